@@ -1,0 +1,49 @@
+"""One kind of error for every fault of a user's file, printed the way compilers print theirs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Where:
+    """A place in a file: ``file:line:column``, or the file alone where no line is known (line 0).
+
+    ``layer`` and ``type`` name the layer that the place belongs to, if any.
+    """
+
+    file: str
+    line: int = 0
+    column: int = 0
+    layer: str = ""
+    type: str = ""
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        if self.layer or self.type:
+            kind = f" ({self.type})" if self.type else ""
+            return f'{place}: layer "{self.layer}"{kind}'
+        return place
+
+
+class SpecError(ValueError):
+    """A fault of a user's file: what was found, what was expected, what to do, and where.
+
+    ``str(error)`` is one line that begins ``file:line:column: `` (``file: `` where there is no line).
+    """
+
+    def __init__(self, message: str, where: Where | None = None) -> None:
+        self.message = message
+        self.where = where
+        super().__init__(f"{where}: {message}" if where else message)
+
+
+def did_you_mean(word: str, known: list[str] | tuple[str, ...]) -> str:
+    """Return ``; did you mean "x"?`` for the closest known word, or an empty string."""
+    import difflib
+
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    if not close:
+        lowered = {k.lower(): k for k in known}
+        close = [lowered[word.lower()]] if word.lower() in lowered else []
+    return f'; did you mean "{close[0]}"?' if close else ""

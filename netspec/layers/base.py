@@ -1,0 +1,155 @@
+"""What every layer is: a module built from a LayerParameter and the shapes of its bottoms.
+
+A layer is complete when its constructor returns: its learnable blobs exist and are filled, and ``top_shapes`` says,
+by integer arithmetic alone, what ``forward`` will return.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import torch
+
+from netspec import fillers
+from netspec.errors import SpecError, Where
+
+Shape = tuple[int, ...]
+TRAIN, TEST = 0, 1  # caffe.proto: enum Phase
+
+
+class Random:
+    """The net's random draws, reproducible from one seed; one generator a device."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self._generators: dict[str, torch.Generator] = {}
+
+    def on(self, device: torch.device | str = "cpu") -> torch.Generator:
+        """Return the generator of ``device`` (made at its first use)."""
+        key = str(device)
+        if key not in self._generators:
+            self._generators[key] = torch.Generator(device).manual_seed(self.seed)
+        return self._generators[key]
+
+
+def _nowhere(*path: str | int) -> Where:
+    return Where("<layer>")
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a layer may know of the net around it.
+
+    ``at(*path)`` is the place in the prototxt of a field of this layer. ``device`` is where blobs are made; on
+    ``meta`` they have shapes and no values. Where ``open_data`` is false, a layer that reads files must not: its tops'
+    shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``.
+    """
+
+    phase: int = TEST
+    random: Random = field(default_factory=lambda: Random(0))
+    at: Callable[..., Where] = _nowhere
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    open_data: bool = True
+    given_shapes: Mapping[str, Shape] = field(default_factory=dict)
+    allow_python: bool = False
+
+
+class Layer(torch.nn.Module):
+    """Base of all layers. A subclass declares its counts, then implements ``setup``, ``reshape`` and ``forward``.
+
+    ``setup()`` reads ``self.param``, refuses what is wrong (``raise self.error(...)``) and adds the learnable blobs;
+    ``self.bottom_shapes`` is known. ``reshape(bottom_shapes)`` returns the tops' shapes; it runs in the constructor and
+    again whenever bottoms of other shapes arrive. ``forward(*bottoms)`` returns one tensor, or a tuple of one a top.
+
+    Caffe: include/caffe/layer.hpp
+    """
+
+    type: ClassVar[str] = ""
+    bottoms: ClassVar[tuple[int, int | None]] = (1, 1)  # fewest and most (None: any number)
+    tops: ClassVar[tuple[int, int | None]] = (1, 1)
+    same_tops: ClassVar[bool] = False  # as many tops as bottoms
+    is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
+    is_input: ClassVar[bool] = False  # its tops are given by the caller
+    label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
+
+    def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
+        super().__init__()
+        self.param = param
+        self.context = context or Context()
+        self.phase: int = param.phase if param.HasField("phase") else self.context.phase
+        self.bottom_shapes: list[Shape] = [tuple(s) for s in bottom_shapes]
+        self.num_tops: int = max(len(param.top), self.tops[0] if self.is_loss else 0)
+        self.blobs = torch.nn.ParameterList()
+        self.blob_shapes: list[Shape] = []
+        self._check_counts()
+        self.setup()
+        self.top_shapes: list[Shape] = [tuple(s) for s in self.reshape(self.bottom_shapes)]
+
+    def setup(self) -> None:
+        """Read the parameters and add the learnable blobs."""
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shapes of the tops for bottoms of these shapes; may keep geometry on ``self``."""
+        raise NotImplementedError
+
+    def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        """Return the tops."""
+        raise NotImplementedError
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of one forward pass at the present shapes (0 where they are not counted)."""
+        return 0
+
+    def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Reshape if the bottoms' shapes changed, run ``forward``, return a tuple."""
+        shapes = [tuple(b.shape) for b in bottoms]
+        if shapes != self.bottom_shapes:
+            self.bottom_shapes = shapes
+            self.top_shapes = [tuple(s) for s in self.reshape(shapes)]
+        tops = self(*bottoms)
+        return tops if isinstance(tops, tuple) else (tops,)
+
+    def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
+        """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""
+        data = torch.full(tuple(shape), value, device=self.context.device)
+        if filler is not None and data.device.type != "meta":
+            try:
+                filled = fillers.fill(filler, tuple(shape), self.context.random.on("cpu"))
+            except ValueError as fault:
+                raise self.error(str(fault)) from None
+            data.copy_(filled)
+        self.blobs.append(torch.nn.Parameter(data))
+        self.blob_shapes.append(tuple(shape))
+
+    def blob(self, index: int) -> torch.Tensor:
+        """Return learnable blob ``index`` in this layer's shape (a PERMISSIVE sharer's owner may have another)."""
+        tensor = self.blobs[index]
+        return tensor if tensor.shape == self.blob_shapes[index] else tensor.view(self.blob_shapes[index])
+
+    def error(self, message: str, *path: str | int) -> SpecError:
+        """Return a SpecError at a field of this layer, e.g. ``self.error("...", "pooling_param", "kernel_size")``."""
+        return SpecError(message, self.context.at(*path))
+
+    def canonical_axis(self, axis: int, shape: Shape, *path: str | int) -> int:
+        """Return ``axis`` counted from the front; negative ones count from the end (Caffe: CanonicalAxisIndex)."""
+        if not -len(shape) <= axis < len(shape):
+            raise self.error(f"axis {axis} is out of range for a blob of {len(shape)} axes, shape {shape}", *path)
+        return axis % len(shape)
+
+    def _check_counts(self) -> None:
+        for found, (least, most), what in (
+            (len(self.bottom_shapes), self.bottoms, "bottom"),
+            (self.num_tops, self.tops, "top"),
+        ):
+            if found < least or (most is not None and found > most):
+                if most is None:
+                    wanted = f"at least {least}"
+                else:
+                    wanted = str(least) if least == most else f"{least} to {most}"
+                raise self.error(f"found {found} {what} blob(s), expected {wanted}", what)
+        if self.same_tops and self.num_tops != len(self.bottom_shapes):
+            raise self.error(
+                f"found {self.num_tops} top blob(s) for {len(self.bottom_shapes)} bottom blob(s), expected as many", "top"
+            )

@@ -1,0 +1,33 @@
+"""The one registry: layer type, as a prototxt writes it, to class."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from netspec.layers.base import Layer
+
+_LAYERS: dict[str, type[Layer]] = {}
+L = TypeVar("L", bound=type[Layer])
+
+
+def register(type_name: str) -> Callable[[L], L]:
+    """Class decorator: make a layer known under the type that prototxt files use."""
+
+    def add(cls: L) -> L:
+        assert type_name not in _LAYERS, f"layer type {type_name} registered twice"
+        cls.type = type_name
+        _LAYERS[type_name] = cls
+        return cls
+
+    return add
+
+
+def layer_class(type_name: str) -> type[Layer] | None:
+    """Return the class registered for a type, or None."""
+    return _LAYERS.get(type_name)
+
+
+def layer_types() -> list[str]:
+    """Return all registered types, in alphabetical order."""
+    return sorted(_LAYERS)

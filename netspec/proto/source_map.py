@@ -1,0 +1,55 @@
+"""Which line and column each part of a net came from; carried beside the NetParameter through every pass."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+from netspec.errors import Where
+
+
+@dataclass(frozen=True)
+class Node:
+    """Position of one message in its file and, by field name, of each of its fields' values, in order."""
+
+    where: Where
+    fields: Mapping[str, tuple[Node, ...]] = field(default_factory=dict)
+
+    def find(self, *path: str | int) -> Where:
+        """Return the place of ``path``, e.g. ``("convolution_param", "pad", 1)``; of the nearest known ancestor otherwise.
+
+        A name steps to the first value of that field, an index after it to the value of that index.
+        """
+        node = self
+        steps = list(path)
+        while steps:
+            name = steps.pop(0)
+            index = steps.pop(0) if steps and isinstance(steps[0], int) else 0
+            children = node.fields.get(str(name), ())
+            if not children:
+                break
+            node = children[min(int(index), len(children) - 1)]
+        return node.where
+
+
+@dataclass(frozen=True)
+class SourceMap:
+    """``layers[i]`` says where layer ``i`` of the NetParameter beside it came from."""
+
+    file: str
+    net: Node
+    layers: tuple[Node, ...] = ()
+
+    @staticmethod
+    def unknown(file: str, count: int) -> SourceMap:
+        """A map for a net that did not come from text (a binary file, a message made in Python)."""
+        node = Node(Where(file))
+        return SourceMap(file, node, (node,) * count)
+
+    def at(self, index: int, *path: str | int, layer: str = "", type: str = "") -> Where:
+        """Return the place of a field of layer ``index``, labelled with the layer's name and type."""
+        return replace(self.layers[index].find(*path), layer=layer, type=type)
+
+    def with_layers(self, layers: Iterable[Node]) -> SourceMap:
+        """Return the map of a net whose layers came from ``layers``, in order."""
+        return replace(self, layers=tuple(layers))
