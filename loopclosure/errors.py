@@ -1,0 +1,21 @@
+"""The one kind of error of this wing, printed the way compilers print theirs."""
+
+from __future__ import annotations
+
+import os
+
+
+class InputError(ValueError):
+    """A fault of a user's file or choice: what was found, what was expected, what to do, and where.
+
+    ``str(error)`` is one line: ``file:line:column: message``; ``file: message`` where no line is known (line 0); the
+    message alone where no file is to blame.
+    """
+
+    def __init__(self, message: str, file: str | os.PathLike[str] = "", line: int = 0, column: int = 0) -> None:
+        self.message = message
+        self.file = os.fspath(file)
+        self.line = line
+        self.column = column
+        place = f"{self.file}:{line}:{column}" if line else self.file
+        super().__init__(f"{place}: {message}" if place else message)

@@ -1,0 +1,245 @@
+"""Where the camera was: the files of the TUM RGB-D benchmark.
+
+A sequence is a folder with ``rgb.txt`` (``timestamp filename``) and ``groundtruth.txt`` (``timestamp tx ty tz qx qy qz
+qw``). A pose is camera-to-world: the position of the optical centre in metres and a unit quaternion with w last; the
+camera looks along its +z, x to the right, y down. Stamps are in seconds.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopclosure.errors import InputError
+
+# TUM's own associate.py takes 0.02 s; with 30 Hz images and motion capture at 100 Hz a hole of 0.03 s does no harm.
+MAX_DIFFERENCE_S = 0.03
+# Four printed decimals leave a norm within 1e-3 of 1. Much further off, the four numbers are no quaternion.
+NORM_TOLERANCE = 0.05
+
+
+class Posed(Protocol):
+    """Whatever has poses: ``positions`` (..., 3) in metres and ``quaternions`` (..., 4), xyzw, of unit length."""
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """Optical centres (..., 3) in metres."""
+        ...
+
+    @property
+    def quaternions(self) -> NDArray[np.float64]:
+        """Camera-to-world rotations (..., 4), xyzw, of unit length."""
+        ...
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses without a time: ``positions`` (..., 3) in metres, ``quaternions`` (..., 4) xyzw of unit length."""
+
+    positions: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, index: int | slice | NDArray) -> Poses:
+        return Poses(self.positions[index], self.quaternions[index])
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses in time: ``stamps`` (N,) in s, rising; ``positions`` (N, 3) in metres; ``quaternions`` (N, 4) xyzw."""
+
+    stamps: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def poses(self) -> Poses:
+        """The N poses without their time."""
+        return Poses(self.positions, self.quaternions)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a sequence: its time in seconds, and its path as ``rgb.txt`` has it (relative to the sequence)."""
+
+    stamp: float
+    path: str
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """The N frames of a sequence that have a pose, in order of time.
+
+    ``stamps`` (N,) in seconds are the frames' own; ``positions`` (N, 3) in metres and ``quaternions`` (N, 4) xyzw are
+    of the nearest pose in time. ``dropped`` counts the frames left out since they have no pose near enough.
+    """
+
+    name: str
+    frames: tuple[Frame, ...]
+    stamps: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+    dropped: int
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def poses(self) -> Poses:
+        """The N poses without their time."""
+        return Poses(self.positions, self.quaternions)
+
+
+def read_rgb_list(path: str | os.PathLike[str]) -> list[Frame]:
+    """Read ``rgb.txt``: the frames in order of time. Raises InputError (file:line:column) for a broken line."""
+    frames = []
+    for number, line in _content_lines(path, 'a list of images, "timestamp filename" a line (TUM RGB-D: rgb.txt)'):
+        fields = list(re.finditer(r"\S+", line))
+        if len(fields) != 2:
+            raise InputError(
+                f'expected "timestamp filename", found {len(fields)} field{"s"[len(fields) == 1 :]}: "{line.strip()}"',
+                path,
+                number,
+                _column_of_count_fault(line, fields, 2),
+            )
+        frames.append(Frame(_number(fields[0], "the timestamp in seconds", path, number), fields[1].group()))
+    if not frames:
+        raise InputError("lists no image", path)
+    return sorted(frames, key=lambda frame: frame.stamp)
+
+
+def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
+    """Read ``groundtruth.txt``, in order of time, its quaternions normalised anew (the file has four decimals).
+
+    Raises InputError (file:line:column) for a line that is not eight numbers or whose quaternion is none.
+    """
+    names = "timestamp tx ty tz qx qy qz qw"
+    rows = []
+    for number, line in _content_lines(path, f'a trajectory, "{names}" a line (TUM RGB-D: groundtruth.txt)'):
+        fields = list(re.finditer(r"\S+", line))
+        if len(fields) != 8:
+            raise InputError(
+                f'expected the eight numbers "{names}", found {len(fields)}: "{line.strip()}"',
+                path,
+                number,
+                _column_of_count_fault(line, fields, 8),
+            )
+        row = [_number(field, name, path, number) for field, name in zip(fields, names.split(), strict=True)]
+        norm = math.hypot(*row[4:])
+        if abs(norm - 1) > NORM_TOLERANCE:
+            raise InputError(
+                f"qx qy qz qw have length {norm:.4g}, a rotation has length 1", path, number, fields[4].start() + 1
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError("holds no pose", path)
+    table = np.array(rows)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    quaternions = table[:, 4:] / np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
+    return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), quaternions)
+
+
+def write_rgb_list(path: str | os.PathLike[str], frames: SequenceOf[Frame]) -> None:
+    """Write ``rgb.txt`` with TUM's three comment lines; stamps with microseconds."""
+    lines = ["# color images", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
+    lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write ``groundtruth.txt`` with TUM's three comment lines; metres and quaternions with six decimals."""
+    lines = [
+        "# ground truth trajectory",
+        f"# file: '{Path(path).parent.name}'",
+        "# timestamp tx ty tz qx qy qz qw",
+    ]
+    for stamp, position, quaternion in zip(
+        trajectory.stamps, trajectory.positions, trajectory.quaternions, strict=True
+    ):
+        lines.append(f"{stamp:.6f} " + " ".join(f"{value:.6f}" for value in (*position, *quaternion)))
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def associate(
+    frame_stamps: NDArray[np.float64], trajectory: Trajectory, max_difference: float = MAX_DIFFERENCE_S
+) -> NDArray[np.intp]:
+    """Find for each frame (N,) the pose nearest in time: its index (N,), -1 where none is within ``max_difference`` s.
+
+    Frames may share a pose, unlike in TUM's associate.py, which pairs one to one: poses come faster than images.
+    """
+    stamps = trajectory.stamps
+    after = np.searchsorted(stamps, frame_stamps).clip(0, len(stamps) - 1)
+    before = (after - 1).clip(0)
+    nearest = np.where(np.abs(stamps[before] - frame_stamps) <= np.abs(stamps[after] - frame_stamps), before, after)
+    return np.where(np.abs(stamps[nearest] - frame_stamps) <= max_difference, nearest, -1)
+
+
+def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MAX_DIFFERENCE_S) -> Sequence:
+    """Read a folder in TUM RGB-D layout; frames without a pose within ``max_difference`` s are counted and left out.
+
+    Raises InputError where a file is missing or broken, or where no frame at all has a pose.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError("no such folder; expected a TUM RGB-D sequence with rgb.txt and groundtruth.txt", folder)
+    frames = read_rgb_list(folder / "rgb.txt")
+    trajectory = read_groundtruth(folder / "groundtruth.txt")
+    stamps = np.array([frame.stamp for frame in frames])
+    nearest = associate(stamps, trajectory, max_difference)
+    posed = nearest >= 0
+    if not posed.any():
+        raise InputError(
+            f"none of its {len(frames)} images has a pose within {max_difference:g} s: images from {stamps[0]:.3f} to "
+            f"{stamps[-1]:.3f} s, poses from {trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s",
+            folder,
+        )
+    return Sequence(
+        name=folder.resolve().name,
+        frames=tuple(frame for frame, kept in zip(frames, posed, strict=True) if kept),
+        stamps=stamps[posed],
+        positions=trajectory.positions[nearest[posed]],
+        quaternions=trajectory.quaternions[nearest[posed]],
+        dropped=int((~posed).sum()),
+    )
+
+
+def _content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines that are neither empty nor a comment, with their numbers from 1."""
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror}); expected {expected}", path) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not a text file; expected {expected}", path) from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield number, line
+
+
+def _number(field: re.Match[str], name: str, path: str | os.PathLike[str], line: int) -> float:
+    try:
+        value = float(field.group())
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f'expected a number for {name}, found "{field.group()}"', path, line, field.start() + 1)
+    return value
+
+
+def _column_of_count_fault(line: str, fields: list[re.Match[str]], expected: int) -> int:
+    """Return the column (from 1) of the first field too many, or the one where the first missing field should be."""
+    return fields[expected].start() + 1 if len(fields) > expected else len(line.rstrip()) + 1
