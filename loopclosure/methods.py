@@ -18,7 +18,7 @@ Item = TypeVar("Item")
 
 
 class Progress(Protocol):
-    """Wraps the items of one stage of the work, to show how far it is; ``stage`` names it as the table of times does."""
+    """Wraps the items of one stage of the work, to show how far it is; ``stage`` is its name in the table of times."""
 
     def __call__(self, items: Iterable[Item], stage: str, total: int | None = None) -> Iterable[Item]:
         """Return an iterable of the same items."""
@@ -77,7 +77,7 @@ class Setting:
     seed: int = 0
 
 
-# name -> "module:factory"; a factory takes (argument: str, setting: Setting, inner: Method | None) and returns a Method.
+# name -> "module:factory"; a factory takes (argument: str, setting: Setting, inner: Method | None), returns a Method.
 # On the command line a method is written name, name:argument, or name+inner[:argument], where inner is a method again
 # whose scores the first one refines: seqslam+features:siamese.npz:cosine.
 METHODS: dict[str, str] = {
