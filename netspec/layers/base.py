@@ -73,6 +73,7 @@ class Layer(torch.nn.Module):
     is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
     is_input: ClassVar[bool] = False  # its tops are given by the caller
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
+    default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
         super().__init__()
@@ -97,6 +98,12 @@ class Layer(torch.nn.Module):
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         """Return the tops."""
         raise NotImplementedError
+
+    def restart(self) -> None:
+        """Return to the first record, where the layer reads any."""
+
+    def close(self) -> None:
+        """Let go of files and threads, where the layer holds any."""
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one forward pass at the present shapes (0 where they are not counted)."""

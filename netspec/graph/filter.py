@@ -1,0 +1,75 @@
+"""Which layers of a net belong to a phase, level and set of stages (Caffe: Net::FilterNet, src/caffe/net.cpp)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from netspec import log
+from netspec.errors import SpecError
+from netspec.graph import Report, raise_fault
+from netspec.proto.schema import NetParameter, NetState
+from netspec.proto.source_map import SourceMap
+
+
+def with_state(net: Any, phase: int, level: int | None = None, stages: Iterable[str] = ()) -> Any:
+    """Return a copy of the net whose state has this phase, this level (unless None) and these stages added."""
+    stated = NetParameter()
+    stated.CopyFrom(net)
+    stated.state.phase = phase
+    if level is not None:
+        stated.state.level = level
+    stated.state.stage.extend(stages)
+    return stated
+
+
+def merged_state(*states: Any) -> Any:
+    """Return the NetState in which each of ``states`` overrides those before it (stages add up)."""
+    merged = NetState()
+    for state in states:
+        merged.MergeFrom(state)
+    return merged
+
+
+def filter_net(net: Any, source: SourceMap, report: Report = raise_fault) -> tuple[Any, SourceMap]:
+    """Return the net with only the layers that its ``state`` includes."""
+    filtered = NetParameter()
+    filtered.CopyFrom(net)
+    del filtered.layer[:]
+    kept = []
+    for index, layer in enumerate(net.layer):
+        if layer.include and layer.exclude:
+            where = source.at(index, "exclude", layer=layer.name, type=layer.type)
+            report(SpecError("found both include and exclude rules, expected either one; remove one kind", where))
+        if _included(net.state, layer):
+            filtered.layer.add().CopyFrom(layer)
+            kept.append(source.layers[index])
+    return filtered, source.with_layers(kept)
+
+
+def _included(state: Any, layer: Any) -> bool:
+    if layer.include:
+        return any(_meets(state, rule, layer.name) for rule in layer.include)
+    return not any(_meets(state, rule, layer.name) for rule in layer.exclude)
+
+
+def _meets(state: Any, rule: Any, name: str) -> bool:
+    ending = f"specified by a rule in layer {name}"
+    if rule.HasField("phase") and rule.phase != state.phase:
+        log.info("net.cpp:296", f"The NetState phase ({state.phase}) differed from the phase ({rule.phase}) {ending}")
+        return False
+    if rule.HasField("min_level") and state.level < rule.min_level:
+        log.info("net.cpp:305", f"The NetState level ({state.level}) is below the min_level ({rule.min_level}) {ending}")
+        return False
+    if rule.HasField("max_level") and state.level > rule.max_level:
+        log.info("net.cpp:314", f"The NetState level ({state.level}) is above the max_level ({rule.max_level}) {ending}")
+        return False
+    for stage in rule.stage:
+        if stage not in state.stage:
+            log.info("net.cpp:328", f"The NetState did not contain stage '{stage}' {ending}")
+            return False
+    for stage in rule.not_stage:
+        if stage in state.stage:
+            log.info("net.cpp:342", f"The NetState contained a not_stage '{stage}' {ending}")
+            return False
+    return True

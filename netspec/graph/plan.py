@@ -1,0 +1,181 @@
+"""The last value without torch: which layer reads and writes which value, who owns each parameter, what is put out.
+
+Blob *names* are Caffe's; *values* are numbered, one for each time a layer writes. An in-place layer writes a new value
+under an old name, so a Plan has no in-place operation and each value is written once.
+Caffe: Net::Init, AppendTop, AppendBottom, AppendParam (src/caffe/net.cpp).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from netspec.errors import SpecError
+from netspec.graph import Report, raise_fault
+from netspec.proto.source_map import SourceMap
+
+PERMISSIVE = 1  # caffe.proto: ParamSpec.DimCheckMode
+
+
+@dataclass(frozen=True)
+class Param:
+    """One ``param { }`` of a layer. ``owner`` is (layer, index) of the parameter it shares by name, or None: its own."""
+
+    name: str
+    lr_mult: float
+    decay_mult: float
+    permissive: bool
+    owner: tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class Node:
+    """One layer: ``bottoms`` and ``tops`` are value numbers (a bottom nobody writes: -1)."""
+
+    name: str
+    type: str
+    bottoms: tuple[int, ...]
+    tops: tuple[int, ...]
+    in_place: tuple[bool, ...]
+    params: tuple[Param, ...]
+    blocked: tuple[bool, ...]  # propagate_down: false, by bottom
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A net in running order. ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values."""
+
+    net: Any
+    source: SourceMap
+    nodes: tuple[Node, ...]
+    blobs: tuple[str, ...]
+    outputs: dict[str, int]
+
+
+def make_plan(net: Any, source: SourceMap, report: Report = raise_fault) -> Plan:
+    """Return the Plan of a filtered net with its splits."""
+    blobs: list[str] = []
+    current: dict[str, int] = {}
+    available: set[str] = set()
+    owners: dict[str, tuple[int, int]] = {}
+    multipliers = _shared_multipliers(net, source, report)
+    nodes = []
+    for i, layer in enumerate(net.layer):
+
+        def fault(message: str, *path: str | int, i: int = i, layer: Any = layer) -> None:
+            report(SpecError(message, source.at(i, *path, layer=layer.name, type=layer.type)))
+
+        if layer.propagate_down and len(layer.propagate_down) != len(layer.bottom):
+            fault(
+                f"found {len(layer.propagate_down)} propagate_down, expected none or one a bottom ({len(layer.bottom)})",
+                "propagate_down",
+            )
+        bottoms = tuple(current.get(blob, -1) for blob in layer.bottom)
+        available.difference_update(layer.bottom)
+        tops, in_place = [], []
+        for j, blob in enumerate(layer.top):
+            replaces = j < len(layer.bottom) and layer.bottom[j] == blob
+            if blob in current and not replaces:
+                first = next(k for k, other in enumerate(net.layer) if blob in other.top)
+                fault(
+                    f'top blob "{blob}" is produced by multiple sources (first by layer "{net.layer[first].name}"); '
+                    "rename one, or compute in place: same bottom and top, before its other uses",
+                    "top",
+                    j,
+                )
+            in_place.append(replaces)
+            tops.append(len(blobs))
+            current[blob] = len(blobs)
+            blobs.append(blob)
+            available.add(blob)
+        params = []
+        for j, spec in enumerate(layer.param):
+            lr_mult, decay_mult = spec.lr_mult, spec.decay_mult
+            owner = None
+            if spec.name:
+                owner = owners.setdefault(spec.name, (i, j))
+                owner = None if owner == (i, j) else owner
+                lr_mult, decay_mult = multipliers[spec.name]
+            params.append(Param(spec.name, lr_mult, decay_mult, spec.share_mode == PERMISSIVE, owner))
+        blocked = tuple(not down for down in layer.propagate_down) or (False,) * len(bottoms)
+        nodes.append(Node(layer.name, layer.type, bottoms, tuple(tops), tuple(in_place), tuple(params), blocked))
+    outputs = {name: current[name] for name in sorted(available)}
+    return Plan(net, source, tuple(nodes), tuple(blobs), outputs)
+
+
+def _shared_multipliers(net: Any, source: SourceMap, report: Report) -> dict[str, tuple[float, float]]:
+    """Return lr_mult and decay_mult of each parameter name: given once, or by several alike."""
+    found: dict[str, dict[str, float]] = {}
+    for i, layer in enumerate(net.layer):
+        for j, spec in enumerate(layer.param):
+            if not spec.name:
+                continue
+            given = found.setdefault(spec.name, {})
+            for field in ("lr_mult", "decay_mult"):
+                if not spec.HasField(field):
+                    continue
+                value = getattr(spec, field)
+                if given.setdefault(field, value) != value:
+                    where = source.at(i, "param", j, field, layer=layer.name, type=layer.type)
+                    message = f'shared param "{spec.name}" has {field} {value:g} here and {given[field]:g} before; make them equal'
+                    report(SpecError(message, where))
+    return {name: (given.get("lr_mult", 1.0), given.get("decay_mult", 1.0)) for name, given in found.items()}
+
+
+@dataclass(frozen=True)
+class Backward:
+    """What Caffe would propagate: by layer, and by layer and bottom."""
+
+    layers: tuple[bool, ...]
+    bottoms: tuple[tuple[bool, ...], ...]
+
+
+def plan_backward(
+    plan: Plan,
+    learns: Sequence[bool],
+    has_loss: Sequence[Sequence[bool]],
+    label_bottoms: Sequence[frozenset[int]],
+) -> Backward:
+    """Decide what needs backward computation, as Net::Init does and logs.
+
+    ``learns[i]``: layer i has a parameter with a rate; ``has_loss[i][j]``: its top j has a loss weight (anonymous tops
+    included); ``label_bottoms[i]``: its bottoms that never receive a gradient.
+    """
+    value_needs = [False] * len(plan.blobs)
+    layer_needs: list[bool] = []
+    bottom_needs: list[list[bool]] = []
+    for i, node in enumerate(plan.nodes):
+        wanted = [v >= 0 and value_needs[v] for v in node.bottoms]
+        declared = list(plan.net.layer[i].propagate_down)
+        bottom_needs.append(declared if len(declared) == len(wanted) and declared else list(wanted))
+        needs = any(wanted) or learns[i]
+        layer_needs.append(needs)
+        for v in node.tops:
+            value_needs[v] = needs
+    under_loss: set[str] = set()
+    skipped: set[str] = set()
+    for i in reversed(range(len(plan.nodes))):
+        node = plan.nodes[i]
+        names = [plan.blobs[v] for v in node.tops]
+        names += ["(automatic)"] * (len(has_loss[i]) - len(names))
+        contributes = any(has_loss[i]) or any(name in under_loss for name in names)
+        if layer_needs[i] and all(name in skipped for name in names):
+            layer_needs[i] = False
+            bottom_needs[i] = [False] * len(node.bottoms)
+        if not contributes:
+            layer_needs[i] = False
+        for j, v in enumerate(node.bottoms):
+            name = plan.blobs[v] if v >= 0 else ""
+            if contributes:
+                under_loss.add(name)
+            else:
+                bottom_needs[i][j] = False
+            if not bottom_needs[i][j]:
+                skipped.add(name)
+    if plan.net.force_backward:
+        layer_needs = [True] * len(plan.nodes)
+        bottom_needs = [
+            [need or j not in label_bottoms[i] for j, need in enumerate(needs)] for i, needs in enumerate(bottom_needs)
+        ]
+    return Backward(tuple(layer_needs), tuple(tuple(needs) for needs in bottom_needs))

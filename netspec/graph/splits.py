@@ -1,0 +1,82 @@
+"""A Split layer behind every blob that is used more than once (Caffe: src/caffe/util/insert_splits.cpp).
+
+Autograd would add the gradients by itself; the layers are Caffe's blob names, its log and its caffemodel's layer list.
+A blob with an explicit loss_weight counts that as one use, and the first of its copies carries the weight.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from netspec.errors import SpecError, did_you_mean
+from netspec.graph import Report, raise_fault
+from netspec.proto.schema import NetParameter
+from netspec.proto.source_map import SourceMap
+
+Top = tuple[int, int]  # layer index, top index
+
+
+def insert_splits(net: Any, source: SourceMap, report: Report = raise_fault) -> tuple[Any, SourceMap]:
+    """Return the net with Split layers inserted."""
+    producer, uses, weights = _count_uses(net, source, report)
+    split = NetParameter()
+    split.CopyFrom(net)
+    del split.layer[:]
+    places = []
+    used: Counter[Top] = Counter()
+    for i, layer in enumerate(net.layer):
+        copy = split.layer.add()
+        copy.CopyFrom(layer)
+        places.append(source.layers[i])
+        for j, blob in enumerate(layer.bottom):
+            top = producer.get((i, j))
+            if top is not None and uses[top] > 1:
+                copy.bottom[j] = _blob_name(net.layer[top[0]].name, blob, top[1], used[top])
+                used[top] += 1
+        for j, blob in enumerate(layer.top):
+            top = (i, j)
+            if uses[top] > 1:
+                added = split.layer.add()
+                places.append(source.layers[i])
+                added.name = f"{blob}_{layer.name}_{j}_split"
+                added.type = "Split"
+                added.bottom.append(blob)
+                added.top.extend(_blob_name(layer.name, blob, j, k) for k in range(uses[top]))
+                if weights.get(top):
+                    copy.ClearField("loss_weight")
+                    added.loss_weight.extend([weights[top]] + [0.0] * (uses[top] - 1))
+                    used[top] += 1
+    return split, source.with_layers(places)
+
+
+def _blob_name(layer: str, blob: str, top: int, copy: int) -> str:
+    return f"{blob}_{layer}_{top}_split_{copy}"
+
+
+def _count_uses(
+    net: Any, source: SourceMap, report: Report
+) -> tuple[dict[tuple[int, int], Top], Counter[Top], dict[Top, float]]:
+    """Return which top each bottom reads, how often each top is used, and the tops' explicit loss weights."""
+    latest: dict[str, Top] = {}
+    producer: dict[tuple[int, int], Top] = {}
+    uses: Counter[Top] = Counter()
+    weights: dict[Top, float] = {}
+    for i, layer in enumerate(net.layer):
+        for j, blob in enumerate(layer.bottom):
+            if blob not in latest:
+                where = source.at(i, "bottom", j, layer=layer.name, type=layer.type)
+                known = ", ".join(latest) or "none"
+                hint = did_you_mean(blob, list(latest))
+                report(SpecError(f'unknown bottom blob "{blob}"{hint or ";"} available: {known}', where))
+                continue
+            producer[i, j] = latest[blob]
+            uses[latest[blob]] += 1
+        for j, blob in enumerate(layer.top):
+            latest[blob] = (i, j)
+        for j, weight in enumerate(layer.loss_weight[: len(layer.top)]):
+            top = latest[layer.top[j]]
+            weights[top] = weight
+            if weight:
+                uses[top] += 1
+    return producer, uses, weights
