@@ -1,0 +1,198 @@
+"""Precision and recall of a matrix of scores, exactly: one point for each distinct score, no grid of thresholds.
+
+Two conventions are in use, and their figures must never be mixed; every result here carries the name of its own:
+
+- **all pairs**: every judged pair is a sample (the similarity matrix against its truth, as in the paper);
+- **best match of each query**: each query names its best reference, right or wrong; recall is the share of the
+  queries with a loop that have theirs found (FAB-MAP, SeqSLAM and most of the loop-closure literature).
+
+Soft truth (near enough to be no mistake, but nothing that must be found): over all pairs such a pair is ignored. A
+best match that hits soft truth alone is right for a query that has a loop, and ignored for one that has none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopclosure.errors import InputError
+from loopclosure.truth import Truth
+
+ALL_PAIRS = "all pairs"
+BEST_MATCH = "best match of each query"
+
+
+@dataclass(frozen=True)
+class PrecisionRecall:
+    """A precision-recall curve, from the highest score down; ties are one point.
+
+    convention         ALL_PAIRS or BEST_MATCH, or what the samples are
+    thresholds         (n,) the distinct scores, falling: what scores >= threshold is called a loop
+    precision, recall  (n,)
+    positives          what there is to find: judged pairs, or queries with a loop
+    samples            how many scores were judged
+    exclusion          what makes a place the same, and what was left out
+    """
+
+    convention: str
+    thresholds: np.ndarray
+    precision: np.ndarray
+    recall: np.ndarray
+    positives: int
+    samples: int
+    exclusion: str = ""
+
+    @property
+    def average_precision(self) -> float:
+        """Sum of (R_n - R_n-1) P_n over the points (not the trapezoid); NaN where there is nothing to find."""
+        if not self.positives:
+            return float("nan")
+        return float(np.sum(np.diff(self.recall, prepend=0.0) * self.precision))
+
+    @property
+    def recall_at_full_precision(self) -> float:
+        """The greatest recall before the first mistake: 0 if the very first is wrong."""
+        return self.recall_at_precision(1.0)
+
+    def recall_at_precision(self, wanted: float) -> float:
+        """Return the greatest recall of any threshold with at least this precision; 0 where there is none."""
+        if not self.positives:
+            return float("nan")
+        return float(np.max(self.recall[self.precision >= wanted], initial=0.0))
+
+    def threshold_for_precision(self, wanted: float) -> float | None:
+        """Return the threshold with the greatest recall among those with at least this precision, the highest such."""
+        good = np.flatnonzero((self.precision >= wanted) & (self.recall > 0))
+        return float(self.thresholds[good[np.argmax(self.recall[good])]]) if len(good) else None
+
+    @property
+    def best_f1(self) -> float:
+        """The greatest F1 of any threshold."""
+        return float(np.max(self._f1, initial=0.0)) if self.positives else float("nan")
+
+    @property
+    def best_f1_threshold(self) -> float:
+        """The threshold of the greatest F1, the highest such; +inf where nothing is ever right."""
+        f1 = self._f1
+        return float(self.thresholds[np.argmax(f1)]) if np.any(f1 > 0) else float("inf")
+
+    @property
+    def _f1(self) -> np.ndarray:
+        total = self.precision + self.recall
+        return np.divide(2 * self.precision * self.recall, total, out=np.zeros_like(total), where=total > 0)
+
+
+def curve(
+    scores: np.ndarray,
+    right: np.ndarray,
+    positives: int | None = None,
+    convention: str = "samples",
+    exclusion: str = "",
+) -> PrecisionRecall:
+    """Build the curve of samples with a score and a right or wrong answer.
+
+    scores     (n,); a NaN or -inf is never called a loop
+    right      (n,) bool
+    positives  what there is to find, where that is more than ``right`` holds; the number of True in it by default
+    """
+    scores, right = np.asarray(scores).reshape(-1), np.asarray(right, dtype=bool).reshape(-1)
+    if len(scores) != len(right):
+        raise InputError(f"{len(scores)} scores but {len(right)} truths")
+    if positives is None:
+        positives = int(np.count_nonzero(right))
+    samples = len(scores)
+    said = ~np.isnan(scores) & ~np.isneginf(scores)
+    scores, right = scores[said], right[said]
+    order = np.argsort(-scores, kind="stable")
+    scores, right = scores[order], right[order]
+    last_of_tie = np.flatnonzero(np.append(scores[1:] != scores[:-1], True)) if len(scores) else np.zeros(0, int)
+    true_positives = np.cumsum(right)[last_of_tie]
+    called = last_of_tie + 1
+    return PrecisionRecall(
+        convention=convention,
+        thresholds=scores[last_of_tie],
+        precision=true_positives / np.maximum(called, 1),
+        recall=true_positives / positives if positives else np.zeros(len(last_of_tie)),
+        positives=positives,
+        samples=samples,
+        exclusion=exclusion,
+    )
+
+
+def all_pairs(scores: np.ndarray, truth: Truth) -> PrecisionRecall:
+    """Judge every pair for itself; ``scores`` (Q, R), higher = more alike. NaN is never found, yet may be missed."""
+    _check_size(scores, truth)
+    counted = truth.judged & (truth.hard | ~truth.soft)
+    return curve(scores[counted], truth.hard[counted], convention=ALL_PAIRS, exclusion=truth.sentence)
+
+
+@dataclass(frozen=True)
+class BestMatches:
+    """The best judged reference of each query.
+
+    reference  (Q,) its number, -1 where the query has no candidate with a score; of equal ones the first
+    score      (Q,) its score, -inf there
+    right      (Q,) bool: it hits hard truth, or soft truth where the query has a loop
+    ignored    (Q,) bool: it hits soft truth and the query has no loop: neither right nor wrong
+    """
+
+    reference: np.ndarray
+    score: np.ndarray
+    right: np.ndarray
+    ignored: np.ndarray
+
+
+def best_matches(scores: np.ndarray, truth: Truth) -> BestMatches:
+    """Find and judge the best match of each query; ``scores`` (Q, R)."""
+    candidates = _candidates(scores, truth)
+    rows = np.arange(len(candidates))
+    reference = np.argmax(candidates, axis=1)
+    score = candidates[rows, reference]
+    none = np.isneginf(score)
+    soft = truth.soft[rows, reference] & ~none
+    loops = truth.queries_with_a_loop
+    return BestMatches(np.where(none, -1, reference), score, soft & loops, soft & ~loops)
+
+
+def best_match(scores: np.ndarray, truth: Truth) -> PrecisionRecall:
+    """Judge the best match of each query; ``scores`` (Q, R). A wrong match of a query with a loop is one mistake."""
+    found = best_matches(scores, truth)
+    kept = ~found.ignored
+    positives = int(np.count_nonzero(truth.queries_with_a_loop))
+    return curve(found.score[kept], found.right[kept], positives, BEST_MATCH, truth.sentence)
+
+
+def recall_at_k(scores: np.ndarray, truth: Truth, ks: tuple[int, ...] = (1, 5, 10, 20)) -> dict[int, float]:
+    """Return, for each k, the share of the queries with a loop that have a hard or soft one among their best k.
+
+    Of equal scores the first references count. Queries without a loop are left out; NaN where none has one.
+    """
+    candidates = _candidates(scores, truth)
+    queries = np.flatnonzero(truth.queries_with_a_loop)
+    if not len(queries):
+        return {k: float("nan") for k in ks}
+    if min(ks) < 1:
+        raise InputError(f"recall at {min(ks)} was asked for; expected 1 or more")
+    ranked = np.argsort(-candidates[queries], axis=1, kind="stable")[:, : max(ks)]
+    hits = np.take_along_axis(truth.soft[queries], ranked, axis=1)
+    hits &= ~np.isneginf(np.take_along_axis(candidates[queries], ranked, axis=1))
+    found = np.cumsum(hits, axis=1) > 0
+    return {k: float(np.mean(found[:, min(k, found.shape[1]) - 1])) for k in ks}
+
+
+def _candidates(scores: np.ndarray, truth: Truth) -> np.ndarray:
+    """Return the scores with -inf for what is not judged and for NaN."""
+    _check_size(scores, truth)
+    return np.where(truth.judged & ~np.isnan(scores), scores, -np.inf)
+
+
+def _check_size(scores: np.ndarray, truth: Truth) -> None:
+    if scores.shape != truth.hard.shape:
+        raise InputError(
+            f"the scores are {_by(scores.shape)}, the truth is {_by(truth.hard.shape)} (query x reference)"
+        )
+
+
+def _by(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(n) for n in shape)
