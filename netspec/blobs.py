@@ -55,7 +55,7 @@ def diff_to_array(proto: Any) -> np.ndarray | None:
 
 
 def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
-    """Return a BlobProto of the values, and of their gradient: float32 as Caffe writes them, or doubles from float64."""
+    """Return a BlobProto of the values, and of their gradient: float32 as Caffe writes, or doubles from float64."""
     wide = values.dtype == np.float64
     runs = _Runs()
     for array, names in ((values, _DATA), (diff, _DIFF)):

@@ -1,0 +1,89 @@
+"""The learning rate of an iteration: nothing but a function of the solver's parameters, the iteration and the step.
+
+Caffe: SGDSolver::GetLearningRate (src/caffe/solvers/sgd_solver.cpp:27)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from netspec.errors import SpecError, did_you_mean
+from netspec.proto.source_map import Node
+
+Rate = Callable[[Any, int, int], Any]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """``rate(param, iteration, step)``, and the fields of SolverParameter without which it means nothing."""
+
+    needs: tuple[str, ...]
+    rate: Rate
+
+
+def _power(base: float, exponent: float) -> np.float64:
+    return np.power(np.float64(base), np.float64(exponent))  # inf and nan where Python's ** would raise
+
+
+POLICIES: dict[str, Policy] = {
+    "fixed": Policy((), lambda p, i, step: p.base_lr),
+    "step": Policy(("gamma", "stepsize"), lambda p, i, step: p.base_lr * _power(p.gamma, step)),
+    "exp": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(p.gamma, i)),
+    "inv": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(1 + p.gamma * i, -p.power)),
+    "multistep": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(p.gamma, step)),
+    "poly": Policy(("max_iter",), lambda p, i, step: p.base_lr * _power(1 - i / p.max_iter, p.power)),
+    "sigmoid": Policy(
+        ("gamma", "stepsize"), lambda p, i, step: p.base_lr / (1 + np.exp(np.float64(-p.gamma * (i - p.stepsize))))
+    ),
+}
+
+
+def check_policy(param: Any, node: Node) -> None:
+    """Refuse an unknown policy, or one without the fields it needs, before the first iteration.
+
+    Caffe refuses a stepsize of 0 and a negative gamma only when it comes to them, and lets a forgotten gamma or
+    max_iter make the rate 0 or infinite.
+    """
+    policy = POLICIES.get(param.lr_policy)
+    if policy is None:
+        known = ", ".join(POLICIES)
+        found = f'unknown lr_policy "{param.lr_policy}"' if param.lr_policy else "no lr_policy"
+        hint = did_you_mean(param.lr_policy, list(POLICIES))
+        raise SpecError(f"{found}, expected one of {known}{hint}", node.find("lr_policy"))
+    for field in policy.needs:
+        value = getattr(param, field)
+        if not param.HasField(field):
+            raise SpecError(f'lr_policy "{param.lr_policy}" needs {field}, found none', node.find("lr_policy"))
+        if value < 0 or (value == 0 and field != "gamma"):
+            expected = "at least 0" if field == "gamma" else "more than 0"
+            message = f'lr_policy "{param.lr_policy}" needs {field} of {expected}, found {value:g}'
+            raise SpecError(message, node.find(field))
+
+
+def next_step(param: Any, iteration: int, step: int) -> int:
+    """Return the step that iteration ``iteration`` runs in, ``step`` being that of the iteration before.
+
+    multistep goes up by at most one an iteration, however many stepvalues were passed (sgd_solver.cpp:46).
+    """
+    if param.lr_policy == "step":
+        return iteration // param.stepsize
+    if param.lr_policy == "multistep" and step < len(param.stepvalue) and iteration >= param.stepvalue[step]:
+        return step + 1
+    return step
+
+
+def learning_rate(param: Any, iteration: int, step: int) -> float:
+    """Return the rate of an iteration in a step, rounded to float32 as Caffe's.
+
+    Raises SpecError where the rate is not a number, as poly's is beyond max_iter.
+    """
+    with np.errstate(all="ignore"):
+        rate = float(np.float32(POLICIES[param.lr_policy].rate(param, iteration, step)))
+    if not np.isfinite(rate):
+        message = f'lr_policy "{param.lr_policy}" gives the learning rate {rate} at iteration {iteration}'
+        raise SpecError(f"{message} (max_iter {param.max_iter})")
+    return rate

@@ -1,0 +1,167 @@
+"""How gradients become new weights: one rule for each of Caffe's solver types, on lists of tensors.
+
+Caffe lets a solver overwrite the gradients step by step until they hold what is subtracted from the weights; so here.
+The lists are in the order of the net's learnable parameters. ``torch._foreach_*`` does the same to each tensor of a
+list; on a GPU in one kernel.
+
+Caffe: src/caffe/solvers/*.cpp
+"""
+
+# pyright: reportPrivateImportUsage=false
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from netspec.errors import SpecError, did_you_mean
+from netspec.proto.source_map import Node
+
+Tensors = list[torch.Tensor]
+
+
+def clip(diffs: Tensors, limit: float) -> tuple[float, float] | None:
+    """Scale all gradients so that their common L2 norm is ``limit``, where it is more (SGDSolver::ClipGradients).
+
+    Returns the norm and the factor where it acted. A negative limit is none.
+    """
+    if limit < 0 or not diffs:
+        return None
+    norm = float(torch.linalg.vector_norm(torch.stack(torch._foreach_norm(diffs))))
+    if norm <= limit or math.isnan(norm):
+        return None
+    torch._foreach_mul_(diffs, limit / norm)
+    return norm, limit / norm
+
+
+def normalize(diffs: Tensors, iter_size: int) -> None:
+    """Make the gradients that ``iter_size`` passes have summed up their mean (SGDSolver::Normalize)."""
+    if iter_size != 1:
+        torch._foreach_mul_(diffs, 1 / iter_size)
+
+
+def regularize(diffs: Tensors, weights: Tensors, decays: Sequence[float], kind: str) -> None:
+    """Add weight decay, each parameter's own (SGDSolver::Regularize): L2 decay * w, L1 decay * sign(w), sign(0) = 0."""
+    chosen = [i for i, decay in enumerate(decays) if decay]
+    if not chosen:
+        return
+    pull = [weights[i] for i in chosen]
+    pull = torch._foreach_mul(torch._foreach_sign(pull) if kind == "L1" else pull, [decays[i] for i in chosen])
+    torch._foreach_add_([diffs[i] for i in chosen], pull)
+
+
+Compute = Callable[[Any, Tensors, Sequence[float], Tensors, int], None]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A solver type.
+
+    ``compute(param, diffs, rates, history, iteration)`` turns gradients into what is subtracted from the weights
+    (Caffe: ComputeUpdateValue) and updates the history. ``rates`` has the learning rate of each parameter, its lr_mult
+    included. ``sets`` is how many values the history holds for each weight: the second set follows the first.
+    """
+
+    compute: Compute
+    sets: int = 1
+    momentum: bool = True
+
+
+def sgd(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
+    """Momentum with the rate inside the history: after a step of the rate the old velocity keeps its old rate."""
+    _accelerate(diffs, rates, history, param.momentum)
+    torch._foreach_copy_(diffs, history)
+
+
+def nesterov(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
+    """(1 + momentum) h(t) - momentum h(t-1), h being the history of :func:`sgd`."""
+    before = torch._foreach_mul(history, param.momentum)
+    _accelerate(diffs, rates, history, param.momentum)
+    torch._foreach_copy_(diffs, history)
+    torch._foreach_mul_(diffs, 1 + param.momentum)
+    torch._foreach_sub_(diffs, before)
+
+
+def adagrad(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
+    """Rate g / (sqrt(sum of g^2) + delta): delta outside the root."""
+    torch._foreach_addcmul_(history, diffs, diffs)
+    _divide_by_root(diffs, history, param.delta)
+    torch._foreach_mul_(diffs, rates)
+
+
+def rmsprop(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
+    """:func:`adagrad` with a fading sum of g^2."""
+    _fade_in_squares(history, diffs, param.rms_decay)
+    _divide_by_root(diffs, history, param.delta)
+    torch._foreach_mul_(diffs, rates)
+
+
+def adadelta(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
+    """Rate g times the root of past updates' squares (the second set) over past gradients' squares (the first)."""
+    gradients, updates = history[: len(diffs)], history[len(diffs) :]
+    _fade_in_squares(gradients, diffs, param.momentum)
+    scale = torch._foreach_add(updates, param.delta)
+    torch._foreach_div_(scale, torch._foreach_add(gradients, param.delta))
+    torch._foreach_sqrt_(scale)
+    torch._foreach_mul_(diffs, scale)
+    _fade_in_squares(updates, diffs, param.momentum)
+    torch._foreach_mul_(diffs, rates)
+
+
+def adam(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
+    """First and second moments; delta is added to the root *before* the bias correction, unlike torch's Adam."""
+    means, squares = history[: len(diffs)], history[len(diffs) :]
+    torch._foreach_mul_(means, param.momentum)
+    torch._foreach_add_(means, diffs, alpha=1 - param.momentum)
+    _fade_in_squares(squares, diffs, param.momentum2)
+    torch._foreach_copy_(diffs, means)
+    _divide_by_root(diffs, squares, param.delta)
+    t = iteration + 1
+    correction = math.sqrt(1 - param.momentum2**t) / (1 - param.momentum**t)
+    torch._foreach_mul_(diffs, [rate * correction for rate in rates])
+
+
+RULES: dict[str, Rule] = {
+    "SGD": Rule(sgd),
+    "Nesterov": Rule(nesterov),
+    "AdaGrad": Rule(adagrad, momentum=False),
+    "RMSProp": Rule(rmsprop, momentum=False),
+    "AdaDelta": Rule(adadelta, sets=2),
+    "Adam": Rule(adam, sets=2),
+}
+
+
+def find_rule(param: Any, node: Node) -> Rule:
+    """Return the rule of ``type``, in any case of letters; refuse what the constructors of Caffe's solvers refuse."""
+    name = {known.lower(): known for known in RULES}.get(param.type.lower())
+    if name is None:
+        message = f'unknown solver type "{param.type}", expected one of {", ".join(RULES)}'
+        raise SpecError(message + did_you_mean(param.type, list(RULES)), node.find("type"))
+    if param.momentum and not RULES[name].momentum:
+        raise SpecError(f"momentum cannot be used with {name}; remove it", node.find("momentum"))
+    if name == "RMSProp" and not 0 <= param.rms_decay < 1:
+        raise SpecError(f"rms_decay {param.rms_decay:g}, expected at least 0 and less than 1", node.find("rms_decay"))
+    return RULES[name]
+
+
+def _accelerate(diffs: Tensors, rates: Sequence[float], history: Tensors, momentum: float) -> None:
+    """History = momentum * history + rate * diff."""
+    torch._foreach_mul_(diffs, rates)
+    torch._foreach_mul_(history, momentum)
+    torch._foreach_add_(history, diffs)
+
+
+def _fade_in_squares(history: Tensors, diffs: Tensors, keep: float) -> None:
+    """History = keep * history + (1 - keep) * diff^2."""
+    torch._foreach_mul_(history, keep)
+    torch._foreach_addcmul_(history, diffs, diffs, value=1 - keep)
+
+
+def _divide_by_root(diffs: Tensors, squares: Tensors, delta: float) -> None:
+    """Diff = diff / (sqrt(squares) + delta)."""
+    roots = torch._foreach_sqrt(squares)
+    torch._foreach_add_(roots, delta)
+    torch._foreach_div_(diffs, roots)

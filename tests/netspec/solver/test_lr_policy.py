@@ -1,0 +1,105 @@
+import math
+
+import pytest
+
+from netspec.errors import SpecError, Where
+from netspec.proto.schema import SolverParameter
+from netspec.proto.source_map import Node
+from netspec.solver.lr_policy import check_policy, learning_rate, next_step
+
+NODE = Node(
+    Where("s.prototxt"),
+    {
+        "lr_policy": (Node(Where("s.prototxt", 3, 1)),),
+        "stepsize": (Node(Where("s.prototxt", 4, 1)),),
+        "gamma": (Node(Where("s.prototxt", 5, 1)),),
+    },
+)
+
+
+def rates(param, iterations) -> list[float]:
+    """The rate of each iteration, run through in order from a fresh start."""
+    out, step = [], 0
+    for i in iterations:
+        step = next_step(param, i, step)
+        out.append(learning_rate(param, i, step))
+    return out
+
+
+def test_fixed():
+    assert rates(SolverParameter(lr_policy="fixed", base_lr=0.5), (0, 9)) == [0.5, 0.5]
+
+
+def test_step():
+    param = SolverParameter(lr_policy="step", base_lr=0.5, gamma=0.5, stepsize=10)
+    assert rates(param, (0, 9, 10, 19, 20)) == [0.5, 0.5, 0.25, 0.25, 0.125]
+
+
+def test_exp():
+    assert rates(SolverParameter(lr_policy="exp", base_lr=2, gamma=0.5), (0, 1, 3)) == [2, 1, 0.25]
+
+
+def test_inv():
+    param = SolverParameter(lr_policy="inv", base_lr=0.01, gamma=0.0001, power=0.75)
+    assert rates(param, (5000,)) == pytest.approx([0.01 * 1.5**-0.75], rel=1e-6)
+
+
+def test_poly():
+    param = SolverParameter(lr_policy="poly", base_lr=1, power=2, max_iter=10)
+    assert rates(param, (0, 5, 10)) == [1, 0.25, 0]
+
+
+def test_sigmoid():
+    param = SolverParameter(lr_policy="sigmoid", base_lr=1, gamma=0.5, stepsize=10)
+    assert rates(param, (6, 10, 14)) == pytest.approx([1 / (1 + math.exp(2)), 0.5, 1 / (1 + math.exp(-2))], rel=1e-6)
+
+
+def test_multistep():
+    param = SolverParameter(lr_policy="multistep", base_lr=1, gamma=0.5, stepvalue=[2, 4])
+    assert rates(param, range(6)) == [1, 1, 0.5, 0.5, 0.25, 0.25]
+
+
+def test_multistep_goes_up_at_most_once_an_iteration():
+    """Resumed with its step lost, Caffe takes as many iterations as it has steps to make up for."""
+    param = SolverParameter(lr_policy="multistep", base_lr=1, gamma=0.5, stepvalue=[2, 4, 5])
+    assert rates(param, range(10, 14)) == [0.5, 0.25, 0.125, 0.125]
+
+
+def test_the_rate_is_rounded_to_float32():
+    param = SolverParameter(lr_policy="fixed", base_lr=0.1)
+    assert learning_rate(param, 0, 0) == pytest.approx(0.1, rel=1e-7)
+    assert learning_rate(param, 0, 0) != 0.1
+
+
+def test_a_rate_that_grows_beyond_all_bounds_is_refused():
+    param = SolverParameter(lr_policy="exp", base_lr=1, gamma=10)
+    with pytest.raises(SpecError, match='lr_policy "exp" gives the learning rate inf at iteration 500'):
+        learning_rate(param, 500, 0)
+
+
+def test_poly_has_no_rate_beyond_max_iter():
+    param = SolverParameter(lr_policy="poly", base_lr=1, power=0.5, max_iter=10)
+    with pytest.raises(SpecError, match=r"nan at iteration 11 \(max_iter 10\)"):
+        learning_rate(param, 11, 0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"lr_policy": "stp"}, r's.prototxt:3:1: unknown lr_policy "stp".*; did you mean "step"\?'),
+        ({}, "s.prototxt:3:1: no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid"),
+        ({"lr_policy": "step", "gamma": 0.1}, 's.prototxt:3:1: lr_policy "step" needs stepsize, found none'),
+        ({"lr_policy": "step", "stepsize": 10}, 's.prototxt:3:1: lr_policy "step" needs gamma, found none'),
+        ({"lr_policy": "step", "gamma": 0.1, "stepsize": 0}, "s.prototxt:4:1: .* stepsize of more than 0, found 0"),
+        ({"lr_policy": "inv", "gamma": -1}, "s.prototxt:5:1: .* gamma of at least 0, found -1"),
+        ({"lr_policy": "poly"}, "needs max_iter, found none"),
+        ({"lr_policy": "sigmoid", "gamma": 1}, "needs stepsize, found none"),
+    ],
+)
+def test_what_is_refused_before_the_first_iteration(fields: dict, message: str):
+    with pytest.raises(SpecError, match=message):
+        check_policy(SolverParameter(**fields), NODE)
+
+
+def test_a_gamma_of_0_is_legal():
+    check_policy(SolverParameter(lr_policy="step", gamma=0, stepsize=1), NODE)

@@ -1,0 +1,137 @@
+import math
+
+import pytest
+import torch
+
+from netspec.errors import SpecError, Where
+from netspec.proto.schema import SolverParameter
+from netspec.proto.source_map import Node
+from netspec.solver.update import RULES, Tensors, clip, find_rule, normalize, regularize
+
+NOWHERE = Node(Where("s.prototxt"))
+SHAPES = [(3, 2), (4,)]
+
+
+def run(
+    param, gradients: list[list[torch.Tensor]], rates: list[float]
+) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Start from zero weights; return the weights and the history after one update for each rate."""
+    rule = find_rule(param, NOWHERE)
+    weights = [torch.zeros(shape) for shape in SHAPES]
+    history = [torch.zeros(shape) for shape in SHAPES * rule.sets]
+    for iteration, (diffs, rate) in enumerate(zip(gradients, rates, strict=True)):
+        diffs = [d.clone() for d in diffs]
+        rule.compute(param, diffs, [rate, 2 * rate], history, iteration)
+        for w, d in zip(weights, diffs, strict=True):
+            w -= d
+    return weights, history
+
+
+@pytest.fixture
+def gradients() -> list[Tensors]:
+    generator = torch.Generator().manual_seed(1)
+    return [[torch.randn(shape, generator=generator) for shape in SHAPES] for _ in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("fields", "optimiser", "settings"),
+    [
+        ({"type": "SGD", "momentum": 0.9}, torch.optim.SGD, {"momentum": 0.9}),
+        ({"type": "SGD"}, torch.optim.SGD, {}),
+        ({"type": "Nesterov", "momentum": 0.9}, torch.optim.SGD, {"momentum": 0.9, "nesterov": True}),
+        ({"type": "AdaGrad", "delta": 0.01}, torch.optim.Adagrad, {"eps": 0.01}),
+        ({"type": "RMSProp", "rms_decay": 0.9, "delta": 0.01}, torch.optim.RMSprop, {"alpha": 0.9, "eps": 0.01}),
+        ({"type": "AdaDelta", "momentum": 0.95, "delta": 1e-3}, torch.optim.Adadelta, {"rho": 0.95, "eps": 1e-3}),
+        ({"type": "Adam", "momentum": 0.9, "delta": 0}, torch.optim.Adam, {"betas": (0.9, 0.999), "eps": 0}),
+    ],
+)
+def test_while_the_rate_stands_still_a_rule_is_that_of_torch(fields, optimiser, settings, gradients):
+    weights, _ = run(SolverParameter(**fields), gradients, [0.1] * len(gradients))
+    theirs = [torch.nn.Parameter(torch.zeros(shape)) for shape in SHAPES]
+    groups = [{"params": [theirs[0]], "lr": 0.1}, {"params": [theirs[1]], "lr": 0.2}]
+    optimizer = optimiser(groups, **settings)
+    for diffs in gradients:
+        for parameter, diff in zip(theirs, diffs, strict=True):
+            parameter.grad = diff.clone()
+        optimizer.step()
+    for mine, parameter in zip(weights, theirs, strict=True):
+        torch.testing.assert_close(mine, parameter.data, rtol=1e-5, atol=1e-6)
+
+
+def test_sgd_keeps_the_old_rate_in_its_velocity():
+    """The rate is inside the history: after a step of the rate the old velocity goes on as it was."""
+    ones = [[torch.ones(shape) for shape in SHAPES]] * 2
+    weights, history = run(SolverParameter(momentum=0.5), ones, [1.0, 0.0])
+    assert torch.all(history[0] == 0.5)
+    assert torch.all(weights[0] == -1.5)
+
+
+def test_adam_adds_delta_before_the_bias_correction():
+    ones = [[torch.ones(shape) for shape in SHAPES]]
+    weights, _ = run(SolverParameter(type="Adam", momentum=0.9, momentum2=0.99, delta=0.1), ones, [1.0])
+    expected = math.sqrt(1 - 0.99) / (1 - 0.9) * 0.1 / (math.sqrt(0.01) + 0.1)
+    assert weights[0][0, 0].item() == pytest.approx(-expected, rel=1e-5)
+
+
+def test_a_rate_of_0_moves_nothing_but_history_goes_on(gradients):
+    param = SolverParameter(momentum=0.9)
+    history = [torch.ones(shape) for shape in SHAPES]
+    diffs = [torch.zeros(shape) for shape in SHAPES]
+    RULES["SGD"].compute(param, diffs, [0.0, 0.0], history, 0)
+    assert torch.all(history[0] == torch.tensor(0.9))
+
+
+def test_the_second_set_of_the_history_follows_the_first(gradients):
+    _, history = run(SolverParameter(type="Adam", momentum=0.9), gradients, [0.1] * len(gradients))
+    assert [tuple(h.shape) for h in history] == SHAPES * 2
+    assert torch.all(history[2] >= 0)  # the squares
+    assert torch.any(history[0] < 0)  # the means
+
+
+def test_clip_scales_the_norm_of_all_gradients_together():
+    diffs = [torch.tensor([3.0]), torch.tensor([[4.0]])]
+    assert clip(diffs, 10) is None
+    assert clip(diffs, -1) is None
+    norm, factor = clip(diffs, 1) or (0, 0)
+    assert (norm, factor) == pytest.approx((5, 0.2))
+    torch.testing.assert_close(diffs, [torch.tensor([0.6]), torch.tensor([[0.8]])])
+
+
+def test_normalize_makes_the_sum_of_iter_size_passes_a_mean():
+    diffs = [torch.tensor([3.0, 6.0])]
+    normalize(diffs, 3)
+    torch.testing.assert_close(diffs[0], torch.tensor([1.0, 2.0]))
+
+
+def test_weight_decay_is_each_parameters_own():
+    weights = [torch.tensor([2.0, -4.0, 0.0]), torch.tensor([8.0])]
+    diffs = [torch.ones(3), torch.ones(1)]
+    regularize(diffs, weights, [0.5, 0.0], "L2")
+    assert diffs[0].tolist() == [2, -1, 1]
+    assert diffs[1].tolist() == [1]
+
+
+def test_l1_pulls_by_the_sign_and_leaves_a_weight_of_0():
+    weights, diffs = [torch.tensor([2.0, -4.0, 0.0])], [torch.ones(3)]
+    regularize(diffs, weights, [0.5], "L1")
+    assert diffs[0].tolist() == [1.5, 0.5, 1]
+
+
+def test_the_type_is_known_in_any_case_of_letters():
+    assert find_rule(SolverParameter(type="ADAM"), NOWHERE) is RULES["Adam"]
+    assert find_rule(SolverParameter(type="rmsprop"), NOWHERE) is RULES["RMSProp"]
+    assert find_rule(SolverParameter(), NOWHERE) is RULES["SGD"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"type": "Adan"}, 'unknown solver type "Adan", expected one of SGD, .*; did you mean "Adam"'),
+        ({"type": "AdaGrad", "momentum": 0.9}, "momentum cannot be used with AdaGrad"),
+        ({"type": "RMSProp", "momentum": 0.9}, "momentum cannot be used with RMSProp"),
+        ({"type": "RMSProp", "rms_decay": 1}, "rms_decay 1, expected at least 0 and less than 1"),
+    ],
+)
+def test_what_caffe_refuses(fields: dict, message: str):
+    with pytest.raises(SpecError, match=message):
+        find_rule(SolverParameter(**fields), NOWHERE)
