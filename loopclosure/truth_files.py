@@ -1,0 +1,161 @@
+"""Files that say which frames show the same place (masks as .mat, .npy, .txt or an image) and where they were taken."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy.io
+import scipy.sparse
+
+from loopclosure.errors import InputError
+
+# The FAB-MAP sets call it truth; several papers' derived files GT.
+TRUTH_KEYS = ("truth", "gt", "groundtruth", "ground_truth")
+COORDINATE_KEYS = ("gps", "coordinates", "xy")
+LOSSLESS_SUFFIXES = (".bmp", ".png", ".pgm", ".tif", ".tiff")
+
+
+def read_truth_matrix(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a mask of loops: (hard, soft), both (Q, R) bool.
+
+    0 is another place, 1 (or 255) the same place; what lies between is soft: near enough to be no mistake, but nothing
+    that must be found (the grey of RTAB-Map's masks). By its ending a file is MATLAB's (.mat, variable ``truth`` or
+    ``GT``, or its only matrix), numpy's (.npy), numbers separated by blanks or commas (.txt, .csv), or a lossless
+    image.
+    """
+    path = Path(path)
+    values = _read_matrix(path, TRUTH_KEYS, "a mask of loops")
+    if values.ndim != 2:
+        raise InputError(f"has shape {values.shape}; expected a matrix, queries x references", path)
+    if not np.all(np.isfinite(values)) or values.min(initial=0) < 0:
+        raise InputError("has a negative or not finite entry; expected 0 = another place, 1 = the same place", path)
+    largest = values.max(initial=0)
+    if largest not in (1, 255):
+        raise InputError(
+            f"its largest entry is {largest:g}; expected 1 or 255 for the same place, 0 for another place", path
+        )
+    return values == largest, values > 0
+
+
+def read_coordinates(path: str | Path) -> np.ndarray:
+    """Read where images were taken: (N, 2) x, y, from a .mat (variable ``GPS``), .npy or text file.
+
+    A row of the text has x and y, or the image's name, x and y.
+    """
+    path = Path(path)
+    values = _read_matrix(path, COORDINATE_KEYS, "coordinates", last_columns=2)
+    if values.ndim != 2 or values.shape[1] not in (2, 3):
+        raise InputError(f"has shape {values.shape}; expected x and y, or number, x and y, in each row", path)
+    if not np.all(np.isfinite(values)):
+        raise InputError("has an entry that is not finite; expected metres", path)
+    return values[:, -2:]
+
+
+def read_place_pairs(path: str | Path) -> list[tuple[str, Path, Path]]:
+    """Read a table of places seen twice, pairs.csv with columns place_id, query, ref: rows of place and two images.
+
+    The images are relative to the table's folder. Raises InputError (file:line) for a missing image.
+    """
+    path = Path(path)
+    rows = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream)
+            missing = {"place_id", "query", "ref"} - set(reader.fieldnames or ())
+            if missing:
+                raise InputError(f"has no column {', '.join(sorted(missing))}; expected place_id,query,ref", path, 1, 1)
+            for row in reader:
+                images = []
+                for column in ("query", "ref"):
+                    image = path.parent / (row[column] or "")
+                    if not image.is_file():
+                        raise InputError(f'no such {column} image "{row[column]}"', path, reader.line_num, 1)
+                    images.append(image)
+                rows.append((row["place_id"], images[0], images[1]))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError("cannot be read; expected a table with columns place_id,query,ref", path) from error
+    if not rows:
+        raise InputError("has no row", path)
+    return rows
+
+
+def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int | None = None) -> np.ndarray:
+    if not path.is_file():
+        raise InputError(f"no such file; expected {what}", path)
+    suffix = path.suffix.lower()
+    if suffix == ".mat":
+        return _read_mat(path, keys, what)
+    if suffix == ".npy":
+        try:
+            values = np.load(path, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot be read as .npy ({error}); expected {what}", path) from error
+        return _numeric(values, path)
+    if suffix in (".txt", ".csv", ".dat"):
+        return _read_text(path, what, last_columns)
+    if suffix in LOSSLESS_SUFFIXES:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise InputError(f"is not an image that can be read; expected {what}", path)
+        return image
+    raise InputError(
+        f'"{suffix}" is no known kind of file for {what}; known: .mat .npy .txt .csv {" ".join(LOSSLESS_SUFFIXES)}'
+        + (" (a JPEG has lost the exact values)" if suffix in (".jpg", ".jpeg") else ""),
+        path,
+    )
+
+
+def _read_mat(path: Path, keys: tuple[str, ...], what: str) -> np.ndarray:
+    try:
+        content: dict[str, Any] = scipy.io.loadmat(str(path))
+    except NotImplementedError as error:
+        raise InputError("is a MATLAB 7.3 file; save it anew in MATLAB with -v7", path) from error
+    except Exception as error:  # a broken file makes loadmat raise whatever its bytes lead to
+        raise InputError(f"cannot be read as .mat ({error}); expected {what}", path) from error
+    matrices = {}
+    for name, value in content.items():
+        if scipy.sparse.issparse(value):
+            value = value.toarray()
+        if not name.startswith("__") and isinstance(value, np.ndarray) and value.ndim == 2 and value.size > 1:
+            matrices[name] = value
+    named = [name for key in keys for name in matrices if name.lower() == key]
+    if not named and len(matrices) == 1:
+        named = list(matrices)
+    if not named:
+        found = ", ".join(f"{n} {m.shape[0]}x{m.shape[1]}" for n, m in matrices.items()) or "no matrix"
+        raise InputError(f'has no variable "{keys[0]}" ({what}); found {found}', path)
+    return _numeric(matrices[named[0]], path)
+
+
+def _numeric(values: np.ndarray, path: Path) -> np.ndarray:
+    if values.dtype.kind not in "buif":
+        raise InputError(f"holds {values.dtype}; expected numbers", path)
+    return values.astype(np.uint8) if values.dtype == bool else values
+
+
+def _read_text(path: Path, what: str, last_columns: int | None) -> np.ndarray:
+    """Read rows of numbers; ``last_columns`` takes only so many from the right, the others may be names."""
+    rows: list[list[float]] = []
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read as text; expected {what}", path) from error
+    for number, line in enumerate(lines, start=1):
+        fields = line.partition("#")[0].replace(",", " ").split()
+        if not fields:
+            continue
+        taken = fields if last_columns is None else fields[-last_columns:]
+        try:
+            row = [float(field) for field in taken]
+        except ValueError:
+            raise InputError(f'expected numbers, found "{line.strip()[:60]}"', path, number, 1) from None
+        if rows and len(row) != len(rows[0]):
+            raise InputError(f"has {len(row)} numbers, the rows above have {len(rows[0])}", path, number, 1)
+        rows.append(row)
+    if not rows:
+        raise InputError(f"is empty; expected {what}", path)
+    return np.array(rows)
