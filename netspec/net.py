@@ -122,18 +122,15 @@ class Net(torch.nn.Module):
         seed = int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed
         self.random = Random(seed)
         self.layers = self._build_layers(options)
-        self.inputs = [
-            blob for layer, node in zip(self.layers, plan.nodes, strict=True) if layer.is_input for blob in _tops(plan, node)
-        ]
+        self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
 
     # Building
 
     def _build_layers(self, options: BuildOptions) -> Any:
-        layers: list[Layer] = []
+        layers: dict[int, Layer] = {}  # without the faulty ones, where faults are collected
         shapes: dict[int, Shape] = {}
         memory = 0
-        complete = True
         for i, (node, param) in enumerate(zip(self.plan.nodes, self.param.layer, strict=True)):
             if not param.HasField("phase"):
                 param.phase = self.phase
@@ -141,12 +138,10 @@ class Net(torch.nn.Module):
             self._log_wiring(node)
             cls = layer_class(node.type)
             if cls is None:
-                complete = False
                 options.report(SpecError(_unknown_type(node.type), at("type")))
                 continue
             if any(v not in shapes for v in node.bottoms):
-                complete = False
-                continue  # a fault upstream was reported
+                continue  # for a fault upstream, which was reported
             context = Context(
                 phase=self.phase,
                 random=self.random,
@@ -159,10 +154,9 @@ class Net(torch.nn.Module):
             try:
                 layer = cls(param, [shapes[v] for v in node.bottoms], context)
                 weights = _loss_weights(layer)
-                layers.append(layer)
+                layers[i] = layer
                 self._adopt_params(layers, i, layer)
             except SpecError as fault:
-                complete = False
                 options.report(fault)
                 continue
             self.loss_weights.append(weights)
@@ -177,9 +171,9 @@ class Net(torch.nn.Module):
                 if weight:
                     log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
             log.info("net.cpp:139", f"Memory required for data: {memory}")
-        if complete:
-            self._finish(layers)
-        return torch.nn.ModuleList(layers)
+        if len(layers) == len(self.plan.nodes):
+            self._finish(list(layers.values()))
+        return torch.nn.ModuleList(layers.values())
 
     def _log_wiring(self, node: Any) -> None:
         log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
@@ -192,7 +186,7 @@ class Net(torch.nn.Module):
             else:
                 log.info("net.cpp:382", f"{node.name} -> {self.plan.blobs[v]}")
 
-    def _adopt_params(self, layers: list[Layer], i: int, layer: Layer) -> None:
+    def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer) -> None:
         """Tie the shared parameters of layer ``i`` to their owners; list the others as learnable."""
         node = self.plan.nodes[i]
         if len(node.params) > len(layer.blobs):
@@ -207,6 +201,8 @@ class Net(torch.nn.Module):
                 self.learnable.append(Learnable(parameter, spec.lr_mult, spec.decay_mult, node.name, j))
                 continue
             owner_index, owner_blob = spec.owner
+            if owner_index not in layers:
+                continue  # for a fault of the owner, which was reported
             owner = layers[owner_index]
             here, there = layer.blob_shapes[j], owner.blob_shapes[owner_blob]
             fits = _count(here) == _count(there) if spec.permissive else here == there

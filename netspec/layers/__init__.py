@@ -6,8 +6,10 @@ from netspec.layers import (  # noqa: F401
     data,
     loss,
     normalization,
+    python,
     recurrent,
     utility,
+    utility_shape,
     vision_convolution,
     vision_pooling,
 )

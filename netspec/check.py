@@ -1,0 +1,111 @@
+"""What a file builds, without opening any data: shapes, parameters, memory, multiply-adds; and every fault at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from netspec.errors import SpecError
+from netspec.graph.filter import with_state
+from netspec.layers.base import Shape
+from netspec.net import BuildOptions, Net, build_net
+from netspec.proto.text import parse_net, parse_solver
+
+
+@dataclass
+class Checked:
+    """One net of the file: ``label`` says which; ``net`` is None where its faults left nothing to build."""
+
+    label: str
+    net: Net | None
+    faults: list[SpecError] = field(default_factory=list)
+
+
+def is_solver(path: str | Path) -> bool:
+    """Return whether a file is a solver's rather than a net's: whichever reads further into it."""
+    try:
+        parse_net(path)
+        return False
+    except SpecError as as_net:
+        try:
+            parse_solver(path)
+            return True
+        except SpecError as as_solver:
+            return _reach(as_solver) > _reach(as_net)
+
+
+def _reach(fault: SpecError) -> tuple[int, int]:
+    return (fault.where.line, fault.where.column) if fault.where else (0, 0)
+
+
+def check_net(
+    net: Any, source: Any, label: str, shapes: Mapping[str, Shape], allow_python: bool = False
+) -> Checked:
+    """Build a net (its ``state`` set) on no device and collect its faults."""
+    faults: list[SpecError] = []
+    options = BuildOptions(
+        torch.device("meta"), 0, open_data=False, given_shapes=shapes, report=faults.append, allow_python=allow_python
+    )
+    built = build_net(net, source, options)
+    return Checked(label, built, faults)
+
+
+def check_file(
+    path: str | Path,
+    phase: int,
+    level: int = 0,
+    stages: Iterable[str] = (),
+    shapes: Mapping[str, Shape] | None = None,
+    allow_python: bool = False,
+) -> list[Checked]:
+    """Check a net for a phase, level and stages, or all nets of a solver."""
+    if is_solver(path):
+        from netspec.solver.solver import solver_nets
+
+        solver, node = parse_solver(path)
+        return [
+            check_net(net, source, label, shapes or {}, allow_python)
+            for label, net, source in solver_nets(solver, node, str(path), level=level, stages=tuple(stages))
+        ]
+    net, source = parse_net(path)
+    return [check_net(with_state(net, phase, level, stages), source, str(path), shapes or {}, allow_python)]
+
+
+def as_json(net: Net) -> dict[str, Any]:
+    """Return ``blobs`` name -> shape, ``params`` layer -> shapes, ``inputs``, ``outputs``."""
+    params = {}
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        if layer.blob_shapes:
+            params[node.name] = [list(shape) for shape in layer.blob_shapes]
+    blobs = {name: list(shape) for name, shape in net.shapes.items()}
+    return {"blobs": blobs, "params": params, "inputs": net.inputs, "outputs": net.outputs}
+
+
+def table(net: Net) -> str:
+    """Return a line a layer: name, type, top shapes, parameters, memory of its tops, multiply-adds; and the totals."""
+    head = ("layer", "type", "tops", "parameters", "MiB", "multiply-adds")
+    rows = []
+    totals = [0, 0, 0]
+    counted: set[int] = set()
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        parameters = sum(blob.numel() for blob in layer.blobs if id(blob) not in counted)
+        shared = len(layer.blobs) > 0 and parameters == 0
+        counted.update(id(blob) for blob in layer.blobs)
+        memory = 4 * sum(torch.Size(shape).numel() for shape in layer.top_shapes)
+        work = layer.multiply_adds()
+        for k, value in enumerate((parameters, memory, work)):
+            totals[k] += value
+        tops = ", ".join("x".join(map(str, shape)) or "scalar" for shape in layer.top_shapes)
+        count = "shared" if shared else (f"{parameters:,}" if parameters else "")
+        rows.append((node.name, node.type, tops, count, f"{memory / 2**20:.2f}", f"{work:,}" if work else ""))
+    rows.append(("total", "", "", f"{totals[0]:,}", f"{totals[1] / 2**20:.2f}", f"{totals[2]:,}"))
+    widths = [max(len(row[k]) for row in (head, *rows)) for k in range(len(head))]
+    lines = []
+    for row in (head, *rows):
+        cells = [cell.ljust(w) if k < 3 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)

@@ -1,0 +1,353 @@
+"""The command line: parses arguments, sets up the log, catches SpecError; computes nothing.
+
+Options may be written as gflags let Caffe's users write them: ``-solver s``, ``--solver=s``, ``-gpu 0``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import re
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from netspec import log
+from netspec.errors import SpecError
+
+PHASES = {"TRAIN": 0, "TEST": 1}
+EFFECTS = ("stop", "snapshot", "none")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage."""
+    return run(_parser(), list(sys.argv[1:] if argv is None else argv))
+
+
+def train(argv: Sequence[str] | None = None) -> int:
+    """Run ``netspec train``: the door ``tools/train.py``."""
+    return main(["train", *(sys.argv[1:] if argv is None else argv)])
+
+
+def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
+    """Parse the words of a command line, run the command's ``run``, and turn a fault of the user's files into one line."""
+    arguments = parser.parse_args([_gflag(word) for word in words])
+    try:
+        with _logging():
+            return arguments.run(arguments) or 0
+    except SpecError as fault:
+        print(fault, file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+
+
+def _gflag(word: str) -> str:
+    """Return ``-flag`` as ``--flag``; argparse knows one-letter options only with one dash."""
+    return "-" + word if re.match(r"-[A-Za-z_]\w", word) else word
+
+
+class _logging:
+    """Caffe's log on stderr, around the progress bar where there is one."""
+
+    def __enter__(self) -> None:
+        self.handler = logging.StreamHandler(_BarAware())
+        self.handler.setFormatter(log.GlogFormatter())
+        log.logger.addHandler(self.handler)
+        self.before = log.logger.level, log.logger.propagate
+        log.logger.setLevel(logging.INFO)
+        log.logger.propagate = False
+
+    def __exit__(self, *_: object) -> None:
+        log.logger.removeHandler(self.handler)
+        log.logger.level, log.logger.propagate = self.before
+
+
+class _BarAware:
+    """A stream that writes to stderr above a tqdm bar, if one is shown."""
+
+    def write(self, text: str) -> None:
+        tqdm = sys.modules.get("tqdm")
+        if tqdm is None or not sys.stderr.isatty():
+            sys.stderr.write(text)
+        elif text.rstrip("\n"):
+            tqdm.tqdm.write(text.rstrip("\n"), file=sys.stderr)
+
+    def flush(self) -> None:
+        sys.stderr.flush()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="netspec", description="Run Caffe's prototxt in PyTorch, with Caffe's numbers.", allow_abbrev=False
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, function: Callable[[argparse.Namespace], int | None], summary: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        added.set_defaults(run=function)
+        return added
+
+    p = command("train", _train, "train or fine-tune a model (caffe train)")
+    p.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
+    p.add_argument("--solver", help="the solver's prototxt")
+    p.add_argument("--snapshot", help="a .solverstate to resume from")
+    p.add_argument("--weights", help="weights to start from, several separated by commas")
+    _add_device(p)
+    _add_state(p, phase=None)
+    p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
+    p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="default: snapshot")
+    _add_python(p)
+
+    p = command("test", _test, "score a model on its TEST-phase data (caffe test)")
+    p.add_argument("--model", required=True, help="the net's prototxt")
+    p.add_argument("--weights", required=True, help="the trained weights")
+    p.add_argument("--iterations", type=_positive, default=50, help="batches to run (default: 50)")
+    _add_device(p)
+    _add_state(p, phase=None)
+    _add_python(p)
+
+    p = command("time", _time, "measure a model's forward and backward milliseconds a layer (caffe time)")
+    p.add_argument("--model", required=True, help="the net's prototxt")
+    p.add_argument("--iterations", type=_positive, default=50, help="passes to time (default: 50)")
+    _add_device(p)
+    _add_state(p, phase="TRAIN")
+    _add_python(p)
+
+    p = command("check", _check, "build a net, or a solver's nets, without opening data; report every fault")
+    p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
+    _add_state(p, phase="TEST")
+    p.add_argument(
+        "--shape", action="append", default=[], type=_shape, metavar="BLOB=N,C,H,W", help="the shape of a data layer's top"
+    )
+    p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")
+    _add_python(p)
+
+    p = command("extract", _extract, "write blobs, over the records of a data layer or over images, to an .npz")
+    p.add_argument("--model", required=True, help="the net's prototxt")
+    p.add_argument("--weights", help="the trained weights; without, random ones")
+    p.add_argument("--blob", required=True, nargs="+", action="extend", help="the blobs to write")
+    p.add_argument("--out", required=True, help="the .npz to write")
+    p.add_argument("--source", action="append", default=[], type=_source, metavar="LAYER=DB", help="another database")
+    p.add_argument("--iterations", type=_positive, help="batches to run (default: every record once)")
+    p.add_argument("--images", metavar="FOLDER|LIST", help="image files instead of records")
+    p.add_argument("--input", default="data", help="the blob that images go into (default: data)")
+    p.add_argument("--shape", type=_shape, metavar="BLOB=N,C,H,W", help="that blob's shape, where the data is not at hand")
+    _add_device(p)
+    _add_state(p, phase="TEST")
+    _add_python(p)
+
+    command("layers", _layers, "print the layers it knows, from their own descriptions")
+    return parser
+
+
+def _add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--gpu", default="", help="the GPU to run on (default: as the solver says, else the CPU)")
+
+
+def _add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
+    if phase:
+        parser.add_argument("--phase", default=phase, choices=sorted(PHASES), type=str.upper, help=f"default: {phase}")
+    parser.add_argument("--level", type=int, default=0, help="the NetState's level (default: 0)")
+    parser.add_argument("--stage", default="", help="the NetState's stages, separated by commas")
+
+
+def _add_python(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--allow-python-layers", action="store_true", help="let Python layers of the net run their code")
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a positive number")
+    return value
+
+
+def _shape(text: str) -> tuple[str, tuple[int, ...]]:
+    match = re.fullmatch(r"([^=]+)=(\d+(?:,\d+)*)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected BLOB=N,C,H,W, e.g. data=32,3,224,224")
+    return match[1], tuple(int(d) for d in match[2].split(","))
+
+
+def _source(text: str) -> tuple[str, str]:
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected LAYER=DB")
+    return name, path
+
+
+def _stages(arguments: argparse.Namespace) -> tuple[str, ...]:
+    return tuple(stage for stage in arguments.stage.split(",") if stage)
+
+
+def _device(gpu: str) -> Any:
+    """Return the torch device of ``--gpu``: the CPU where it is empty."""
+    import torch
+
+    if not gpu:
+        return torch.device("cpu")
+    if gpu == "all" or "," in gpu:
+        raise SpecError(f"--gpu {gpu}: several GPUs are not supported; give one number")
+    if not gpu.isdigit():
+        raise SpecError(f"--gpu {gpu}: expected the number of a GPU")
+    count = torch.cuda.device_count()
+    if int(gpu) >= count:
+        raise SpecError(f"--gpu {gpu}: this machine has {count or 'no'} GPU(s) that torch can use; leave --gpu out for the CPU")
+    return torch.device("cuda", int(gpu))
+
+
+def _bar(description: str, unit: str) -> Callable[[Any], Any]:
+    """Return a wrapper that shows a progress bar on a terminal."""
+    from tqdm import tqdm
+
+    return lambda items: tqdm(items, desc=description, unit=unit, disable=not sys.stderr.isatty(), leave=False)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
+    from netspec.solver.solver import load_solver
+
+    path = arguments.solver or arguments.path
+    if not path or (arguments.solver and arguments.path):
+        raise SpecError("train: need one solver definition; netspec train solver.prototxt")
+    if arguments.snapshot and arguments.weights:
+        raise SpecError("train: give a snapshot to resume training or weights to fine-tune, not both")
+    requested: list[str] = []
+    for number, effect in ((signal.SIGINT, arguments.sigint_effect), (signal.SIGHUP, arguments.sighup_effect)):
+        if effect != "none":
+            signal.signal(number, lambda *_, effect=effect: requested.append(effect))
+        else:
+            signal.signal(number, signal.SIG_IGN)
+    solver = load_solver(
+        path,
+        weights=arguments.weights,
+        snapshot=arguments.snapshot,
+        device=_device(arguments.gpu) if arguments.gpu else None,
+        level=arguments.level,
+        stages=tuple(arguments.stage.split(",")),
+        allow_python=arguments.allow_python_layers,
+        action=lambda: requested.pop(0) if requested else None,
+    )
+    log.info("caffe.cpp:239", "Starting Optimization")
+    total = solver.param.max_iter
+    with tqdm(total=total, initial=solver.iteration, unit="it", disable=not sys.stderr.isatty(), leave=False) as bar:
+        solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
+        solver.solve()
+    solver.close()
+    log.info("caffe.cpp:250", "Optimization Done.")
+
+
+def _load(arguments: argparse.Namespace, phase: str) -> Any:
+    from netspec.net import load_net
+
+    device = _device(arguments.gpu)
+    log.info("caffe.cpp:275", "Use CPU." if device.type == "cpu" else f"Use GPU with device ID {device.index}")
+    return load_net(
+        arguments.model,
+        phase,
+        level=arguments.level,
+        stages=_stages(arguments),
+        device=device,
+        allow_python=arguments.allow_python_layers,
+    )
+
+
+def _test(arguments: argparse.Namespace) -> None:
+    from netspec.runs import test_net
+    from netspec.weights import load_weights
+
+    net = _load(arguments, "TEST")
+    for path in arguments.weights.split(","):
+        load_weights(net, path)
+    test_net(net, arguments.iterations)
+    net.close()
+
+
+def _time(arguments: argparse.Namespace) -> None:
+    from netspec.runs import time_net
+
+    net = _load(arguments, arguments.phase)
+    time_net(net, arguments.iterations)
+    net.close()
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from netspec.check import as_json, check_file, table
+
+    log.logger.setLevel(logging.WARNING)
+    shapes = dict(arguments.shape)
+    checked = check_file(
+        arguments.file,
+        PHASES[arguments.phase],
+        arguments.level,
+        _stages(arguments),
+        shapes,
+        arguments.allow_python_layers,
+    )
+    faults = dict.fromkeys(str(fault) for part in checked for fault in part.faults)
+    if faults:
+        print("\n".join(faults), file=sys.stderr)
+        return 1
+    if arguments.json:
+        found = {part.label: as_json(part.net) for part in checked if part.net}
+        print(json.dumps(next(iter(found.values())) if len(found) == 1 else found))
+        return 0
+    for part in checked:
+        if part.net:
+            print(f"{part.label}: {part.net.name or 'a net without a name'}\n{table(part.net)}\n")
+    return 0
+
+
+def _extract(arguments: argparse.Namespace) -> None:
+    import numpy as np
+
+    from netspec.extract import extract_images, extract_records, image_net, read_image_list, with_sources
+    from netspec.graph.filter import with_state
+    from netspec.net import BuildOptions, build_net
+    from netspec.proto.text import parse_net
+    from netspec.weights import load_weights
+
+    device = _device(arguments.gpu)
+    out = Path(arguments.out)
+    if not out.parent.is_dir():
+        raise SpecError(f"--out {out}: there is no folder {out.parent}; make it first")
+    if not arguments.weights:
+        log.warning("extract_features.cpp:62", "no --weights: the net has random ones")
+    if arguments.images:
+        if len(arguments.blob) != 1:
+            raise SpecError(f"--images takes one --blob, found {len(arguments.blob)}")
+        (blob,) = arguments.blob
+        if arguments.shape and arguments.shape[0] != arguments.input:
+            raise SpecError(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
+        images = read_image_list(Path(arguments.images))
+        shape = arguments.shape[1] if arguments.shape else None
+        net, scaling = image_net(arguments.model, blob, arguments.input, shape, device)
+        if arguments.weights:
+            load_weights(net, arguments.weights)
+        arrays = extract_images(net, scaling, blob, images, progress=_bar("extract", "batch"))
+    else:
+        message, source = parse_net(arguments.model)
+        stated = with_state(message, PHASES[arguments.phase], arguments.level, _stages(arguments))
+        stated = with_sources(stated, source, dict(arguments.source))
+        net = build_net(stated, source, BuildOptions(device, allow_python=arguments.allow_python_layers))
+        if arguments.weights:
+            load_weights(net, arguments.weights)
+        arrays = extract_records(net, arguments.blob, arguments.iterations, _bar("extract", "batch"))
+    net.close()
+    with out.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def _layers(arguments: argparse.Namespace) -> None:
+    from netspec.layers import layer_class, layer_types
+
+    for name in layer_types():
+        cls = layer_class(name)
+        first = ((cls and cls.__doc__) or "").strip().splitlines()[0]
+        print(f"{name:28} {first}")

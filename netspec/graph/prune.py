@@ -1,0 +1,50 @@
+"""The part of a net that computes given blobs from given inputs: how features are taken from images with a training net."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from netspec.errors import SpecError, Where, did_you_mean
+from netspec.proto.schema import NetParameter
+from netspec.proto.source_map import SourceMap
+
+
+def prune(
+    net: Any, source: SourceMap, wanted: Sequence[str], given: Mapping[str, Sequence[int]]
+) -> tuple[Any, SourceMap]:
+    """Return the filtered net with only the layers that ``wanted`` blobs need.
+
+    The layer that first writes a blob of ``given`` (name -> shape) is replaced by an Input layer of that shape; layers
+    that change it in place stay. Raises SpecError for a blob that the net does not have.
+    """
+    blobs = [top for layer in net.layer for top in layer.top]
+    for name in (*wanted, *given):
+        if name not in blobs:
+            known = ", ".join(dict.fromkeys(blobs))
+            raise SpecError(f'no blob "{name}" in this net{did_you_mean(name, blobs) or ";"} it has: {known}', Where(source.file))
+    needed = set(wanted)
+    kept: list[int] = []
+    for i in reversed(range(len(net.layer))):
+        layer = net.layer[i]
+        made = {top for top in layer.top if top in needed}
+        if not made:
+            continue
+        fresh = {top for j, top in enumerate(layer.top) if j >= len(layer.bottom) or layer.bottom[j] != top}
+        if made & fresh and made <= set(given):
+            continue  # an Input layer stands for it
+        kept.append(i)
+        needed -= fresh - set(given)
+        needed.update(layer.bottom)
+    pruned = NetParameter()
+    pruned.CopyFrom(net)
+    del pruned.layer[:]
+    places = []
+    for name, shape in given.items():
+        entry = pruned.layer.add(name=name, type="Input", top=[name])
+        entry.input_param.shape.add().dim.extend(shape)
+        places.append(source.net)
+    for i in reversed(kept):
+        pruned.layer.add().CopyFrom(net.layer[i])
+        places.append(source.layers[i])
+    return pruned, source.with_layers(places)

@@ -1,0 +1,59 @@
+"""Every layer case that BVLC Caffe computed: outputs, input gradients, parameter gradients, running statistics."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import netspec
+
+CASES = sorted((Path(__file__).parents[1] / "golden" / "layers").iterdir())
+TOLERANCE = 1e-5  # of the largest element
+
+
+def assert_close(found: np.ndarray, expected: np.ndarray, what: str) -> None:
+    assert found.shape == expected.shape, what
+    scale = max(float(np.abs(expected).max(initial=0)), 1e-30)
+    worst = float(np.abs(found.astype(np.float64) - expected).max(initial=0)) / scale
+    assert worst <= TOLERANCE, f"{what}: off by {worst:.2e} of the largest element"
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
+def test_layer_computes_what_caffe_computed(case: Path) -> None:
+    golden = np.load(case / "golden.npz")
+    meta = json.loads(str(golden["meta"]))
+    net = netspec.load_net(case / "net.prototxt", phase=meta["phase"])
+    for key in golden.files:
+        if key.startswith("param_init/"):
+            _, layer, index = key.split("/")
+            net.params[layer][int(index)].data.copy_(torch.from_numpy(golden[key]))
+    inputs = {}
+    for name in net.inputs:
+        inputs[name] = torch.from_numpy(golden[f"in/{name}"]).requires_grad_(bool(meta["grad"]))
+    for _ in range(meta["warmup"]):
+        net(**inputs)
+    outputs = net(**inputs)
+    expected_outputs = [key[len("out/") :] for key in golden.files if key.startswith("out/")]
+    assert list(outputs) == sorted(expected_outputs)
+    for name, output in outputs.items():
+        assert_close(output.detach().numpy(), golden[f"out/{name}"], f"output {name}")
+    if meta["grad"]:
+        reached = {name: blob for name, blob in outputs.items() if blob.requires_grad and f"topdiff/{name}" in golden}
+        diffs = [torch.from_numpy(golden[f"topdiff/{name}"]).reshape(blob.shape) for name, blob in reached.items()]
+        torch.autograd.backward(list(reached.values()), diffs)
+        for key in golden.files:
+            kind, *rest = key.split("/")
+            if kind == "indiff":
+                assert_close(_gradient(inputs[rest[0]]), golden[key], f"gradient of input {rest[0]}")
+            elif kind == "paramdiff":
+                assert_close(_gradient(net.params[rest[0]][int(rest[1])]), golden[key], f"gradient of {key}")
+    for key in golden.files:
+        if key.startswith("param_after/"):
+            _, layer, index = key.split("/")
+            assert_close(net.params[layer][int(index)].detach().numpy(), golden[key], key)
+
+
+def _gradient(tensor: torch.Tensor) -> np.ndarray:
+    return np.zeros(tuple(tensor.shape), np.float32) if tensor.grad is None else tensor.grad.numpy()
