@@ -1,11 +1,15 @@
 """Caffe's messages as Python classes, in a descriptor pool of their own.
 
-The pool is private: another "caffe.proto" in the process (pycaffe's, a converter's) does not clash with this one, and no
-generated module ties netspec to one version of protobuf. ``caffe.desc`` is ``caffe.proto`` compiled; how, says its head.
+The pool is private: another "caffe.proto" in the process (pycaffe's, a converter's) does not clash with this one, and
+no generated module ties netspec to one version of protobuf. ``caffe.desc`` is ``caffe.proto`` compiled; the head of that
+file says how.
 """
+
+# ruff: noqa: D101 (the messages are described in caffe.proto)
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +19,7 @@ from google.protobuf.message import Message
 PACKAGE = "caffe"
 _LAST_NUMBER = 1 << 29  # field numbers end before this
 
-#: The pool; :mod:`netspec.proto.dialect` adds the files of forks to it.
+#: The pool; :mod:`netspec.proto.dialect` adds the messages and fields of forks to it.
 pool = descriptor_pool.DescriptorPool()
 
 
@@ -24,8 +28,8 @@ def _load() -> None:
     files.ParseFromString(Path(__file__).with_name("caffe.desc").read_bytes())
     for file in files.file:
         for declared in file.message_type:
-            # Numbers above Caffe's own are open for the fields of forks: as extensions they can come later, and do not
-            # change the classes below.
+            # Numbers above Caffe's own are open for the fields of forks: as extensions they can come later, and do
+            # not change the classes below.
             declared.extension_range.add(start=max(f.number for f in declared.field) + 1, end=_LAST_NUMBER)
         pool.Add(file)
 
@@ -43,44 +47,43 @@ def message(name: str) -> type[Message]:
 
 if TYPE_CHECKING:
 
-    class _CaffeMessage(Message):
-        """What a type checker may know: the fields exist at run time only."""
+    class CaffeMessage(Message):
+        """What a type checker may know of a message: its fields exist at run time only."""
 
         def __init__(self, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> Any: ...
         def __setattr__(self, name: str, value: Any) -> None: ...
 
-    class BlobShape(_CaffeMessage): ...
+    class BlobShape(CaffeMessage): ...
 
-    class BlobProto(_CaffeMessage): ...
+    class BlobProto(CaffeMessage): ...
 
-    class BlobProtoVector(_CaffeMessage): ...
+    class BlobProtoVector(CaffeMessage): ...
 
-    class Datum(_CaffeMessage): ...
+    class Datum(CaffeMessage): ...
 
-    class FillerParameter(_CaffeMessage): ...
+    class FillerParameter(CaffeMessage): ...
 
-    class NetParameter(_CaffeMessage): ...
+    class NetParameter(CaffeMessage): ...
 
-    class SolverParameter(_CaffeMessage): ...
+    class SolverParameter(CaffeMessage): ...
 
-    class SolverState(_CaffeMessage): ...
+    class SolverState(CaffeMessage): ...
 
-    class NetState(_CaffeMessage): ...
+    class NetState(CaffeMessage): ...
 
-    class NetStateRule(_CaffeMessage): ...
+    class NetStateRule(CaffeMessage): ...
 
-    class ParamSpec(_CaffeMessage): ...
+    class ParamSpec(CaffeMessage): ...
 
-    class LayerParameter(_CaffeMessage): ...
+    class LayerParameter(CaffeMessage): ...
 
-    class V1LayerParameter(_CaffeMessage): ...
+    class V1LayerParameter(CaffeMessage): ...
 
-    class V0LayerParameter(_CaffeMessage): ...
-
-    class TransformationParameter(_CaffeMessage): ...
+    class TransformationParameter(CaffeMessage): ...
 
 else:
+    CaffeMessage = Message
     BlobShape = message("BlobShape")
     BlobProto = message("BlobProto")
     BlobProtoVector = message("BlobProtoVector")
@@ -94,5 +97,80 @@ else:
     ParamSpec = message("ParamSpec")
     LayerParameter = message("LayerParameter")
     V1LayerParameter = message("V1LayerParameter")
-    V0LayerParameter = message("V0LayerParameter")
     TransformationParameter = message("TransformationParameter")
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field as reading and writing text need it, Caffe's own or a fork's.
+
+    ``type`` is a FieldDescriptorProto.Type. ``descriptor`` is protobuf's, whose property for the label changed between
+    its versions.
+    """
+
+    name: str
+    type: int
+    repeated: bool
+    required: bool
+    descriptor: Any
+
+    def get(self, message: Message) -> Any:
+        """Return the value, its default where it is absent; of a repeated field, its list."""
+        return message.Extensions[self.descriptor] if self.descriptor.is_extension else getattr(message, self.name)
+
+    def set(self, message: Message, value: Any) -> None:
+        """Set a singular scalar."""
+        if self.descriptor.is_extension:
+            message.Extensions[self.descriptor] = value
+        else:
+            setattr(message, self.name, value)
+
+    def present(self, message: Message) -> bool:
+        """Say whether a value was given."""
+        if self.repeated:
+            return len(self.get(message)) > 0
+        if self.descriptor.is_extension:
+            return message.HasExtension(self.descriptor)
+        return message.HasField(self.name)
+
+
+#: Fields that active dialects add: full name of the message -> name of the field -> Field.
+added_fields: dict[str, dict[str, Field]] = {}
+_own_fields: dict[str, dict[str, Field]] = {}
+
+
+def as_field(declared: descriptor_pb2.FieldDescriptorProto, descriptor: Any) -> Field:
+    """Return the Field of a declaration and of its descriptor in the pool."""
+    return Field(
+        declared.name,
+        descriptor.type,
+        declared.label == descriptor_pb2.FieldDescriptorProto.LABEL_REPEATED,
+        declared.label == descriptor_pb2.FieldDescriptorProto.LABEL_REQUIRED,
+        descriptor,
+    )
+
+
+def fields_of(descriptor: Any) -> dict[str, Field]:
+    """Return the fields of a message's descriptor by name: the schema's own, then those of the active dialects."""
+    name = descriptor.full_name
+    if name not in _own_fields:
+        declared = descriptor_pb2.DescriptorProto()
+        descriptor.CopyToProto(declared)
+        _own_fields[name] = {f.name: as_field(f, descriptor.fields_by_name[f.name]) for f in declared.field}
+    return {**_own_fields[name], **added_fields[name]} if name in added_fields else _own_fields[name]
+
+
+def _field(message: Message, name: str) -> Field:
+    field = fields_of(message.DESCRIPTOR).get(name)
+    assert field is not None, f"{message.DESCRIPTOR.full_name} has no field {name}, nor has an active dialect"
+    return field
+
+
+def value(message: Message, name: str) -> Any:
+    """Return the value of a field, its default where it is absent; ``name`` may be a field of an active dialect."""
+    return _field(message, name).get(message)
+
+
+def has(message: Message, name: str) -> bool:
+    """Say whether a field was given; ``name`` may be a field of an active dialect."""
+    return _field(message, name).present(message)

@@ -16,7 +16,7 @@ class Node:
     fields: Mapping[str, tuple[Node, ...]] = field(default_factory=dict)
 
     def find(self, *path: str | int) -> Where:
-        """Return the place of ``path``, e.g. ``("convolution_param", "pad", 1)``; of the nearest known ancestor otherwise.
+        """Return the place of ``path``, e.g. ``("convolution_param", "pad", 1)``, or of its nearest known ancestor.
 
         A name steps to the first value of that field, an index after it to the value of that index.
         """
@@ -41,10 +41,20 @@ class SourceMap:
     layers: tuple[Node, ...] = ()
 
     @staticmethod
+    def of(net: Node) -> SourceMap:
+        """Return the map of a net just read, whose layers are in ``layer``, or of an old one, in ``layers``."""
+        return SourceMap(net.where.file, net, (*net.fields.get("layer", ()), *net.fields.get("layers", ())))
+
+    @staticmethod
     def unknown(file: str, count: int) -> SourceMap:
         """A map for a net that did not come from text (a binary file, a message made in Python)."""
         node = Node(Where(file))
         return SourceMap(file, node, (node,) * count)
+
+    def as_net(self) -> Node:
+        """Return the places of the net with those of its layers as they are now; see :meth:`of`."""
+        others = {name: nodes for name, nodes in self.net.fields.items() if name not in ("layer", "layers")}
+        return replace(self.net, fields={**others, "layer": self.layers})
 
     def at(self, index: int, *path: str | int, layer: str = "", type: str = "") -> Where:
         """Return the place of a field of layer ``index``, labelled with the layer's name and type."""

@@ -1,0 +1,121 @@
+"""The dialects of Caffe's forks: their messages and fields, added to the schema while a dialect is active.
+
+A dialect writes its additions down in the language of caffe.proto: new messages as they stand in the fork's own file,
+and new fields of Caffe's messages in ``extend``::
+
+    message NormalizeParameter {
+      optional bool across_spatial = 1 [default = true];
+    }
+    extend LayerParameter {
+      optional NormalizeParameter norm_param = 206;
+    }
+
+The text reader and writer then take ``norm_param { ... }`` for one of LayerParameter's fields, and a layer reads it with
+``schema.value(self.param, "norm_param")``. The classes of Caffe's messages stay the same objects throughout; while no
+dialect is active, the schema is Caffe's. Numbers must be above those that Caffe itself uses in the message, so a fork
+that took one of these (``interp_param = 143``) needs another number here: text files do not tell the difference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from google.protobuf.descriptor_pb2 import FileDescriptorProto
+
+from netspec.errors import SpecError, Where
+from netspec.proto.declarations import read_declarations
+from netspec.proto.schema import PACKAGE, added_fields, as_field, fields_of, pool
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """What a fork adds. ``advice`` says to a user how to switch it on, e.g. ``"add --plugin ssd"``."""
+
+    name: str
+    source: str = ""
+    layer_types: tuple[str, ...] = ()
+    advice: str = ""
+
+    @cached_property
+    def declarations(self) -> FileDescriptorProto:
+        """The additions as a descriptor, in a package of their own, so that forks may use the same names."""
+        file = read_declarations(self.source, f"{self.name}.proto", f"{PACKAGE}.{self.name}")
+        if "caffe.proto" not in file.dependency:
+            file.dependency.append("caffe.proto")
+        return file
+
+    def fields(self) -> set[tuple[str, str]]:
+        """The fields that it adds: full name of Caffe's message and name of the field."""
+        return {(f"{PACKAGE}.{f.extendee.removeprefix(f'{PACKAGE}.')}", f.name) for f in self.declarations.extension}
+
+
+_known: dict[str, Dialect] = {}
+_active: dict[str, Dialect] = {}
+
+
+def announce(dialect: Dialect) -> None:
+    """Make a dialect known, so that errors about its fields and layer types say that it has them."""
+    _known[dialect.name] = dialect
+
+
+def activate(dialect: Dialect) -> None:
+    """Announce a dialect and add its fields and messages to the schema. Does nothing if it is active.
+
+    Raises SpecError where its declarations cannot be read, or where the schema or another active dialect has a field or
+    a number of it already.
+    """
+    announce(dialect)
+    if dialect.name in _active:
+        return
+    file = dialect.declarations
+    for full_name, field in dialect.fields():
+        if field in fields_of(pool.FindMessageTypeByName(full_name)):
+            raise SpecError(f'{full_name} has a field "{field}" already', Where(file.name))
+    try:
+        pool.FindFileByName(file.name)
+    except KeyError:
+        _add(file)
+    for declared in file.extension:
+        descriptor = pool.FindExtensionByName(f"{file.package}.{declared.name}")
+        fields = added_fields.setdefault(descriptor.containing_type.full_name, {})
+        fields[declared.name] = as_field(declared, descriptor)
+    _active[dialect.name] = dialect
+
+
+def _add(file: FileDescriptorProto) -> None:
+    try:
+        pool.Add(file)
+    except TypeError as fault:
+        raise SpecError(f"these declarations do not fit Caffe's schema: {fault}", Where(file.name)) from None
+
+
+def deactivate(name: str) -> None:
+    """Take the fields of an active dialect out of the schema again."""
+    for full_name, field in _active.pop(name).fields():
+        del added_fields[full_name][field]
+
+
+def active() -> list[str]:
+    """Return the names of the active dialects."""
+    return sorted(_active)
+
+
+def advice_for_field(message: str, field: str) -> str:
+    """Return which known dialect has a field of a message (full name), and what to do; or an empty string."""
+    return _advice(field, [d for d in _known.values() if (message, field) in d.fields()])
+
+
+def advice_for_type(layer_type: str) -> str:
+    """Return which known dialect has a layer type, and what to do; or an empty string."""
+    return _advice(layer_type, [d for d in _known.values() if layer_type in d.layer_types])
+
+
+def _advice(name: str, dialects: list[Dialect]) -> str:
+    if not dialects:
+        return ""
+    names = " and ".join(f'"{d.name}"' for d in dialects)
+    advice = f"; {dialects[0].advice}" if dialects[0].advice else ""
+    return (
+        f'dialect{"s" if len(dialects) > 1 else ""} {names} {"have" if len(dialects) > 1 else "has"} "{name}"{advice}'
+    )

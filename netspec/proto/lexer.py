@@ -1,0 +1,118 @@
+"""Protobuf's text format cut into tokens that know their line and column.
+
+What a token is: https://protobuf.dev/reference/protobuf/textformat-spec/, and where that is stricter than the C++ parser
+that Caffe uses (strings over several lines, a number glued to the next name), what the C++ parser takes.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from netspec.errors import SpecError, Where
+
+NAME, INTEGER, FLOAT, STRING, SYMBOL, END = "name", "integer", "float", "string", "symbol", "end"
+
+_TOKEN = re.compile(
+    r"""
+    (?P<skip>   (?: [\ \t\r\n\v\f]+ | \#[^\n]* )+ )
+  | (?P<name>   [A-Za-z_][A-Za-z0-9_]* )
+  | (?P<float>  (?: [0-9]+\.[0-9]* | \.[0-9]+ ) (?: [eE][+-]?[0-9]+ )? [fF]?
+              | [0-9]+ [eE][+-]?[0-9]+ [fF]?
+              | [0-9]+ [fF] )
+  | (?P<integer> 0[xX][0-9a-fA-F]+ | [0-9]+ )
+  | (?P<string> " [^"\\]* (?: \\. [^"\\]* )* " | ' [^'\\]* (?: \\. [^'\\]* )* ' )
+  | (?P<symbol> [{}<>\[\]:;,\-] )
+    """,
+    re.VERBOSE | re.DOTALL,
+)
+_ESCAPE = re.compile(r"\\(?:([0-7]{1,3})|[xX]([0-9a-fA-F]{1,2})|u([0-9a-fA-F]{4})|U([0-9a-fA-F]{8})|(.))", re.DOTALL)
+_SIMPLE_ESCAPES = {"a": 7, "b": 8, "f": 12, "n": 10, "r": 13, "t": 9, "v": 11, "\\": 92, "?": 63, "'": 39, '"': 34}
+
+
+@dataclass(frozen=True)
+class Token:
+    """A token: its kind, its spelling, and where its first character stands in the text."""
+
+    kind: str
+    text: str
+    start: int
+
+
+class Lexer:
+    """The tokens of a text, one after the other, ending with one of kind END.
+
+    Bytes that were not UTF-8 are expected as ``surrogateescape`` leaves them; in comments they do no harm.
+    """
+
+    def __init__(self, text: str, file: str) -> None:
+        self.text = text
+        self.file = file
+        self._lines = [0, *(m.end() for m in re.finditer("\n", text))]
+
+    def __iter__(self) -> Iterator[Token]:
+        position, text = 0, self.text
+        while position < len(text):
+            match = _TOKEN.match(text, position)
+            if match is None:
+                raise self._unexpected(position)
+            kind = match.lastgroup or ""
+            if kind != "skip":
+                yield Token(kind, match.group(), position)
+            position = match.end()
+        yield Token(END, "", position)
+
+    def where(self, start: int) -> Where:
+        """Return the place of a character."""
+        line = bisect_right(self._lines, start)
+        return Where(self.file, line, start - self._lines[line - 1] + 1)
+
+    def unquote(self, token: Token) -> bytes:
+        """Return what a STRING token stands for, escapes resolved."""
+        inner = token.text[1:-1]
+        offset = token.start + 1
+        pieces: list[bytes] = []
+        done = 0
+        for match in _ESCAPE.finditer(inner):
+            pieces.append(self._utf8(inner[done : match.start()], offset + done))
+            pieces.append(self._escape(match, offset + match.start()))
+            done = match.end()
+        pieces.append(self._utf8(inner[done:], offset + done))
+        return b"".join(pieces)
+
+    def _escape(self, match: re.Match[str], start: int) -> bytes:
+        octal, hexadecimal, short, long, simple = match.groups()
+        if octal or hexadecimal:
+            return bytes([int(octal, 8) & 255 if octal else int(hexadecimal, 16)])
+        if short or long:
+            code = int(short or long, 16)
+            if code > 0x10FFFF or 0xD800 <= code <= 0xDFFF:
+                raise SpecError(f"{match.group()} is not a character of Unicode", self.where(start))
+            return chr(code).encode()
+        if simple not in _SIMPLE_ESCAPES:
+            raise SpecError(
+                f"unknown escape {match.group()!r} in a string; a backslash itself is \\\\", self.where(start)
+            )
+        return bytes([_SIMPLE_ESCAPES[simple]])
+
+    def _utf8(self, piece: str, start: int) -> bytes:
+        try:
+            return piece.encode()
+        except UnicodeEncodeError as fault:
+            raise self._not_utf8(start + fault.start) from None
+
+    def _not_utf8(self, position: int) -> SpecError:
+        byte = ord(self.text[position]) & 255
+        return SpecError(f"byte 0x{byte:02x} is not UTF-8; save the file as UTF-8 text", self.where(position))
+
+    def _unexpected(self, position: int) -> SpecError:
+        character = self.text[position]
+        if character in "\"'":
+            return SpecError("string without a closing quote", self.where(position))
+        if "\udc80" <= character <= "\udcff":
+            return self._not_utf8(position)
+        if not character.isprintable():
+            return SpecError(f"unexpected character 0x{ord(character):02x}; is this a text file?", self.where(position))
+        return SpecError(f'unexpected character "{character}"', self.where(position))

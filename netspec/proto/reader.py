@@ -1,0 +1,307 @@
+"""Protobuf's text format into a message, by reflection, with the place of everything that was read.
+
+What is accepted is what the C++ parser accepts that Caffe uses, so that a file which Caffe reads is read here, and one
+that it refuses is refused, in one line that says where and why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
+from google.protobuf.message import Message
+
+from netspec.errors import SpecError, Where, did_you_mean
+from netspec.proto import dialect
+from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
+from netspec.proto.schema import Field, NetParameter, SolverParameter, fields_of
+from netspec.proto.source_map import Node
+
+_RANGES = {
+    Declared.TYPE_INT32: (-(1 << 31), (1 << 31) - 1),
+    Declared.TYPE_INT64: (-(1 << 63), (1 << 63) - 1),
+    Declared.TYPE_UINT32: (0, (1 << 32) - 1),
+    Declared.TYPE_UINT64: (0, (1 << 64) - 1),
+}
+_BOOLEANS = {"true": True, "True": True, "t": True, "false": False, "False": False, "f": False}
+_LAYERS = ("caffe.LayerParameter", "caffe.V1LayerParameter")
+
+# The commonest field that forks have and Caffe has not: the rounding of a pooled extent as a bool.
+_ALIASES = {("caffe.PoolingParameter", "ceil_mode"): ("round_mode", {True: "CEIL", False: "FLOOR"})}
+
+Children = dict[str, list[Node]]
+
+
+def read_text(text: str, file: str, message: Message) -> Node:
+    """Read a text into an empty ``message``; return the places of its parts.
+
+    Raises SpecError for unknown fields, values of the wrong type or out of range, singular fields given twice, missing
+    required fields, and text that is not protobuf's text format.
+    """
+    return _Reader(text, file).read(message)
+
+
+class _Reader:
+    """A recursive descent over the tokens; ``self.token`` is the next one."""
+
+    def __init__(self, text: str, file: str) -> None:
+        self.lexer = Lexer(text, file)
+        self._tokens = iter(self.lexer)
+        self._open: list[tuple[Message, Token]] = []  # the messages being read, each with the token that named it
+        self._long_string: Token | None = None
+        self.token = next(self._tokens)
+
+    def read(self, message: Message) -> Node:
+        children: Children = {}
+        self._open.append((message, self.token))
+        while self.token.kind != END:
+            self._field(message, children)
+        self._check_required(message)
+        return Node(Where(self.lexer.file), _frozen(children))
+
+    # ---- Grammar ----
+
+    def _field(self, message: Message, children: Children) -> None:
+        name = self._take(NAME, "a field name")
+        key = (message.DESCRIPTOR.full_name, name.text)
+        alias, meaning = _ALIASES.get(key, (name.text, None))
+        field = fields_of(message.DESCRIPTOR).get(alias)
+        if field is None:
+            raise self._error(self._unknown_field(message, name.text), name)
+        if not field.repeated and field.present(message):
+            first = children[alias][0].where.line
+            raise self._error(f'"{alias}" was given already, in line {first}; it takes one value', name)
+        nodes = children.setdefault(alias, [])
+        if self._at(":"):
+            self._next()
+        elif field.type != Declared.TYPE_MESSAGE:
+            raise self._expected('":"', f'after "{name.text}"')
+        if meaning is not None:
+            field.set(message, field.descriptor.enum_type.values_by_name[meaning[self._boolean()]].number)
+            nodes.append(Node(self.lexer.where(name.start)))
+        elif field.repeated and self._at("["):
+            self._list(field, message, nodes)
+        else:
+            nodes.append(self._value(field, message, name))
+        if self._at(",") or self._at(";"):
+            self._next()
+
+    def _list(self, field: Field, message: Message, nodes: list[Node]) -> None:
+        self._next()
+        if self._at("]"):
+            self._next()
+            return
+        while True:
+            nodes.append(self._value(field, message, self.token))
+            if self._at("]"):
+                self._next()
+                return
+            if not self._at(","):
+                raise self._expected('"," or "]"', f'in the list of "{field.name}"')
+            self._next()
+
+    def _value(self, field: Field, message: Message, place: Token) -> Node:
+        where = self.lexer.where(place.start)
+        if field.type == Declared.TYPE_MESSAGE:
+            inner = field.get(message)
+            inner = inner.add() if field.repeated else inner
+            inner.SetInParent()
+            return Node(where, self._message(inner, place, field.name))
+        value = self._scalar(field)
+        if field.repeated:
+            field.get(message).append(value)
+        else:
+            field.set(message, value)
+        return Node(where)
+
+    def _message(self, message: Message, place: Token, name: str) -> dict[str, tuple[Node, ...]]:
+        if not (self._at("{") or self._at("<")):
+            raise self._expected('"{"', f'after "{name}"')
+        closing = "}" if self._next().text == "{" else ">"
+        children: Children = {}
+        self._open.append((message, place))
+        while not self._at(closing):
+            if self.token.kind == END:
+                line = self.lexer.where(place.start).line
+                raise self._error(f'the file ends inside "{name}" of line {line}; is a "{closing}" missing?')
+            self._field(message, children)
+        self._check_required(message)
+        self._open.pop()
+        self._next()
+        return _frozen(children)
+
+    # ---- Scalars ----
+
+    def _scalar(self, field: Field) -> Any:
+        if field.type in _RANGES:
+            return self._integer(field)
+        if field.type in (Declared.TYPE_FLOAT, Declared.TYPE_DOUBLE):
+            return self._float(field)
+        if field.type == Declared.TYPE_BOOL:
+            return self._boolean()
+        if field.type == Declared.TYPE_ENUM:
+            return self._enum(field)
+        return self._string(field)
+
+    def _integer(self, field: Field) -> int:
+        start = self.token
+        negative = self._minus()
+        if self.token.kind != INTEGER:
+            raise self._expected("an integer", f'for "{field.name}"', start)
+        value = self._natural(self._next())
+        value = -value if negative else value
+        least, most = _RANGES[field.type]
+        if not least <= value <= most:
+            raise self._error(f'{value} is out of range for "{field.name}", which takes {least} to {most}', start)
+        return value
+
+    def _float(self, field: Field) -> float:
+        start = self.token
+        negative = self._minus()
+        token = self.token
+        if token.kind == FLOAT or (token.kind == INTEGER and (token.text == "0" or token.text[0] != "0")):
+            value = float(self._next().text.rstrip("fF"))
+        elif token.kind == INTEGER:
+            raise self._error(f'expected a decimal number for "{field.name}", found "{token.text}"', start)
+        elif token.kind == NAME and token.text.lower() in ("inf", "infinity", "nan"):
+            value = float(self._next().text)
+        else:
+            raise self._expected("a number", f'for "{field.name}"', start)
+        return -value if negative else value
+
+    def _boolean(self) -> bool:
+        token = self.token
+        if token.kind == NAME and token.text in _BOOLEANS:
+            return _BOOLEANS[self._next().text]
+        if token.kind == INTEGER and self._natural(token) in (0, 1):
+            return bool(self._natural(self._next()))
+        raise self._expected("true or false")
+
+    def _enum(self, field: Field) -> int:
+        values = field.descriptor.enum_type.values_by_name
+        start = self.token
+        if self.token.kind == NAME:
+            word = self._next().text
+            if word in values:
+                return values[word].number
+            names = sorted(values, key=lambda v: values[v].number)
+            known = did_you_mean(word, names) or f"; it is one of {', '.join(names)}"
+            raise self._error(f'"{field.name}" has no value "{word}"{known}', start)
+        negative = self._minus()
+        if self.token.kind != INTEGER:
+            advice = ""
+            if self.token.kind == STRING and field.descriptor.full_name == "caffe.V1LayerParameter.type":
+                advice = '; a layer whose type is in quotes begins with "layer", not "layers"'
+            raise self._expected(f"a name such as {next(iter(values))}", f'for "{field.name}"', start, advice)
+        number = self._natural(self._next())
+        number = -number if negative else number
+        if number not in field.descriptor.enum_type.values_by_number:
+            raise self._error(f'"{field.name}" has no value of number {number}', start)
+        return number
+
+    def _string(self, field: Field) -> str | bytes:
+        start = self.token
+        if start.kind != STRING:
+            advice = "; put it in quotes" if start.kind in (NAME, INTEGER, FLOAT) else ""
+            raise self._expected("a string", f'for "{field.name}"', start, advice)
+        value = b""
+        while self.token.kind == STRING:
+            value += self.lexer.unquote(self._next())
+        if field.type == Declared.TYPE_BYTES:
+            return value
+        try:
+            return value.decode()
+        except UnicodeDecodeError:
+            raise self._error(f'the string for "{field.name}" is not UTF-8', start) from None
+
+    def _natural(self, token: Token) -> int:
+        text = token.text
+        if text[:2] in ("0x", "0X"):
+            return int(text, 16)
+        if text[0] != "0":
+            return int(text)
+        try:
+            return int(text, 8)
+        except ValueError:
+            raise self._error(f'"{text}": a number that begins with 0 is octal', token) from None
+
+    def _minus(self) -> bool:
+        if self._at("-"):
+            self._next()
+            return True
+        return False
+
+    # ---- Tokens ----
+
+    def _at(self, symbol: str) -> bool:
+        return self.token.kind == SYMBOL and self.token.text == symbol
+
+    def _next(self) -> Token:
+        token = self.token
+        if token.kind == STRING and "\n" in token.text:
+            self._long_string = token
+        self.token = next(self._tokens)
+        return token
+
+    def _take(self, kind: str, what: str) -> Token:
+        if self.token.kind != kind:
+            raise self._expected(what)
+        return self._next()
+
+    # ---- Faults ----
+
+    def _check_required(self, message: Message) -> None:
+        for field in fields_of(message.DESCRIPTOR).values():
+            if field.required and not field.present(message):
+                place = self._open[-1][1]
+                raise self._error(f'{message.DESCRIPTOR.name} lacks "{field.name}", which it requires', place)
+
+    def _expected(self, what: str, where: str = "", token: Token | None = None, advice: str = "") -> SpecError:
+        token = token or self.token
+        if token.kind == END:
+            found = "the end of the file"
+        elif token.kind == STRING:
+            found = f"the string {token.text if len(token.text) < 60 else token.text[:56] + '...'}"
+        else:
+            found = f'"{token.text}"'
+        return self._error(f"expected {what}{' ' + where if where else ''}, found {found}{advice}", token)
+
+    def _error(self, message: str, token: Token | None = None) -> SpecError:
+        place = self.lexer.where((token or self.token).start)
+        if self._long_string is not None:
+            line = self.lexer.where(self._long_string.start).line
+            message += f"; the string that begins in line {line} runs over several lines: is a closing quote missing?"
+        for open_message, _ in reversed(self._open):
+            if open_message.DESCRIPTOR.full_name in _LAYERS:
+                layer: Any = open_message
+                kind = layer.type if isinstance(layer.type, str) else ""
+                return SpecError(message, replace(place, layer=layer.name, type=kind))
+        return SpecError(message, place)
+
+    def _unknown_field(self, message: Message, name: str) -> str:
+        """Say that a field is unknown, and as well as can be guessed what was meant."""
+        descriptor = message.DESCRIPTOR
+        fault = f'{descriptor.name} has no field "{name}"'
+        fork = dialect.advice_for_field(descriptor.full_name, name)
+        if fork:
+            return f"{fault}; {fork}"
+        inner = self._open[-1][1]
+        for outer, _ in reversed(self._open[:-1]):
+            if name in fields_of(outer.DESCRIPTOR):
+                line = self.lexer.where(inner.start).line
+                return f'{fault}, but {outer.DESCRIPTOR.name} has; is a "}}" missing for "{inner.text}" of line {line}?'
+        known = fields_of(descriptor)
+        messages = {n: f.descriptor.message_type for n, f in known.items() if f.type == Declared.TYPE_MESSAGE}
+        inside = [n for n, message_type in messages.items() if name in fields_of(message_type)]
+        close = did_you_mean(name, list(known))
+        if inside and not close:
+            return f"{fault}; it belongs in {' or '.join(inside)}"
+        other = {NetParameter: SolverParameter, SolverParameter: NetParameter}.get(type(message))
+        if other is not None and name in fields_of(other.DESCRIPTOR):
+            return f"{fault}, but {other.DESCRIPTOR.name} has; is this file a {'net' if other is NetParameter else 'solver'}?"
+        return fault + close
+
+
+def _frozen(children: Children) -> dict[str, tuple[Node, ...]]:
+    return {name: tuple(nodes) for name, nodes in children.items()}

@@ -1,0 +1,71 @@
+"""The doors of this room: files of text in, upgraded messages and the places of their parts out; messages as text out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from netspec.errors import SpecError, Where
+from netspec.proto import upgrade as upgrades
+from netspec.proto.reader import read_text
+from netspec.proto.schema import NetParameter, SolverParameter
+from netspec.proto.source_map import Node, SourceMap
+from netspec.proto.writer import write_text
+
+__all__ = [
+    "parse_net",
+    "parse_net_text",
+    "parse_solver",
+    "parse_solver_text",
+    "read_net",
+    "read_solver",
+    "write_text",
+]
+
+
+def read_net(path: str | Path) -> NetParameter:
+    """Return the net of a .prototxt, upgraded to the current format. Raises SpecError."""
+    return parse_net(path)[0]
+
+
+def read_solver(path: str | Path) -> SolverParameter:
+    """Return the solver of a .prototxt, upgraded to the current format. Raises SpecError."""
+    return parse_solver(path)[0]
+
+
+def parse_net(path: str | Path, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
+    """Return the net of a .prototxt and where its parts stand. Raises SpecError."""
+    return parse_net_text(_text_of(path), str(path), upgrade)
+
+
+def parse_net_text(text: str, file: str, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
+    """Return the net that a text describes and where its parts stand; ``file`` is what errors call it."""
+    net = NetParameter()
+    source = SourceMap.of(read_text(text, file, net))
+    return upgrades.upgrade_net(net, source) if upgrade else (net, source)
+
+
+def parse_solver(path: str | Path, upgrade: bool = True) -> tuple[SolverParameter, Node]:
+    """Return the solver of a .prototxt and where its parts stand. Raises SpecError.
+
+    The nets in it are upgraded too; ``SourceMap.of(node.fields["net_param"][0])`` is the map of one.
+    """
+    return parse_solver_text(_text_of(path), str(path), upgrade)
+
+
+def parse_solver_text(text: str, file: str, upgrade: bool = True) -> tuple[SolverParameter, Node]:
+    """Return the solver that a text describes and where its parts stand; ``file`` is what errors call it."""
+    solver = SolverParameter()
+    node = read_text(text, file, solver)
+    if upgrade:
+        solver, node = upgrades.upgrade_solver(solver, node)
+        solver = upgrades.upgrade_snapshot_prefix(solver, file)
+    return solver, node
+
+
+def _text_of(path: str | Path) -> str:
+    """Return a file's text without a byte-order mark; bytes that are not UTF-8 are left for the lexer to judge."""
+    try:
+        data = Path(path).read_bytes()
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+    return data.removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")
