@@ -15,6 +15,7 @@ from loopclosure.trajectory import read_rgb_list
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
+STAMP = re.compile(r"\d+(\.\d+)?\s+")
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def image_paths(source: str | Path) -> list[Path]:
 
     A TUM RGB-D sequence (a folder with rgb.txt) gives the images listed there, in order of time; any other folder
     its image files in natural order (2.jpg before 10.jpg), those in a subfolder rgb or images where it has none; a text
-    file the paths in it, one a line, relative to its own folder (# begins a comment).
+    file the paths in it, one a line, a stamp may stand before, relative to its own folder (# begins a comment).
     """
     source = Path(source)
     if source.is_dir():
@@ -91,6 +92,8 @@ def image_paths(source: str | Path) -> list[Path]:
         name = line.partition("#")[0].strip()
         if name:
             path = source.parent / name
+            if not path.is_file() and STAMP.match(name):
+                path = source.parent / STAMP.sub("", name)
             if not path.is_file():
                 raise InputError(f'no such image "{name}" (looked in {source.parent})', source, number, 1)
             images.append(path)

@@ -49,7 +49,7 @@ def test_folders_lists_and_sequences(tmp_path):
     assert [p.name for p in image_paths(plain)] == ["1.png", "9.jpg", "10.png"]
     write_images(tmp_path / "outer" / "images", ["a.png"])
     assert [p.name for p in image_paths(tmp_path / "outer")] == ["a.png"]
-    (tmp_path / "list.txt").write_text("# chosen\nplain/9.jpg\nplain/1.png  # twice seen\n")
+    (tmp_path / "list.txt").write_text("# chosen\nplain/9.jpg\n12.5 plain/1.png  # twice seen\n")
     assert [p.name for p in image_paths(tmp_path / "list.txt")] == ["9.jpg", "1.png"]
     write_images(tmp_path / "tum" / "rgb", ["2.png", "1.png"])
     (tmp_path / "tum" / "rgb.txt").write_text("# x\n5.0 rgb/2.png\n6.0 rgb/1.png\n")

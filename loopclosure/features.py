@@ -1,0 +1,144 @@
+"""Descriptors that another program computed, as a method of the judge: features.npz of ``netspec extract --images``."""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from loopclosure.errors import InputError
+from loopclosure.methods import Method, MethodResult, Progress, Setting
+from loopclosure.similarity import METRICS, check_metric, similarity_matrix
+
+# Arrays of the file that describe the images rather than being descriptors.
+BESIDE_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters")
+
+
+@dataclass(frozen=True)
+class Features:
+    """Descriptors of images.
+
+    features           (N, D) float32
+    names              the N images' names, empty where the file has none
+    stamps             (N,) seconds, None where the file has none
+    seconds_per_image  what an image took the net, NaN where the file does not say
+    """
+
+    path: Path
+    features: np.ndarray
+    names: list[str] = field(default_factory=list)
+    stamps: np.ndarray | None = None
+    seconds_per_image: float = float("nan")
+
+    def rows_of(self, images: list[Path]) -> np.ndarray:
+        """Return the descriptors (len(images), D) of these images, found by name.
+
+        As many last parts of path and name are compared as it takes to tell all images apart: ``rgb/1.png`` of the
+        file is ``/data/fr1/rgb/1.png``. A file without names must have exactly these images, in order.
+        """
+        if not self.names:
+            if len(self.features) != len(images):
+                raise InputError(
+                    f"has {len(self.features)} descriptors and no names, but there are {len(images)} images", self.path
+                )
+            return self.features
+        missing = ""
+        for depth in range(max(len(PurePosixPath(name).parts) for name in self.names), 0, -1):
+            rows: dict[str, list[int]] = {}
+            for number, name in enumerate(self.names):
+                rows.setdefault("/".join(PurePosixPath(name).parts[-depth:]), []).append(number)
+            found = [rows.get("/".join(image.parts[-depth:]), []) for image in images]
+            absent = [image for image, numbers in zip(images, found, strict=True) if not numbers]
+            if absent:
+                missing = f"has no descriptor of {absent[0]} ({len(absent)} of {len(images)} images are not in it)"
+                continue
+            for image, numbers in zip(images, found, strict=True):
+                if len(numbers) > 1:
+                    raise InputError(f"names {image.name} {len(numbers)} times, which of them is {image}?", self.path)
+            return self.features[[numbers[0] for numbers in found]]
+        raise InputError(f"{missing}; its names are like {self.names[0]}", self.path)
+
+
+def read_features(path: str | Path) -> Features:
+    """Read a features.npz: ``features`` (N, D), or one array of any name (a blob's); names, stamps, seconds where there."""
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        reason = "no such file" if not path.exists() else f"cannot be read ({error})"
+        raise InputError(f"{reason}; expected the .npz that netspec extract --images writes", path) from error
+    candidates = [name for name in arrays if name not in BESIDE_FEATURES]
+    chosen = "features" if "features" in arrays else candidates[0] if len(candidates) == 1 else ""
+    if not chosen:
+        found = ", ".join(sorted(arrays)) or "nothing"
+        raise InputError(f"has no array features, nor one array alone; found {found}", path)
+    features = arrays[chosen]
+    if features.ndim < 2 or features.dtype.kind not in "fiu" or not len(features):
+        raise InputError(
+            f'"{chosen}" has shape {features.shape}, {features.dtype}; expected (images, dimensions)', path
+        )
+    features = features.reshape(len(features), -1).astype(np.float32)
+    names = [str(name) for name in arrays.get("names", np.zeros(0, str))]
+    stamps = arrays.get("stamps")
+    for what, values in (("names", names), ("stamps", stamps)):
+        if values is not None and len(values) not in (0, len(features)):
+            raise InputError(f"has {len(features)} descriptors but {len(values)} {what}", path)
+    seconds = float(arrays["seconds_per_image"]) if "seconds_per_image" in arrays else float("nan")
+    return Features(path, features, names, stamps, seconds)
+
+
+@dataclass(frozen=True)
+class FeatureMethod:
+    """Descriptors from files, compared in one metric; one file for queries and references, or one for each."""
+
+    query_file: Path
+    reference_file: Path
+    metric: str = "euclidean"
+
+    @property
+    def name(self) -> str:
+        """The file's name and the metric."""
+        return f"{self.query_file.stem} ({self.metric})"
+
+    def score(
+        self,
+        query_images: list[Path],
+        reference_images: list[Path] | None,
+        train_images: list[Path],
+        progress: Progress,
+    ) -> MethodResult:
+        """Score as :class:`loopclosure.methods.Method` says; the seconds of the net are those the file carries."""
+        query_features = read_features(self.query_file)
+        queries = query_features.rows_of(query_images)
+        references = None
+        if reference_images is not None:
+            same = self.reference_file == self.query_file
+            references = (query_features if same else read_features(self.reference_file)).rows_of(reference_images)
+        begin = time.perf_counter()
+        scores = similarity_matrix(queries, references, self.metric)
+        seconds = {"similarity": time.perf_counter() - begin}
+        images = len(query_images) + len(reference_images or [])
+        notes = [f"{queries.shape[1]} dimensions, {self.metric}"]
+        if np.isfinite(query_features.seconds_per_image):
+            seconds = {"features": query_features.seconds_per_image * images, **seconds}
+        else:
+            notes.append("the file does not say how long the features took")
+        return MethodResult(scores, seconds, notes)
+
+
+def features(argument: str, setting: Setting, inner: Method | None) -> FeatureMethod:
+    """Build the method ``features:PATH.npz[:euclidean|cosine]``, or ``features:QUERIES.npz,REFERENCES.npz[...]``."""
+    if inner is not None:
+        raise InputError("features refines no other method; write features:PATH.npz")
+    files, colon, metric = argument.rpartition(":")
+    if not colon or metric.endswith(".npz"):
+        files, metric = argument, METRICS[0]
+    check_metric(metric)
+    paths = [Path(name) for name in files.split(",") if name]
+    if len(paths) not in (1, 2):
+        raise InputError(f'"features:{argument}": expected features:PATH.npz, or two files with a comma between')
+    return FeatureMethod(paths[0], paths[-1], metric)
