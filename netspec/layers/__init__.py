@@ -4,6 +4,7 @@ from netspec.layers import (  # noqa: F401
     activation,
     common,
     data,
+    data_memory,
     loss,
     normalization,
     python,

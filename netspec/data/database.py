@@ -1,0 +1,282 @@
+"""Caffe's databases: LMDB, and LevelDB through the optional package plyvel.
+
+Records are numbered in the order of their keys, which is the order in which Caffe reads them.
+
+Caffe: src/caffe/util/db_lmdb.cpp, src/caffe/util/db_leveldb.cpp
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import weakref
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import ModuleType, TracebackType
+from typing import Any
+
+import lmdb
+
+from netspec import log
+from netspec.errors import SpecError, Where
+
+BACKENDS = ("lmdb", "leveldb")
+_SCAN = 4096  # keys listed ahead of the one that is asked for
+_FIRST_MAP_SIZE = 16 << 20
+_COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a transaction's pages stay in memory until it is committed
+
+
+class Reader(ABC):
+    """Read access to a database, by record number; safe in threads."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return the number of records."""
+
+    @abstractmethod
+    def key(self, i: int) -> bytes:
+        """Return the key of record ``i``."""
+
+    @abstractmethod
+    def record(self, i: int) -> bytes:
+        """Return the value of record ``i``."""
+
+
+# A database cannot be opened twice in a process; the training and the test net, say, may name the same one.
+_open_readers: weakref.WeakValueDictionary[tuple[int, int], Reader] = weakref.WeakValueDictionary()
+_open_lock = threading.Lock()
+
+
+def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) -> Reader:
+    """Open a database for reading; it is closed when nobody refers to the reader any more.
+
+    ``where`` is the place that names the source. Raises SpecError for a database that is missing, empty, damaged or of
+    the other backend.
+    """
+    try:
+        found = _kind(source)
+        if found != backend.lower():
+            default = " (LEVELDB is Caffe's default)" if found == "lmdb" else ""
+            named = found.upper()
+            raise ValueError(f"is of backend {named}, not {backend.upper()}{default}; say backend: {named}")
+        identity = os.stat(os.path.join(source, "data.mdb") if found == "lmdb" else source)
+        with _open_lock:
+            reader = _open_readers.get((identity.st_dev, identity.st_ino))
+            if reader is None:
+                reader = _LmdbReader(source) if found == "lmdb" else _LevelDbReader(source)
+                if not len(reader):
+                    raise ValueError("is empty: it holds no record")
+                _open_readers[identity.st_dev, identity.st_ino] = reader
+    except (ValueError, OSError) as fault:
+        raise SpecError(f'database "{source}" {fault}', where or Where(source)) from None
+    log.info("db_lmdb.cpp:35" if found == "lmdb" else "db_leveldb.cpp:18", f"Opened {found} {source}")
+    return reader
+
+
+def _kind(source: str) -> str:
+    """Return the backend of the database in a folder."""
+    folder = Path(source)
+    if not folder.exists():
+        raise ValueError(f"is not there (relative paths start from {os.getcwd()})")
+    if not folder.is_dir():
+        raise ValueError("is a file; expected a folder with data.mdb (LMDB) or CURRENT (LevelDB) in it")
+    if (folder / "data.mdb").is_file():
+        return "lmdb"
+    if (folder / "CURRENT").is_file():
+        return "leveldb"
+    raise ValueError("is a folder without data.mdb (LMDB) or CURRENT (LevelDB) in it, so it is no database")
+
+
+class _LmdbReader(Reader):
+    """An LMDB, opened without locks, so that read-only media and forked workers are fine."""
+
+    def __init__(self, source: str) -> None:
+        size = os.path.getsize(os.path.join(source, "data.mdb"))
+        if not size:
+            raise ValueError("has an empty data.mdb, so it was never written")
+        try:
+            self._env = lmdb.open(source, readonly=True, lock=False, readahead=True, max_spare_txns=64)
+        except lmdb.Error as fault:
+            raise ValueError(f"cannot be opened as an LMDB ({fault})") from None
+        stat = self._env.stat()
+        pages = 2 + stat["branch_pages"] + stat["leaf_pages"] + stat["overflow_pages"]
+        if size < pages * stat["psize"]:  # a read beyond the end of a mapped file kills the process
+            raise ValueError(f"is cut short: data.mdb has {size} bytes of at least {pages * stat['psize']}")
+        self._length: int = stat["entries"]
+        self._keys: list[bytes] = []
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return self._length
+
+    def key(self, i: int) -> bytes:
+        if i >= len(self._keys):
+            self._list_keys(i + _SCAN)
+        return self._keys[i]
+
+    def record(self, i: int) -> bytes:
+        with self._env.begin() as transaction:
+            value = transaction.get(self.key(i))
+        assert value is not None, "the database changed while it was read"
+        return value
+
+    def _list_keys(self, upto: int) -> None:
+        """Walk on from the last key known: on a slow disk a walk over all keys of a large database takes minutes."""
+        with self._lock, self._env.begin() as transaction, transaction.cursor() as cursor:
+            more = cursor.set_key(self._keys[-1]) and cursor.next() if self._keys else cursor.first()
+            while more and len(self._keys) < upto:
+                self._keys.append(cursor.key())
+                more = cursor.next()
+
+
+class _LevelDbReader(Reader):
+    def __init__(self, source: str) -> None:
+        plyvel = _plyvel()
+        try:
+            self._db = plyvel.DB(source, create_if_missing=False)
+        except (plyvel.Error, OSError) as fault:
+            raise ValueError(f"cannot be opened as a LevelDB ({fault})") from None
+        with self._db.iterator(include_value=False) as keys:
+            self._keys: list[bytes] = list(keys)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def key(self, i: int) -> bytes:
+        return self._keys[i]
+
+    def record(self, i: int) -> bytes:
+        return self._db.get(self._keys[i])
+
+
+def _plyvel() -> ModuleType:
+    try:
+        import plyvel
+    except ImportError:
+        raise ValueError("is a LevelDB, which needs a package more: pip install plyvel") from None
+    return plyvel
+
+
+class Writer:
+    """Writes a new database that appears at its path only when it is whole.
+
+    A context manager: records are put into a hidden folder beside, which takes the path's name at the end, and is
+    removed if anything went wrong. Memory stays flat, and real Caffe reads the result. Raises SpecError where the path
+    exists already (as Caffe does) or cannot be written to.
+    """
+
+    def __init__(self, path: str, backend: str = "lmdb") -> None:
+        self.path = path.rstrip("/") or path
+        if backend.lower() not in BACKENDS:
+            raise SpecError(f'unknown backend "{backend}"; expected one of: {", ".join(BACKENDS)}', Where(path))
+        self._backend = backend.lower()
+        folder, name = os.path.split(self.path)
+        self._partial = os.path.join(folder, f".{name}.{os.getpid()}.partial")
+        self._store: _LmdbStore | _LevelDbStore | None = None
+
+    def __enter__(self) -> Writer:
+        if os.path.lexists(self.path):
+            raise SpecError("exists already; remove it or choose another name for the database", Where(self.path))
+        try:
+            os.mkdir(self._partial)
+            self._store = (_LmdbStore if self._backend == "lmdb" else _LevelDbStore)(self._partial)
+        except (OSError, ValueError, lmdb.Error) as fault:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            raise SpecError(f"cannot write a database here ({fault})", Where(self.path)) from None
+        return self
+
+    def put(self, key: bytes, value: bytes) -> None:
+        """Add a record; a second one of the same key takes the place of the first."""
+        assert self._store is not None, "put() outside of the with block"
+        try:
+            self._store.put(key, value)
+        except (lmdb.Error, OSError) as fault:
+            name = key.decode(errors="backslashreplace")
+            raise SpecError(f'cannot write record "{name}" ({fault})', Where(self.path)) from None
+
+    def commit(self) -> None:
+        """Hand what was put so far to the file system."""
+        assert self._store is not None, "commit() outside of the with block"
+        try:
+            self._store.commit()
+        except (lmdb.Error, OSError) as fault:
+            raise SpecError(f"cannot write to the database ({fault})", Where(self.path)) from None
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        assert self._store is not None
+        try:
+            if kind is None:
+                self.commit()
+            self._store.close()
+            if kind is None:
+                os.rename(self._partial, self.path)
+        except (lmdb.Error, OSError) as fault:
+            raise SpecError(f"cannot put the finished database in its place ({fault})", Where(self.path)) from None
+        finally:
+            self._store = None
+            shutil.rmtree(self._partial, ignore_errors=True)
+
+
+class _LmdbStore:
+    """A growing LMDB. Growth comes ahead of need: a full map would cost the transaction at hand."""
+
+    def __init__(self, folder: str) -> None:
+        self._env = lmdb.open(folder, map_size=_FIRST_MAP_SIZE, mode=0o664, lock=False, sync=False)
+        self._page: int = self._env.stat()["psize"]
+        self._last = b""
+        self._begin()
+
+    def _begin(self) -> None:
+        info = self._env.info()
+        self._free = info["map_size"] // self._page - info["last_pgno"] - 64  # pages
+        self._bytes = self._records = 0
+        self._transaction: Any = self._env.begin(write=True)
+
+    def put(self, key: bytes, value: bytes) -> None:
+        size = len(key) + len(value)
+        pages = size // self._page + 4  # with a leaf that is copied or split, and its branches
+        if pages > self._free:
+            self._transaction.commit()
+            self._env.set_mapsize(2 * max(self._env.info()["map_size"], pages * self._page))
+            self._begin()
+        self._transaction.put(key, value, append=key > self._last)  # in order, pages are filled to the brim
+        self._last = max(self._last, key)
+        self._free -= pages
+        self._bytes += size
+        self._records += 1
+        if self._records >= _COMMIT_RECORDS or self._bytes >= _COMMIT_BYTES:
+            self.commit()
+
+    def commit(self) -> None:
+        self._transaction.commit()
+        self._begin()
+
+    def close(self) -> None:
+        self._transaction.abort()
+        self._env.sync(True)
+        self._env.close()
+
+
+class _LevelDbStore:
+    def __init__(self, folder: str) -> None:
+        self._db = _plyvel().DB(folder, create_if_missing=True, error_if_exists=True)
+        self._batch = self._db.write_batch()
+        self._bytes = self._records = 0
+
+    def put(self, key: bytes, value: bytes) -> None:
+        self._batch.put(key, value)
+        self._bytes += len(key) + len(value)
+        self._records += 1
+        if self._records >= _COMMIT_RECORDS or self._bytes >= _COMMIT_BYTES:
+            self.commit()
+
+    def commit(self) -> None:
+        self._batch.write()
+        self._batch = self._db.write_batch()
+        self._bytes = self._records = 0
+
+    def close(self) -> None:
+        self._db.close()

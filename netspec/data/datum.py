@@ -1,0 +1,99 @@
+"""Datum <-> ndarray: one record of Caffe's databases.
+
+Images are planar, (channels, height, width), and blue, green, red in that order, as OpenCV decodes them.
+
+Caffe: src/caffe/util/io.cpp (CVMatToDatum, DecodeDatumToCVMat), src/caffe/data_transformer.cpp
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from netspec.proto.schema import Datum
+
+
+def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
+    """Return a Datum of an array (C, H, W): uint8 goes into ``data``, any other type as floats into ``float_data``.
+
+    Raises ValueError where the array has not three axes.
+    """
+    if array.ndim != 3:
+        raise ValueError(f"a Datum holds channels x height x width, found an array of shape {array.shape}")
+    channels, height, width = array.shape
+    datum = Datum(channels=channels, height=height, width=width)
+    if array.dtype == np.uint8:
+        datum.data = array.tobytes()
+        datum.encoded = False  # CVMatToDatum writes it out, though it is the default
+    else:
+        datum.float_data.extend(np.asarray(array, np.float32).ravel().tolist())
+    if label is not None:
+        datum.label = int(label)
+    return datum
+
+
+def encoded_datum(image: bytes, label: int | None = None, shape: tuple[int, int, int] | None = None) -> Datum:
+    """Return a Datum of an image file's bytes (PNG, JPEG, ...).
+
+    ``shape`` (C, H, W) is written for an image that was encoded here, and left out for a file stored as it is, which is
+    how Caffe has it (EncodeCVMatToDatum, ReadFileToDatum).
+    """
+    datum = Datum(data=image, encoded=True)
+    if shape is not None:
+        datum.channels, datum.height, datum.width = shape
+    if label is not None:
+        datum.label = int(label)
+    return datum
+
+
+def parse_datum(record: bytes) -> Datum:
+    """Return the Datum that a record holds; raises ValueError where it holds none."""
+    try:
+        return Datum.FromString(record)
+    except DecodeError:
+        raise ValueError(f"is no Datum ({len(record)} bytes)") from None
+
+
+def datum_to_array(datum: Any, color: bool | None = None) -> np.ndarray:
+    """Return the values (C, H, W): uint8 from ``data``, float32 from ``float_data``; ``data`` where both are given.
+
+    An encoded image is decoded, to three channels where ``color`` is true, to one where it is false, and to what the
+    file has where it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that
+    contradicts itself or cannot be decoded.
+    """
+    if datum.encoded:
+        return decode_image(datum.data, color)
+    shape = (datum.channels, datum.height, datum.width)
+    data = datum.data
+    values = np.frombuffer(data, np.uint8) if data else np.array(datum.float_data, np.float32)
+    if len(values) != np.prod(shape) or len(values) == 0:
+        field = "data" if data else "float_data"
+        raise ValueError(f"holds {len(values)} values in {field}, but says channels x height x width = {times(shape)}")
+    return values.reshape(shape)
+
+
+def decode_image(image: bytes, color: bool | None = None) -> np.ndarray:
+    """Decode an image file's bytes to uint8 (C, H, W); ``color`` as in :func:`datum_to_array`."""
+    flag = cv2.IMREAD_UNCHANGED if color is None else cv2.IMREAD_COLOR if color else cv2.IMREAD_GRAYSCALE
+    try:
+        pixels = cv2.imdecode(np.frombuffer(image, np.uint8), flag) if image else None
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ValueError("cannot be decoded as an image")
+    if pixels.dtype != np.uint8:
+        raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits a channel can be read")
+    return planar(pixels)
+
+
+def planar(pixels: np.ndarray) -> np.ndarray:
+    """Return OpenCV's (H, W) or (H, W, C) as contiguous (C, H, W)."""
+    return np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
+
+
+def times(shape: tuple[int, ...]) -> str:
+    """Return a shape as ``3 x 48 x 64``."""
+    return " x ".join(map(str, shape))

@@ -1,0 +1,51 @@
+"""Batches, made ahead of the net by threads."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Feed(Generic[T]):
+    """Hands out ``make(0)``, ``make(1)``, ... in order, up to ``ahead`` of them made ahead by ``workers`` threads.
+
+    ``make`` is a function of the iteration alone, so neither the number of threads nor the moment changes a batch. No
+    thread runs before the first ``next()``; with ``ahead`` 0 none ever does. What ``make`` raises, ``next()`` raises.
+    """
+
+    def __init__(self, make: Callable[[int], T], ahead: int, workers: int) -> None:
+        self._make = make
+        self._ahead = ahead
+        self._workers = workers
+        self._pool: ThreadPoolExecutor | None = None
+        self._pending: deque[Future[T]] = deque()
+        self.position = 0  #: the iteration whose batch comes next
+
+    def next(self) -> T:
+        """Return the batch at ``position``, and step on."""
+        position = self.position
+        self.position += 1
+        if not self._ahead:
+            return self._make(position)
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self._workers, thread_name_prefix="prefetch")
+        while len(self._pending) <= self._ahead:
+            self._pending.append(self._pool.submit(self._make, position + len(self._pending)))
+        return self._pending.popleft().result()
+
+    def restart(self, position: int = 0) -> None:
+        """Go on at iteration ``position``; what was made ahead is dropped."""
+        while self._pending:
+            self._pending.popleft().cancel()
+        self.position = position
+
+    def close(self) -> None:
+        """Stop the threads; a later ``next()`` starts them again."""
+        self.restart(self.position)
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None

@@ -1,0 +1,167 @@
+"""Rows of HDF5 files, and results written to one.
+
+Caffe: src/caffe/layers/hdf5_data_layer.cpp, src/caffe/layers/hdf5_output_layer.cpp
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from functools import lru_cache
+
+import h5py
+import numpy as np
+
+from netspec import log
+from netspec.data.draws import permutation
+from netspec.data.images import list_lines
+from netspec.data.sources import Arrays, Cursor, Shape
+from netspec.errors import SpecError, Where
+
+_FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may straddle two
+
+
+class Hdf5Source:
+    """The datasets named like the tops, row by row, from the files that ``list_file`` names (blank-separated).
+
+    A batch may straddle files. With ``shuffle`` each epoch has its own order of files, and of the rows within each.
+    Raises SpecError for a missing file or dataset, and where rows differ in shape between files.
+    """
+
+    def __init__(
+        self,
+        list_file: str,
+        tops: Sequence[str],
+        batch_size: int,
+        shuffle: bool,
+        seed: int,
+        stream: str,
+        where: Where | None = None,
+    ) -> None:
+        log.info("hdf5_data_layer.cpp:80", f"Loading list of HDF5 filenames from: {list_file}")
+        named = [(name, place) for line, place in list_lines(list_file, where) for name in line.split()]
+        log.info("hdf5_data_layer.cpp:94", f"Number of HDF5 files: {len(named)}")
+        if not named:
+            raise SpecError(f'the list "{list_file}" names no HDF5 file', where or Where(list_file))
+        self._tops = tuple(tops)
+        self._files = [name for name, _ in named]
+        self._row_shapes = _row_shapes(*named[0], self._tops)[1]
+        counts = [self._rows_of(name, place) for name, place in named]
+        self._starts = np.cumsum([0, *counts])
+        self.cursor = Cursor(int(self._starts[-1]), batch_size)
+        self._shuffle, self._seed, self._stream = shuffle, seed, stream
+        self._order = lru_cache(maxsize=2)(self._order_of)
+        self._load = lru_cache(maxsize=_FILES_IN_MEMORY)(self._load_file)
+        self._lock = threading.Lock()
+
+    @property
+    def shapes(self) -> Sequence[Shape]:
+        """The shapes of all tops."""
+        return [(self.cursor.batch_size, *shape) for shape in self._row_shapes]
+
+    def batch(self, iteration: int) -> Arrays:
+        """Return the tops of an iteration, float32."""
+        rows = self._rows(iteration)
+        files = np.searchsorted(self._starts, rows, side="right") - 1
+        tops = tuple(np.empty(shape, np.float32) for shape in self.shapes)
+        for file in np.unique(files):
+            here = files == file
+            with self._lock:
+                datasets = self._load(int(file))
+            for top, dataset in zip(tops, datasets, strict=True):
+                top[here] = dataset[rows[here] - self._starts[file]]
+        return tops
+
+    def keys(self, iteration: int) -> list[str]:
+        """Return ``file:row`` of each row of an iteration."""
+        rows = self._rows(iteration)
+        files = np.searchsorted(self._starts, rows, side="right") - 1
+        return [f"{self._files[f]}:{row - self._starts[f]}" for f, row in zip(files, rows, strict=True)]
+
+    def _rows(self, iteration: int) -> np.ndarray:
+        """Return the rows of an iteration, counted through all files."""
+        count, size = self.cursor.count, self.cursor.batch_size
+        places = np.arange(iteration * size, (iteration + 1) * size)
+        if not self._shuffle:
+            return places % count
+        return np.array([self._order(epoch)[i] for epoch, i in zip(places // count, places % count, strict=True)])
+
+    def _order_of(self, epoch: int) -> np.ndarray:
+        stream = f"{self._stream}/shuffle/{epoch}"
+        rows = []
+        for file in permutation(self._seed, stream, len(self._files)):
+            start, end = self._starts[file : file + 2]
+            rows.append(start + permutation(self._seed, f"{stream}/{file}", int(end - start)))
+        return np.concatenate(rows)
+
+    def _load_file(self, file: int) -> Arrays:
+        with h5py.File(self._files[file]) as opened:
+            return tuple(np.asarray(opened[top], np.float32) for top in self._tops)
+
+    def _rows_of(self, name: str, place: Where) -> int:
+        count, shapes = _row_shapes(name, place, self._tops)
+        if shapes != self._row_shapes:
+            message = f'rows of "{name}" have the shapes {shapes}, those of "{self._files[0]}" {self._row_shapes}'
+            raise SpecError(f"{message}; all files must agree", place)
+        return count
+
+
+def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list[Shape]]:
+    """Return the number of rows and the shape of a row of each dataset."""
+    try:
+        with h5py.File(name) as file:
+            datasets: list[h5py.Dataset] = []
+            for top in tops:
+                dataset = file.get(top)
+                if not isinstance(dataset, h5py.Dataset):
+                    found = ", ".join(f'"{key}"' for key in file) or "nothing"
+                    message = f'HDF5 file "{name}" has no dataset named like top "{top}"; it has {found}'
+                    raise SpecError(message, place)
+                datasets.append(dataset)
+                if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
+                    raise SpecError(f'dataset "{top}" of "{name}" holds no rows of numbers', place)
+            counts = [len(dataset) for dataset in datasets]
+            if min(counts) != max(counts) or not counts[0]:
+                raise SpecError(f'datasets of "{name}" have {counts} rows; expected one number of rows, above 0', place)
+            return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
+    except OSError as fault:
+        raise SpecError(f'HDF5 file "{name}" cannot be read: {fault}', place) from None
+
+
+class Hdf5Sink:
+    """A new HDF5 file with the growing datasets ``data`` and ``label``, both 4-D as Caffe writes them.
+
+    Caffe stops at the second batch, since its datasets exist by then; here batches are appended, and each call leaves
+    the file readable. Raises SpecError where the file cannot be written or a batch does not go with those before it.
+    """
+
+    NAMES = ("data", "label")
+
+    def __init__(self, path: str, where: Where | None = None) -> None:
+        self._path, self._where = path, where
+        try:
+            self._file = h5py.File(path, "w")
+        except OSError as fault:
+            raise SpecError(f'HDF5 file "{path}" cannot be written: {fault}', where) from None
+
+    def append(self, data: np.ndarray, label: np.ndarray) -> None:
+        """Add the rows of a batch."""
+        log.info("hdf5_output_layer.cpp:31", f"Saving HDF5 file {self._path}")
+        for name, values in zip(self.NAMES, (data, label), strict=True):
+            rows = values.reshape(values.shape + (1,) * (4 - values.ndim)).astype(np.float32)
+            if name not in self._file:
+                self._file.create_dataset(name, data=rows, maxshape=(None, *rows.shape[1:]), chunks=True)
+                continue
+            dataset = self._file[name]
+            assert isinstance(dataset, h5py.Dataset)
+            if dataset.shape[1:] != rows.shape[1:]:
+                message = f'rows of "{name}" had the shape {dataset.shape[1:]} so far, now {rows.shape[1:]}'
+                raise SpecError(message, self._where)
+            dataset.resize(len(dataset) + len(rows), axis=0)
+            dataset[-len(rows) :] = rows
+        self._file.flush()
+        log.info("hdf5_output_layer.cpp:36", f"Successfully saved {len(data)} rows")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

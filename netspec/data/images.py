@@ -1,0 +1,82 @@
+"""Image files and lists of them, read as Caffe's ImageData layer and convert_imageset read them.
+
+Caffe: src/caffe/util/io.cpp (ReadImageToCVMat), src/caffe/layers/image_data_layer.cpp
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from netspec.data.datum import decode_image, planar
+from netspec.errors import SpecError, Where
+
+
+@dataclass(frozen=True)
+class ListedImage:
+    """One line of an image list; ``where`` is its place in the list file."""
+
+    name: str
+    label: int
+    where: Where
+
+
+def read_image(path: str, color: bool = True, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Return an image file as uint8 (C, H, W): 3 channels (blue, green, red), or 1 where ``color`` is false.
+
+    ``size`` is (height, width), reached bilinearly and without low-pass filtering, as cv::resize does.
+    Raises ValueError, which names the file, where it is missing or no image.
+    """
+    try:
+        image = decode_image(Path(path).read_bytes(), color)
+    except OSError as fault:
+        raise ValueError(f'image "{path}" cannot be read: {fault.strerror}') from None
+    except ValueError as fault:
+        raise ValueError(f'image "{path}" {fault}') from None
+    return resize(image, size) if size else image
+
+
+def resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return a uint8 image (C, H, W) resized to ``size`` = (height, width)."""
+    height, width = size
+    return planar(cv2.resize(image.transpose(1, 2, 0), (width, height), interpolation=cv2.INTER_LINEAR))
+
+
+def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Where]]:
+    """Yield the lines of a list file with their places, without blank lines and those that begin with ``#``.
+
+    ``where`` is the place that names the file. Raises SpecError where it cannot be read.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except OSError as fault:
+        raise SpecError(f'list file "{path}" cannot be read: {fault.strerror}', where or Where(path)) from None
+    except UnicodeDecodeError:
+        raise SpecError(f'list file "{path}" is not UTF-8 text', where or Where(path)) from None
+    for number, line in enumerate(lines, 1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield line.strip(), Where(path, number, 1)
+
+
+def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:
+    """Read lines of ``name label``, split at the last blank, so that names may hold blanks.
+
+    Raises SpecError for a line without a whole-number label, and for a list without lines. (Caffe takes a label that is
+    no number as 0.)
+    """
+    images = []
+    for line, place in list_lines(path, where):
+        name, _, label = line.rpartition(" ") if " " in line else line.rpartition("\t")
+        try:
+            images.append(ListedImage(name.rstrip(), int(label), place))
+        except ValueError:
+            name = ""
+        if not name:
+            raise SpecError(f'found "{line}", expected an image name, a blank and a whole-number label', place)
+    if not images:
+        raise SpecError(f'the image list "{path}" is empty', where or Where(path))
+    return images

@@ -1,0 +1,173 @@
+"""Where batches come from: each source makes the batch of iteration i as a function of i alone.
+
+Caffe: src/caffe/layers/data_layer.cpp, src/caffe/layers/image_data_layer.cpp
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+
+from netspec.data.database import Reader
+from netspec.data.datum import parse_datum, times
+from netspec.data.draws import permutation, words
+from netspec.data.images import ListedImage, read_image
+from netspec.data.transformer import Shape, Transformer
+from netspec.errors import SpecError, Where
+
+Arrays = tuple[np.ndarray, ...]
+
+
+class Cursor:
+    """Which records each iteration reads: batch after batch, from the start again after the last record.
+
+    ``skip`` records are passed over at the very start. With ``shuffle`` each epoch has an order of its own, which
+    follows from ``seed``, ``stream`` and the epoch's number.
+    """
+
+    def __init__(
+        self, count: int, batch_size: int, skip: int = 0, shuffle: bool = False, seed: int = 0, stream: str = ""
+    ) -> None:
+        self.count, self.batch_size, self.skip = count, batch_size, skip
+        self._shuffle = shuffle
+        self._order = lru_cache(maxsize=2)(lambda epoch: permutation(seed, f"{stream}/shuffle/{epoch}", count))
+
+    def records(self, iteration: int) -> list[int]:
+        """Return the numbers of the records of an iteration."""
+        start = self.skip + iteration * self.batch_size
+        places = (divmod(k, self.count) for k in range(start, start + self.batch_size))
+        return [int(self._order(epoch)[i]) if self._shuffle else i for epoch, i in places]
+
+    def wraps(self, iteration: int) -> int:
+        """Return how often the last record is passed in an iteration."""
+        start = self.skip + iteration * self.batch_size
+        return (start + self.batch_size) // self.count - start // self.count
+
+
+def draw_skip(rand_skip: int, seed: int, stream: str) -> int:
+    """Return how many records to pass over at the start: less than ``rand_skip``, or 0 where that is 0."""
+    return int(words(seed, f"{stream}/rand_skip", 0, 1)[0, 0]) % rand_skip if rand_skip else 0
+
+
+class Source(Protocol):
+    """What a reading layer needs to know of its data."""
+
+    cursor: Cursor
+
+    @property
+    def shapes(self) -> Sequence[Shape]:
+        """The shapes of all tops."""
+        ...
+
+    def batch(self, iteration: int) -> Arrays:
+        """Return the tops of an iteration, float32."""
+        ...
+
+    def keys(self, iteration: int) -> list[str]:
+        """Return the names of the records of an iteration."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Item:
+    name: str
+    image: np.ndarray
+    label: int
+
+
+class _ImageSource:
+    """Images with labels, one at a time by number, made into batches by a Transformer.
+
+    With a batch size of 1 each image may have its own size. Otherwise all must come out of the transform in the first
+    one's shape; raises SpecError, which names the record, where one does not.
+    """
+
+    def __init__(self, cursor: Cursor, transformer: Transformer, where: Where | None) -> None:
+        self.cursor = cursor
+        self._transform = transformer
+        self._where = where
+        first = self._item(cursor.records(0)[0])
+        self._first_name = first.name
+        self._shape = transformer.output_shape(first.image.shape)
+
+    def _item(self, record: int) -> _Item:
+        raise NotImplementedError
+
+    @property
+    def shapes(self) -> Sequence[Shape]:
+        """The shapes of images and labels."""
+        return (self.cursor.batch_size, *self._shape), (self.cursor.batch_size,)
+
+    def batch(self, iteration: int) -> Arrays:
+        """Return images (N, C, H, W) and labels (N,)."""
+        items = [self._item(record) for record in self.cursor.records(iteration)]
+        if len(items) > 1:
+            for item in items:
+                self._check_shape(item)
+        data = self._transform([item.image for item in items], iteration * self.cursor.batch_size)
+        return data, np.array([item.label for item in items], np.float32)
+
+    def _check_shape(self, item: _Item) -> None:
+        shape = self._transform.output_shape(item.image.shape)
+        if shape != self._shape:
+            first = f'the first one, "{self._first_name}", {times(self._shape)}'
+            advice = "all records must be of one size (or batch_size 1)"
+            raise SpecError(f'record "{item.name}" gives {times(shape)}, but {first}; {advice}', self._where)
+
+
+class DatabaseSource(_ImageSource):
+    """The Datums of a database; Caffe's Data layer. Records are named by their keys."""
+
+    def __init__(self, reader: Reader, cursor: Cursor, transformer: Transformer, where: Where | None = None) -> None:
+        self._reader = reader
+        super().__init__(cursor, transformer, where)
+
+    def keys(self, iteration: int) -> list[str]:
+        """Return the keys of the records of an iteration."""
+        return [self._name(record) for record in self.cursor.records(iteration)]
+
+    def _name(self, record: int) -> str:
+        return self._reader.key(record).decode(errors="backslashreplace")
+
+    def _item(self, record: int) -> _Item:
+        try:
+            datum = parse_datum(self._reader.record(record))
+            return _Item(self._name(record), self._transform.decode(datum), datum.label)
+        except ValueError as fault:
+            if isinstance(fault, SpecError):
+                raise
+            raise SpecError(f'record "{self._name(record)}" {fault}', self._where) from None
+
+
+class ImageListSource(_ImageSource):
+    """Image files by a list; Caffe's ImageData layer. Records are named as in the list.
+
+    ``size`` (height, width) is what images are resized to, if anything; ``root`` is put in front of each name.
+    """
+
+    def __init__(
+        self,
+        images: Sequence[ListedImage],
+        root: str,
+        color: bool,
+        size: tuple[int, int] | None,
+        cursor: Cursor,
+        transformer: Transformer,
+    ) -> None:
+        self._images, self._root, self._color, self._size = images, root, color, size
+        super().__init__(cursor, transformer, None)
+
+    def keys(self, iteration: int) -> list[str]:
+        """Return the names of the images of an iteration."""
+        return [self._images[record].name for record in self.cursor.records(iteration)]
+
+    def _item(self, record: int) -> _Item:
+        listed = self._images[record]
+        try:
+            return _Item(listed.name, read_image(self._root + listed.name, self._color, self._size), listed.label)
+        except ValueError as fault:
+            raise SpecError(str(fault), listed.where) from None

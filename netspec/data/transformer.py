@@ -1,0 +1,118 @@
+"""What happens to an image between the database and the net: crop, mirror, mean, scale.
+
+Caffe: src/caffe/data_transformer.cpp
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from netspec import blobs, log
+from netspec.data.datum import datum_to_array, times
+from netspec.data.draws import words
+from netspec.errors import SpecError, Where
+from netspec.proto.schema import BlobProto
+
+Shape = tuple[int, ...]
+TRAIN = 0  # caffe.proto: enum Phase
+
+
+class Transformer:
+    """A ``transform_param`` at work: (x - mean) * scale of a window of each image, mirrored or not.
+
+    The window is drawn in TRAIN and central in TEST. Record k's draws follow from ``seed``, ``stream`` and k alone, its
+    words being for mirror, h_off and w_off, the order in which Caffe draws. ``at(*path)`` is the place of a field of
+    the layer. Raises SpecError for settings that contradict each other and for a mean file that cannot be read.
+    """
+
+    def __init__(self, param: Any, phase: int, at: Callable[..., Where], seed: int = 0, stream: str = "") -> None:
+        self._at = at
+        self._random_crop = phase == TRAIN and param.crop_size > 0
+        self._seed, self._stream = seed, stream
+        self.crop_size: int = param.crop_size
+        self.mirror: bool = param.mirror
+        self.scale = np.float32(param.scale)
+        if param.force_color and param.force_gray:
+            raise self._error("force_color and force_gray exclude each other", "force_gray")
+        self.color: bool | None = True if param.force_color else False if param.force_gray else None
+        if param.HasField("mean_file") and param.mean_value:
+            raise self._error("mean_file and mean_value exclude each other", "mean_value")
+        self.mean_values = np.array(param.mean_value, np.float32)
+        self._mean_file = param.mean_file
+        self._mean = read_mean(param.mean_file, at("transform_param", "mean_file")) if param.mean_file else None
+        self._warned = False
+
+    def decode(self, datum: Any) -> np.ndarray:
+        """Return a Datum's image (C, H, W), in colour or grey where the transform forces it; raises ValueError."""
+        if self.color is not None and not datum.encoded and not self._warned:
+            self._warned = True
+            log.warning("data_transformer.cpp:152", "force_color and force_gray only for encoded datum")
+        return datum_to_array(datum, self.color)
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Return what becomes of an image of ``shape`` (C, H, W).
+
+        Raises SpecError where the image does not fit the crop or the mean.
+        """
+        channels, height, width = shape
+        if self.crop_size > min(height, width):
+            raise self._error(f"crop_size {self.crop_size} is larger than the image, {times(shape)}", "crop_size")
+        if self._mean is not None and self._mean.shape != shape:
+            mean = f'the mean of "{self._mean_file}" is {times(self._mean.shape)}'
+            raise self._error(f"{mean}, the image (uncropped) {times(shape)}; they must be equal", "mean_file")
+        if len(self.mean_values) not in (0, 1, channels):
+            message = f"found {len(self.mean_values)} mean_value for {channels} channels, expected 1 or {channels}"
+            raise self._error(message, "mean_value")
+        return (channels, self.crop_size, self.crop_size) if self.crop_size else shape
+
+    def __call__(self, images: Sequence[np.ndarray], first: int) -> np.ndarray:
+        """Return the images, uint8 or float32 (C, H, W), as one batch: float32 (N, C, H', W').
+
+        ``first`` is the number of the first image in the sequence of all records read, which the draws follow.
+        """
+        batch = np.empty((len(images), *self.output_shape(images[0].shape)), np.float32)
+        draws = words(self._seed, self._stream, first, len(images)).tolist()
+        for image, out, (mirror, h_off, w_off, _) in zip(images, batch, draws, strict=True):
+            self._transform(image, out, mirror, h_off, w_off)
+        if self.scale != 1:
+            batch *= self.scale
+        return batch
+
+    def _transform(self, image: np.ndarray, out: np.ndarray, mirror: int, h_off: int, w_off: int) -> None:
+        mean = self.mean_values[:, None, None] if len(self.mean_values) else self._mean
+        if self.crop_size:
+            spare_h, spare_w = image.shape[1] - self.crop_size, image.shape[2] - self.crop_size
+            top = h_off % (spare_h + 1) if self._random_crop else spare_h // 2
+            left = w_off % (spare_w + 1) if self._random_crop else spare_w // 2
+            window = np.s_[:, top : top + self.crop_size, left : left + self.crop_size]
+            image = image[window]
+            if self._mean is not None:
+                mean = self._mean[window]
+        if self.mirror and mirror % 2:
+            out = out[:, :, ::-1]
+        if mean is None:
+            out[...] = image
+        else:
+            np.subtract(image, mean, out=out, dtype=np.float32)
+
+    def _error(self, message: str, field: str) -> SpecError:
+        return SpecError(message, self._at("transform_param", field))
+
+
+def read_mean(path: str, where: Where | None = None) -> np.ndarray:
+    """Return the mean image of a .binaryproto file: float32 (C, H, W)."""
+    log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
+    try:
+        mean = blobs.to_array(BlobProto.FromString(Path(path).read_bytes()))
+    except OSError as fault:
+        raise SpecError(f'mean file "{path}" cannot be read: {fault.strerror}', where) from None
+    except (DecodeError, ValueError) as fault:
+        raise SpecError(f'mean file "{path}" is no BlobProto of a mean image ({fault})', where) from None
+    if mean.ndim != 3 and not (mean.ndim == 4 and mean.shape[0] == 1):
+        raise SpecError(f'mean file "{path}" holds a blob of shape {mean.shape}, expected one image', where)
+    return mean.reshape(mean.shape[-3:]).astype(np.float32)
