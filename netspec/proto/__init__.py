@@ -1,1 +1,1 @@
-"""The language: Caffe's schema, its text and binary forms, and the upgrades from its older dialects. No torch, no numpy."""
+"""The language: Caffe's schema, its text and binary forms, the upgrades from older forms. No torch, no numpy."""

@@ -20,7 +20,8 @@ from netspec.errors import SpecError, Where
 
 _TOKEN = re.compile(
     r"""(?P<skip> (?: \s+ | //[^\n]* | /\*.*?\*/ )+ )
-      | (?P<token> [A-Za-z_.][\w.]* | -?[0-9.][\w.+]*(?:(?<=[eE])-[0-9]+)? | -(?:inf|nan) | "[^"\n]*" | [{}\[\]=;,] )""",
+      | (?P<token> [A-Za-z_.][\w.]* | -?[0-9.][\w.+]* (?: (?<=[eE])-[0-9]+ )? | -(?:inf|nan) | "[^"\n]*" | [{}\[\]=;,] )
+    """,
     re.VERBOSE | re.DOTALL,
 )
 _LABELS = {

@@ -10,16 +10,17 @@ and new fields of Caffe's messages in ``extend``::
       optional NormalizeParameter norm_param = 206;
     }
 
-The text reader and writer then take ``norm_param { ... }`` for one of LayerParameter's fields, and a layer reads it with
-``schema.value(self.param, "norm_param")``. The classes of Caffe's messages stay the same objects throughout; while no
-dialect is active, the schema is Caffe's. Numbers must be above those that Caffe itself uses in the message, so a fork
-that took one of these (``interp_param = 143``) needs another number here: text files do not tell the difference.
+The text reader and writer then take ``norm_param { ... }`` for one of LayerParameter's fields, and a layer reads it
+with ``schema.value(self.param, "norm_param")``. The classes of Caffe's messages stay the same objects throughout; while
+no dialect is active, the schema is Caffe's. Numbers must be above those that Caffe itself uses in the message, so a
+fork that took one of these (``interp_param = 143``) needs another one here: text files do not tell the difference.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
@@ -77,7 +78,7 @@ def activate(dialect: Dialect) -> None:
     except KeyError:
         _add(file)
     for declared in file.extension:
-        descriptor = pool.FindExtensionByName(f"{file.package}.{declared.name}")
+        descriptor: Any = pool.FindExtensionByName(f"{file.package}.{declared.name}")
         fields = added_fields.setdefault(descriptor.containing_type.full_name, {})
         fields[declared.name] = as_field(declared, descriptor)
     _active[dialect.name] = dialect

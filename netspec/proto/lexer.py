@@ -1,7 +1,7 @@
 """Protobuf's text format cut into tokens that know their line and column.
 
-What a token is: https://protobuf.dev/reference/protobuf/textformat-spec/, and where that is stricter than the C++ parser
-that Caffe uses (strings over several lines, a number glued to the next name), what the C++ parser takes.
+What a token is: https://protobuf.dev/reference/protobuf/textformat-spec/, and where that is stricter than the C++
+parser that Caffe uses (strings over several lines, a number glued to the next name), what the C++ parser takes.
 """
 
 from __future__ import annotations
@@ -48,11 +48,14 @@ class Lexer:
     """
 
     def __init__(self, text: str, file: str) -> None:
+        """``file`` is the name that the tokens' places and the errors give."""
         self.text = text
         self.file = file
+        self._long_strings: list[Token] = []
         self._lines = [0, *(m.end() for m in re.finditer("\n", text))]
 
     def __iter__(self) -> Iterator[Token]:
+        """Yield the tokens. Raises SpecError where the text has something that is none."""
         position, text = 0, self.text
         while position < len(text):
             match = _TOKEN.match(text, position)
@@ -60,7 +63,10 @@ class Lexer:
                 raise self._unexpected(position)
             kind = match.lastgroup or ""
             if kind != "skip":
-                yield Token(kind, match.group(), position)
+                token = Token(kind, match.group(), position)
+                if kind == STRING and "\n" in token.text:
+                    self._long_strings.append(token)
+                yield token
             position = match.end()
         yield Token(END, "", position)
 
@@ -68,6 +74,18 @@ class Lexer:
         """Return the place of a character."""
         line = bisect_right(self._lines, start)
         return Where(self.file, line, start - self._lines[line - 1] + 1)
+
+    def suspicion(self, start: int) -> str:
+        """Return what to say of a fault at a character right after a string over several lines, else nothing.
+
+        Where a closing quote is missing, the string runs on to the next opening one, and the fault is seen there.
+        """
+        for token in reversed(self._long_strings):
+            end = token.start + len(token.text)
+            if token.start < start and self.where(start).line <= self.where(end).line + 1:
+                line = self.where(token.start).line
+                return f"; is a closing quote missing for the string that begins in line {line}?"
+        return ""
 
     def unquote(self, token: Token) -> bytes:
         """Return what a STRING token stands for, escapes resolved."""
@@ -110,7 +128,8 @@ class Lexer:
     def _unexpected(self, position: int) -> SpecError:
         character = self.text[position]
         if character in "\"'":
-            return SpecError("string without a closing quote", self.where(position))
+            fault = f"string without a closing quote{self.suspicion(position)}"
+            return SpecError(fault, self.where(position))
         if "\udc80" <= character <= "\udcff":
             return self._not_utf8(position)
         if not character.isprintable():

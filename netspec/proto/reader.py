@@ -15,20 +15,27 @@ from google.protobuf.message import Message
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto import dialect
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
-from netspec.proto.schema import Field, NetParameter, SolverParameter, fields_of
+from netspec.proto.schema import Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Node
 
-_RANGES = {
+_RANGES: dict[int, tuple[int, int]] = {
     Declared.TYPE_INT32: (-(1 << 31), (1 << 31) - 1),
     Declared.TYPE_INT64: (-(1 << 63), (1 << 63) - 1),
     Declared.TYPE_UINT32: (0, (1 << 32) - 1),
     Declared.TYPE_UINT64: (0, (1 << 64) - 1),
 }
 _BOOLEANS = {"true": True, "True": True, "t": True, "false": False, "False": False, "f": False}
+_V1_TYPES = V1LayerParameter.LayerType.keys()
 _LAYERS = ("caffe.LayerParameter", "caffe.V1LayerParameter")
 
 # The commonest field that forks have and Caffe has not: the rounding of a pooled extent as a bool.
 _ALIASES = {("caffe.PoolingParameter", "ceil_mode"): ("round_mode", {True: "CEIL", False: "FLOOR"})}
+
+# What else a file may be, if a field is unknown in its outermost message.
+_OTHER_FILE: dict[str, tuple[Any, str]] = {
+    "caffe.NetParameter": (SolverParameter, "solver"),
+    "caffe.SolverParameter": (NetParameter, "net"),
+}
 
 Children = dict[str, list[Node]]
 
@@ -49,7 +56,6 @@ class _Reader:
         self.lexer = Lexer(text, file)
         self._tokens = iter(self.lexer)
         self._open: list[tuple[Message, Token]] = []  # the messages being read, each with the token that named it
-        self._long_string: Token | None = None
         self.token = next(self._tokens)
 
     def read(self, message: Message) -> Node:
@@ -63,7 +69,10 @@ class _Reader:
     # ---- Grammar ----
 
     def _field(self, message: Message, children: Children) -> None:
-        name = self._take(NAME, "a field name")
+        if self.token.kind != NAME:
+            advice = '; is there one "}" too many?' if self._at("}") and len(self._open) == 1 else ""
+            raise self._expected("a field name", advice=advice)
+        name = self._next()
         key = (message.DESCRIPTOR.full_name, name.text)
         alias, meaning = _ALIASES.get(key, (name.text, None))
         field = fields_of(message.DESCRIPTOR).get(alias)
@@ -71,7 +80,7 @@ class _Reader:
             raise self._error(self._unknown_field(message, name.text), name)
         if not field.repeated and field.present(message):
             first = children[alias][0].where.line
-            raise self._error(f'"{alias}" was given already, in line {first}; it takes one value', name)
+            raise self._error(f'"{alias}" was given already, in line {first}; it can be given once', name)
         nodes = children.setdefault(alias, [])
         if self._at(":"):
             self._next()
@@ -185,15 +194,16 @@ class _Reader:
             word = self._next().text
             if word in values:
                 return values[word].number
-            names = sorted(values, key=lambda v: values[v].number)
-            known = did_you_mean(word, names) or f"; it is one of {', '.join(names)}"
+            known = did_you_mean(word, list(values)) or f"; it is one of {', '.join(values)}"
             raise self._error(f'"{field.name}" has no value "{word}"{known}', start)
         negative = self._minus()
         if self.token.kind != INTEGER:
             advice = ""
-            if self.token.kind == STRING and field.descriptor.full_name == "caffe.V1LayerParameter.type":
+            if self.token.kind == STRING and self.token.text[1:-1] in values:
+                advice = "; leave out the quotes"
+            elif self.token.kind == STRING and field.descriptor.full_name == "caffe.V1LayerParameter.type":
                 advice = '; a layer whose type is in quotes begins with "layer", not "layers"'
-            raise self._expected(f"a name such as {next(iter(values))}", f'for "{field.name}"', start, advice)
+            raise self._expected(f"a name such as {list(values)[-1]}", f'for "{field.name}"', start, advice)
         number = self._natural(self._next())
         number = -number if negative else number
         if number not in field.descriptor.enum_type.values_by_number:
@@ -204,6 +214,8 @@ class _Reader:
         start = self.token
         if start.kind != STRING:
             advice = "; put it in quotes" if start.kind in (NAME, INTEGER, FLOAT) else ""
+            if field.descriptor.full_name == "caffe.LayerParameter.type" and start.text in _V1_TYPES:
+                advice = '; a layer whose type is not in quotes begins with "layers", the older format'
             raise self._expected("a string", f'for "{field.name}"', start, advice)
         value = b""
         while self.token.kind == STRING:
@@ -239,15 +251,8 @@ class _Reader:
 
     def _next(self) -> Token:
         token = self.token
-        if token.kind == STRING and "\n" in token.text:
-            self._long_string = token
         self.token = next(self._tokens)
         return token
-
-    def _take(self, kind: str, what: str) -> Token:
-        if self.token.kind != kind:
-            raise self._expected(what)
-        return self._next()
 
     # ---- Faults ----
 
@@ -269,9 +274,7 @@ class _Reader:
 
     def _error(self, message: str, token: Token | None = None) -> SpecError:
         place = self.lexer.where((token or self.token).start)
-        if self._long_string is not None:
-            line = self.lexer.where(self._long_string.start).line
-            message += f"; the string that begins in line {line} runs over several lines: is a closing quote missing?"
+        message += self.lexer.suspicion((token or self.token).start)
         for open_message, _ in reversed(self._open):
             if open_message.DESCRIPTOR.full_name in _LAYERS:
                 layer: Any = open_message
@@ -295,11 +298,11 @@ class _Reader:
         messages = {n: f.descriptor.message_type for n, f in known.items() if f.type == Declared.TYPE_MESSAGE}
         inside = [n for n, message_type in messages.items() if name in fields_of(message_type)]
         close = did_you_mean(name, list(known))
+        other, kind = _OTHER_FILE.get(descriptor.full_name, (message, ""))
+        if kind and name in fields_of(other.DESCRIPTOR):
+            return f"{fault}, but {other.DESCRIPTOR.name} has; is this file a {kind}?"
         if inside and not close:
             return f"{fault}; it belongs in {' or '.join(inside)}"
-        other = {NetParameter: SolverParameter, SolverParameter: NetParameter}.get(type(message))
-        if other is not None and name in fields_of(other.DESCRIPTOR):
-            return f"{fault}, but {other.DESCRIPTOR.name} has; is this file a {'net' if other is NetParameter else 'solver'}?"
         return fault + close
 
 

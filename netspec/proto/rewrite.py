@@ -18,6 +18,7 @@ class Draft:
     """A message under construction, and the places of what was put into it."""
 
     def __init__(self, message: Message, where: Where) -> None:
+        """``message`` is what is filled; ``where`` is the place that stands for it as a whole."""
         self.message: Any = message
         self.where = where
         self.places: dict[str, tuple[Node, ...]] = {}

@@ -1,11 +1,11 @@
 """Caffe's messages as Python classes, in a descriptor pool of their own.
 
 The pool is private: another "caffe.proto" in the process (pycaffe's, a converter's) does not clash with this one, and
-no generated module ties netspec to one version of protobuf. ``caffe.desc`` is ``caffe.proto`` compiled; the head of that
-file says how.
+no generated module ties netspec to one version of protobuf. ``caffe.desc`` is ``caffe.proto`` compiled; how, is said
+there.
 """
 
-# ruff: noqa: D101 (the messages are described in caffe.proto)
+# ruff: noqa: D101, D105, D107 (the messages are described in caffe.proto)
 
 from __future__ import annotations
 
@@ -47,8 +47,11 @@ def message(name: str) -> type[Message]:
 
 if TYPE_CHECKING:
 
-    class CaffeMessage(Message):
-        """What a type checker may know of a message: its fields exist at run time only."""
+    class _AnyAttribute(type):
+        def __getattr__(cls, name: str) -> Any: ...
+
+    class CaffeMessage(Message, metaclass=_AnyAttribute):
+        """What a type checker may know of a message: its fields and enums exist at run time only."""
 
         def __init__(self, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> Any: ...

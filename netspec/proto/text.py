@@ -1,4 +1,4 @@
-"""The doors of this room: files of text in, upgraded messages and the places of their parts out; messages as text out."""
+"""The doors of this room: text files in, upgraded messages and the places of their parts out; messages as text."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """From every older form of Caffe's nets and solvers to the current one, the places of their parts included.
 
-Each pass takes a net and its map and returns new ones; one that has nothing to do returns what it was given. They run in
-Caffe's order, on text as on weights. Where Caffe drops a field without a word (of a net that is partly V0: its V1 layers,
-its ``state``), it is kept here.
+Each pass takes a net and its map and returns new ones; one that has nothing to do returns what it was given. They run
+in Caffe's order, on text as on weights. Where Caffe drops a field without a word (of a net that is partly V0: its V1
+layers, its ``state``), it is kept here.
 
 Caffe: src/caffe/util/upgrade_proto.cpp, UpgradeNetAsNeeded, UpgradeSolverAsNeeded, UpgradeSnapshotPrefixProperty
 """
@@ -179,7 +179,8 @@ def upgrade_v1(net: NetParameter, source: SourceMap) -> Upgraded:
     """Return a V1 net with ``layer`` for ``layers``: types by name, and a ParamSpec a learnable array."""
     if not needs_v1_upgrade(net):
         return net, source
-    assert not len(net.layer) and not needs_v0_upgrade(net), "an earlier pass was left out"
+    assert not net.layer, "upgrade_net refuses such a net"
+    assert not needs_v0_upgrade(net), "upgrade_v0 goes first"
     result = copy_without(net, {"layers"})
     places = []
     for layer, place in zip(net.layers, source.layers, strict=True):
@@ -214,7 +215,8 @@ def needs_input_upgrade(net: NetParameter) -> bool:
 def upgrade_input(net: NetParameter, source: SourceMap) -> Upgraded:
     """Return a net with an Input layer named "input" before all others, for its ``input`` fields and their shapes.
 
-    Inputs without any shape, as old weights have them, are dropped. Raises SpecError where some have no shape.
+    Inputs without any shape, as old weights have them, are dropped. Raises SpecError where only some have one. Shapes
+    beyond those of the inputs, and input_dim beside input_shape, are left out with a warning, as Caffe does without.
     """
     if not needs_input_upgrade(net):
         return net, source
@@ -230,11 +232,25 @@ def upgrade_input(net: NetParameter, source: SourceMap) -> Upgraded:
         for index in range(len(net.input)):
             shapes.put("shape", *_input_shape(net, source.net, index))
         places.insert(0, draft.place())
-    elif source.net.find("input").line:
-        where = source.net.find("input")
-        log.warning("upgrade_proto.cpp:977", f"{where}: input without input_shape or input_dim is dropped")
+    for surplus in _surplus(net, source.net):
+        log.warning("upgrade_proto.cpp:977", f"{surplus} is not used")
     result.layer.extend(net.layer)
     return result, replace(source, net=replace(source.net, fields=kept), layers=tuple(places))
+
+
+def _surplus(net: NetParameter, place: Node) -> list[str]:
+    """Return the parts of the input fields that no Input layer can take."""
+    if not len(net.input_shape) and not len(net.input_dim):
+        where = place.find("input")
+        return [f"{where}: input without input_shape or input_dim"] if where.line else []
+    inputs, found = len(net.input), []
+    if len(net.input_shape) > inputs:
+        found.append(f"{place.find('input_shape', inputs)}: input_shape beyond the {inputs} inputs")
+    used = 0 if len(net.input_shape) else 4 * inputs
+    if len(net.input_dim) > used:
+        beyond = f"beyond four each of {inputs} inputs" if used else "beside input_shape"
+        found.append(f"{place.find('input_dim', used)}: input_dim {beyond}")
+    return found
 
 
 def _input_shape(net: NetParameter, place: Node, index: int) -> tuple[Message, tuple[Node, ...]]:
@@ -342,17 +358,18 @@ def upgrade_solver(solver: SolverParameter, place: Node) -> tuple[SolverParamete
         if solver.HasField("type"):
             raise SpecError('both "type" and the older "solver_type" are given; keep "type"', place.find("solver_type"))
         log.info(
-            "upgrade_proto.cpp:1082",
+            "upgrade_proto.cpp:1084",
             f"Attempting to upgrade input file specified using deprecated 'solver_type' field (enum)': {file}",
         )
         old = SolverParameter.SolverType.Name(solver.solver_type)
         draft.put("type", _SOLVER_TYPES[old], place.fields.get("solver_type", ()))
         log.info(
-            "upgrade_proto.cpp:1089",
-            "Successfully upgraded file specified using deprecated 'solver_type' field (enum) to 'type' field (string).",
+            "upgrade_proto.cpp:1091",
+            "Successfully upgraded file specified using deprecated 'solver_type' field (enum) to 'type' field "
+            "(string).",
         )
         log.warning(
-            "upgrade_proto.cpp:1091",
+            "upgrade_proto.cpp:1093",
             "Note that future Caffe releases will only support 'type' field (string) for a solver's type.",
         )
     return draft.message, draft.place()
@@ -367,10 +384,10 @@ def upgrade_snapshot_prefix(solver: SolverParameter, path: str | Path) -> Solver
     if not solver.HasField("snapshot_prefix"):
         result.snapshot_prefix = stem
         message = f"snapshot_prefix was not specified and is set to {result.snapshot_prefix}"
-        log.info("upgrade_proto.cpp:1107", message)
+        log.info("upgrade_proto.cpp:1108", message)
     elif os.path.isdir(solver.snapshot_prefix):
         result.snapshot_prefix = os.path.join(solver.snapshot_prefix, os.path.basename(stem))
         log.info(
-            "upgrade_proto.cpp:1112", f"snapshot_prefix was a directory and is replaced to {result.snapshot_prefix}"
+            "upgrade_proto.cpp:1113", f"snapshot_prefix was a directory and is replaced to {result.snapshot_prefix}"
         )
     return result

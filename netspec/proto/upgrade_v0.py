@@ -1,4 +1,4 @@
-"""From the format of 2013 to that of 2014: ``layers { layer { type: "conv" ... } }`` to ``layers { type: CONVOLUTION }``.
+"""From the layers of 2013 to those of 2014: ``layers { layer { type: "conv" } }`` to ``layers { type: CONVOLUTION }``.
 
 Caffe: src/caffe/util/upgrade_proto.cpp, UpgradeV0Net, UpgradeV0PaddingLayers, UpgradeV0LayerParameter
 """

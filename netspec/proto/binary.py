@@ -1,0 +1,61 @@
+"""Messages in protobuf's binary form: .caffemodel, .solverstate, .binaryproto. Files of any size that memory holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeVar
+
+from google.protobuf.message import DecodeError, Message
+
+from netspec.errors import SpecError, Where
+from netspec.proto.schema import NetParameter
+from netspec.proto.source_map import SourceMap
+from netspec.proto.upgrade import upgrade_net
+
+M = TypeVar("M", bound=Message)
+
+
+def read_binary(path: str | Path, message_class: type[M]) -> M:
+    """Return the message that a file holds.
+
+    Raises SpecError for a file that cannot be read, is empty, or holds something else. Protobuf's binary form has no
+    mark of its own: what decodes without a single known field is taken for something else.
+    """
+    where = Where(str(path))
+    try:
+        data = Path(path).read_bytes()
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror or fault}", where) from None
+    name = message_class.DESCRIPTOR.name
+    if not data:
+        raise SpecError(f"the file is empty, expected a binary {name}", where)
+    message = message_class()
+    try:
+        message.ParseFromString(data)
+        known = bool(message.ListFields())
+    except DecodeError:
+        known = False
+    if not known:
+        raise SpecError(f"expected a binary {name}, found {_guess(data)}", where)
+    return message
+
+
+def read_net_binary(path: str | Path) -> NetParameter:
+    """Return the net of a .caffemodel, upgraded to the current format. Raises SpecError."""
+    return parse_net_binary(path)[0]
+
+
+def parse_net_binary(path: str | Path, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
+    """Return the net of a .caffemodel, and a map that knows the file only. Raises SpecError."""
+    net = read_binary(path, NetParameter)
+    source = SourceMap.unknown(str(path), len(net.layer) + len(net.layers))
+    return upgrade_net(net, source) if upgrade else (net, source)
+
+
+def _guess(data: bytes) -> str:
+    """Say what else a file seems to be."""
+    if data.startswith(b"\x89HDF\r\n\x1a\n"):
+        return "an HDF5 file; its name should end in .h5"
+    if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:1000]):
+        return "text"
+    return "something else, or a part of one: is the file whole?"
