@@ -53,6 +53,11 @@ def regularize(diffs: Tensors, weights: Tensors, decays: Sequence[float], kind: 
     torch._foreach_add_([diffs[i] for i in chosen], pull)
 
 
+def subtract(weights: Tensors, diffs: Tensors) -> None:
+    """Move the weights (Net::Update)."""
+    torch._foreach_sub_(weights, diffs)
+
+
 Compute = Callable[[Any, Tensors, Sequence[float], Tensors, int], None]
 
 

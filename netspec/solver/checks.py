@@ -1,0 +1,53 @@
+"""What is refused before anything is built: settings that Caffe dies of, some of them only after days of training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from netspec.errors import SpecError
+from netspec.graph import Report, raise_fault
+from netspec.proto.source_map import Node
+from netspec.solver.lr_policy import check_policy
+from netspec.solver.update import find_rule
+
+REGULARIZATIONS = ("L2", "L1")
+_AT_LEAST_ONE = ("average_loss", "iter_size")
+_NOT_NEGATIVE = ("max_iter", "display", "test_interval", "snapshot")
+
+
+def check_settings(param: Any, node: Node, report: Report = raise_fault) -> None:
+    """Report every fault of the solver's own settings; the nets have theirs."""
+    for check in (find_rule, check_policy, _check_regularization):
+        try:
+            check(param, node)
+        except SpecError as fault:
+            report(fault)
+    for name in _AT_LEAST_ONE + _NOT_NEGATIVE:
+        value, least = getattr(param, name), int(name in _AT_LEAST_ONE)
+        if value < least:
+            report(SpecError(f"found {name} {value}, expected at least {least}", node.find(name)))
+    for i, count in enumerate(param.test_iter):
+        if count < 0:
+            report(SpecError(f"found test_iter {count}, expected at least 0", node.find("test_iter", i)))
+    if param.snapshot > 0 and not param.snapshot_prefix:
+        report(SpecError("snapshot is given but snapshot_prefix is not", node.find("snapshot")))
+
+
+def check_writable(param: Any, node: Node) -> None:
+    """Refuse a snapshot_prefix that cannot be written to, by writing there (Caffe: CheckSnapshotWritePermissions)."""
+    probe = Path(f"{param.snapshot_prefix}_iter_0.tempfile")
+    try:
+        probe.touch()
+        probe.unlink()
+    except OSError as fault:
+        message = f'cannot write to snapshot prefix "{param.snapshot_prefix}": {fault.strerror or fault}; '
+        raise SpecError(
+            message + "make sure that the directory exists and is writeable", node.find("snapshot_prefix")
+        ) from None
+
+
+def _check_regularization(param: Any, node: Node) -> None:
+    if param.regularization_type not in REGULARIZATIONS:
+        message = f'unknown regularization_type "{param.regularization_type}", expected {" or ".join(REGULARIZATIONS)}'
+        raise SpecError(message, node.find("regularization_type"))

@@ -1,0 +1,96 @@
+"""What a training goes on from: .solverstate in Caffe's binary form, and its HDF5 form in files that end in ``.h5``.
+
+Caffe: SGDSolver::SnapshotSolverState, RestoreSolverState (src/caffe/solvers/sgd_solver.cpp)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from netspec import blobs
+from netspec.errors import SpecError, Where
+from netspec.proto.schema import SolverState
+from netspec.whole_file import whole_file
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a training stands.
+
+    ``history`` has one float32 array a learnable parameter, in the net's order; the second set of Adam and AdaDelta
+    follows the first. ``iteration`` counts updates done. ``learned_net`` is the path of the weights as it was written,
+    relative to the working directory of that run.
+    """
+
+    iteration: int
+    learned_net: str
+    current_step: int
+    history: list[np.ndarray]
+
+
+def read_state(path: str | Path) -> State:
+    """Read a .solverstate or .solverstate.h5, Caffe's or ours. Raises SpecError."""
+    where = Where(str(path))
+    try:
+        if h5py.is_hdf5(path):
+            return _read_hdf5(path)
+        proto = SolverState.FromString(Path(path).read_bytes())
+        history = [blobs.to_array(blob) for blob in proto.history]
+        return State(proto.iter, proto.learned_net, proto.current_step, history)
+    except OSError as fault:
+        raise SpecError(f"the solver state cannot be read: {fault.strerror or fault}", where) from None
+    except (DecodeError, KeyError):
+        raise SpecError(
+            "this is not a solver state: neither a SolverState of Caffe's nor its HDF5 form", where
+        ) from None
+    except ValueError as fault:
+        raise SpecError(f"the solver state is damaged: {fault}", where) from None
+
+
+def write_state(path: str | Path, state: State) -> None:
+    """Write the state, whole or not at all. Raises SpecError where it cannot be written."""
+    with whole_file(path) as unfinished:
+        if str(path).endswith(".h5"):
+            _write_hdf5(unfinished, state)
+            return
+        proto = SolverState(iter=state.iteration, learned_net=state.learned_net, current_step=state.current_step)
+        proto.history.extend(blobs.from_array(array) for array in state.history)
+        unfinished.write_bytes(proto.SerializeToString(deterministic=True))
+
+
+def find_learned_net(state: State, path: str | Path) -> Path | None:
+    """Return the file of the state's weights: as written, else beside the state; None where the state names none."""
+    if not state.learned_net:
+        return None
+    written = Path(state.learned_net)
+    beside = Path(path).parent / written.name
+    for candidate in (written, beside):
+        if candidate.is_file():
+            return candidate
+    raise SpecError(f"its weights are neither at {written} nor at {beside}", Where(str(path)))
+
+
+def _read_hdf5(path: str | Path) -> State:
+    with h5py.File(path, "r") as opened:
+        file: Any = opened
+        history = file["history"]
+        learned_net = file["learned_net"][()].decode() if "learned_net" in file else ""
+        arrays = [history[str(i)][()] for i in range(len(history))]
+        return State(int(file["iter"][0]), learned_net, int(file["current_step"][0]), arrays)
+
+
+def _write_hdf5(path: Path, state: State) -> None:
+    learned_net = state.learned_net.encode()
+    with h5py.File(path, "w") as file:
+        file.create_dataset("iter", data=np.array([state.iteration], np.int32))
+        file.create_dataset("learned_net", data=np.array(learned_net, f"S{len(learned_net) + 1}"))
+        file.create_dataset("current_step", data=np.array([state.current_step], np.int32))
+        history = file.create_group("history")
+        for i, array in enumerate(state.history):
+            history.create_dataset(str(i), data=array)

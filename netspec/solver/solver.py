@@ -1,0 +1,371 @@
+"""The training loop. An iteration: clear, [test], forward and backward, rate, update, count, [snapshot].
+
+Caffe: src/caffe/solver.cpp; the sites in the log calls are the lines of that file that print the same.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from netspec import log
+from netspec.errors import SpecError, Where
+from netspec.net import BuildOptions, Net, build_net
+from netspec.proto.schema import SolverParameter
+from netspec.proto.source_map import Node
+from netspec.proto.text import parse_solver, write_text
+from netspec.solver import nets, update
+from netspec.solver.checks import check_settings, check_writable
+from netspec.solver.lr_policy import learning_rate, next_step
+from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
+from netspec.weights import load_weights, save_weights
+
+Scores = dict[str, list[float]]
+_CREATING = {
+    "net": "solver.cpp:102",
+    "net_param": "solver.cpp:97",
+    "train_net": "solver.cpp:92",
+    "train_net_param": "solver.cpp:88",
+}
+
+
+def load_solver(
+    path: str | Path,
+    weights: str | Path | Iterable[str | Path] | None = None,
+    snapshot: str | Path | None = None,
+    device: str | torch.device | None = None,
+    level: int | None = None,
+    stages: Iterable[str] = (),
+    allow_python: bool = False,
+    action: Callable[[], str | None] | None = None,
+) -> Solver:
+    """Make the solver of a prototxt, its nets built and ready to step.
+
+    ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field;
+    ``snapshot`` is a .solverstate to go on from; ``level`` and ``stages`` go to the training net. For ``device`` and
+    ``action`` see :class:`Solver`. Raises SpecError for every fault of the files.
+    """
+    if weights is not None and snapshot is not None:
+        raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
+    param, node = parse_solver(path)
+    if level is not None or stages:
+        param = nets.with_train_state(param, level, stages)
+    if weights is not None:
+        param.ClearField("weights")
+        param.weights.extend([str(weights)] if isinstance(weights, (str, Path)) else map(str, weights))
+    chosen = choose_device(param, node) if device is None else torch.device(device)
+    if chosen.type == "cpu":
+        log.info("caffe.cpp:197", "Use CPU.")
+    else:
+        log.info("caffe.cpp:204", f"Using GPUs {chosen.index or 0}")
+    solver = Solver(param, node, device=chosen, allow_python=allow_python, action=action)
+    if snapshot is not None:
+        log.info("caffe.cpp:235", f"Resuming from {snapshot}")
+        solver.restore(snapshot)
+    return solver
+
+
+def choose_device(param: Any, node: Node) -> torch.device:
+    """Return the device that solver_mode and device_id ask for; the CPU, with a warning, where there is no GPU."""
+    if param.solver_mode == SolverParameter.SolverMode.Value("CPU"):
+        return torch.device("cpu")
+    count = torch.cuda.device_count()
+    if not count:
+        place = node.find("solver_mode")
+        log.warning("caffe.cpp:197", f"{place}: solver_mode GPU, but torch finds no GPU here: running on the CPU")
+        return torch.device("cpu")
+    if not 0 <= param.device_id < count:
+        raise SpecError(
+            f"found device_id {param.device_id}, but torch finds {count} GPU(s) here", node.find("device_id")
+        )
+    return torch.device("cuda", param.device_id)
+
+
+class Solver:
+    """A training: the net it trains, the nets it tests, and where it stands.
+
+    ``iteration`` counts the updates done; ``net`` is the training net, ``test_nets`` the others; ``scores`` has, for
+    each test net, the mean of every output element of its last test. ``on_iteration()`` is called after each update,
+    ``on_test(i)`` after test net i was run.
+    """
+
+    def __init__(
+        self,
+        param: Any,
+        node: Node | None = None,
+        *,
+        device: torch.device | None = None,
+        allow_python: bool = False,
+        action: Callable[[], str | None] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """Build the nets of a solver as ``proto.text.parse_solver`` returns it; raise SpecError for what is wrong.
+
+        ``device`` overrides solver_mode and device_id. ``action`` is asked between iterations, also those of a test:
+        "stop" ends the training, "snapshot" takes one. ``clock`` gives the seconds behind "iter/s".
+        """
+        node = node or Node(Where("<solver>"))
+        log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
+        check_settings(param, node)
+        if param.snapshot:
+            check_writable(param, node)
+        self.param = param
+        self.node = node
+        self.action = action or (lambda: None)
+        self.clock = clock
+        self.on_iteration: Callable[[], object] = lambda: None
+        self.on_test: Callable[[int], object] = lambda i: None
+        self.iteration = 0
+        self.current_step = 0
+        self.scores: list[Scores] = []
+        self.stopped = False
+        self._losses: deque[float] = deque(maxlen=param.average_loss)
+        self._displayed = (clock(), 0)
+        self._rule = update.find_rule(param, node)
+        self._device = device or choose_device(param, node)
+        self._allow_python = allow_python
+
+        train = nets.train_net(param, node)
+        field = train.origin.split()[0]
+        how = "from" if "file:" in train.origin else "specified in"
+        log.info(_CREATING[field], f"Creating training net {how} {train.origin}" + ("" if how == "from" else "."))
+        self.net = self._build(train, 0)
+        self.test_nets: list[Net] = []
+        for i, test in enumerate(nets.test_nets(param, node)):
+            log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
+            self.test_nets.append(self._build(test, 1 + i))
+        log.info("solver.cpp:57", "Solver scaffolding done.")
+        self.history = [
+            torch.zeros_like(learnable.parameter.detach())
+            for _ in range(self._rule.sets)
+            for learnable in self.net.learnable
+        ]
+
+    def _build(self, described: nets.SolverNet, offset: int) -> Net:
+        """Build a net; ``offset`` keeps the random draws of a solver's nets apart."""
+        seed = self.param.random_seed + offset if self.param.random_seed >= 0 else None
+        options = BuildOptions(self._device, seed, allow_python=self._allow_python)
+        net = build_net(described.net, described.source, options)
+        for paths in self.param.weights:
+            for path in paths.split(","):
+                log.info("solver.cpp:72", f"Finetuning from {path.strip()}")
+                load_weights(net, path.strip())
+        return net
+
+    @property
+    def loss(self) -> float:
+        """The training loss, a mean over the last ``average_loss`` iterations of this call of :meth:`step`."""
+        return sum(self._losses) / len(self._losses) if self._losses else 0.0
+
+    @property
+    def learning_rate(self) -> float:
+        """The rate of the iteration to come."""
+        return learning_rate(self.param, self.iteration, next_step(self.param, self.iteration, self.current_step))
+
+    def solve(self) -> None:
+        """Train up to max_iter, then show the loss and test once more where the settings say so."""
+        log.info("solver.cpp:289", f"Solving {self.net.name}")
+        log.info("solver.cpp:290", f"Learning Rate Policy: {self.param.lr_policy}")
+        if self.param.snapshot_after_train:
+            check_writable(self.param, self.node)
+        self.step(self.param.max_iter - self.iteration)
+        if self.param.snapshot_after_train and not self._is_due(self.param.snapshot):
+            self.snapshot()
+        if self.stopped:
+            log.info("solver.cpp:311", "Optimization stopped early.")
+            return
+        if self._is_due(self.param.display):
+            with torch.no_grad():
+                self._losses.append(self.net.forward_loss()[0].item())
+            log.info("solver.cpp:327", f"Iteration {self.iteration}, loss = {log.number(self.loss)}")
+        if self._is_due(self.param.test_interval):
+            self.test_all()
+        log.info("solver.cpp:332", "Optimization Done.")
+
+    def step(self, iterations: int) -> None:
+        """Run some iterations. The window of the averaged loss begins anew."""
+        self.stopped = False
+        self._losses.clear()
+        self._displayed = (self.clock(), self.iteration)
+        for _ in range(iterations):
+            if self._is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
+                self.test_all()
+                if self.stopped:
+                    return
+            loss, outputs = self._forward_backward()
+            self._losses.append(loss)
+            if self._is_due(self.param.display):
+                self._display(outputs)
+            self._apply_update()
+            self.iteration += 1
+            self.on_iteration()
+            request = self.action()
+            if self._is_due(self.param.snapshot) or request == "snapshot":
+                self.snapshot()
+            if request == "stop":
+                self.stopped = True
+                return
+
+    def _is_due(self, interval: int) -> bool:
+        return interval > 0 and self.iteration % interval == 0
+
+    def _forward_backward(self) -> tuple[float, dict[str, torch.Tensor]]:
+        """Sum the gradients of iter_size passes; return the mean of their losses, and the outputs of the last."""
+        for learnable in self.net.learnable:
+            learnable.parameter.grad = None
+        total = 0.0
+        outputs: dict[str, torch.Tensor] = {}
+        for _ in range(self.param.iter_size):
+            loss, outputs = self.net.forward_loss()
+            if loss.requires_grad:
+                loss.backward()
+            total += loss.item()
+        return total / self.param.iter_size, outputs
+
+    @torch.no_grad()
+    def _apply_update(self) -> None:
+        """Move the weights; the gradients then hold what was subtracted, as in Caffe."""
+        rate = self._advance_rate()
+        if self._is_due(self.param.display):
+            log.info("sgd_solver.cpp:112", f"Iteration {self.iteration}, lr = {log.number(rate)}")
+        learnable = self.net.learnable
+        weights = [item.parameter.detach() for item in learnable]
+        diffs = [
+            torch.zeros_like(w) if item.parameter.grad is None else item.parameter.grad
+            for item, w in zip(learnable, weights, strict=True)
+        ]
+        clipped = update.clip(diffs, self.param.clip_gradients)
+        if clipped:
+            norm, factor = map(log.number, clipped)
+            limit = log.number(self.param.clip_gradients)
+            message = f"Gradient clipping: scaling down gradients (L2 norm {norm} > {limit}) by scale factor {factor}"
+            log.info("sgd_solver.cpp:99", message)
+        update.normalize(diffs, self.param.iter_size)
+        decays = [self.param.weight_decay * item.decay_mult for item in learnable]
+        update.regularize(diffs, weights, decays, self.param.regularization_type)
+        rates = [rate * item.lr_mult for item in learnable]
+        self._rule.compute(self.param, diffs, rates, self.history, self.iteration)
+        update.subtract(weights, diffs)
+
+    def _advance_rate(self) -> float:
+        step = next_step(self.param, self.iteration, self.current_step)
+        if step != self.current_step and self.param.lr_policy == "multistep":
+            log.info("sgd_solver.cpp:50", f"MultiStep Status: Iteration {self.iteration}, step = {step}")
+        self.current_step = step
+        return learning_rate(self.param, self.iteration, step)
+
+    def _display(self, outputs: dict[str, torch.Tensor]) -> None:
+        now, (then, iteration) = self.clock(), self._displayed
+        speed = (self.iteration - iteration) / (now - then or 1)
+        pace = f"{log.number(speed)} iter/s, {log.number(now - then)}s/{self.param.display} iters"
+        log.info("solver.cpp:239", f"Iteration {self.iteration} ({pace}), loss = {log.number(self.loss)}")
+        self._displayed = (now, self.iteration)
+        scores = {name: blob.detach().reshape(-1).tolist() for name, blob in outputs.items()}
+        _log_scores("solver.cpp:258", "Train", scores, self.net.output_loss_weights)
+
+    # Testing
+
+    def test_all(self) -> None:
+        """Run every test net, each over its test_iter batches, with the present weights."""
+        self.scores = [{} for _ in self.test_nets]
+        for i in range(len(self.test_nets)):
+            if not self.stopped:
+                self._test(i)
+
+    @torch.no_grad()
+    def _test(self, i: int) -> None:
+        log.info("solver.cpp:347", f"Iteration {self.iteration}, Testing net (#{i})")
+        net, batches = self.test_nets[i], self.param.test_iter[i]
+        net.share_weights_with(self.net)
+        sums: Scores = {}
+        total = 0.0
+        for _ in range(batches):
+            while request := self.action():
+                if request == "snapshot":
+                    self.snapshot()
+                self.stopped |= request == "stop"
+            if self.stopped:
+                log.info("solver.cpp:396", "Test interrupted.")
+                return
+            loss, outputs = net.forward_loss()
+            total += loss.item()
+            for name, blob in outputs.items():
+                scores = blob.reshape(-1).tolist()
+                sums[name] = [a + b for a, b in zip(sums[name], scores, strict=True)] if name in sums else scores
+        if self.param.test_compute_loss and batches:
+            log.info("solver.cpp:401", f"Test loss: {log.number(total / batches)}")
+        self.scores[i] = {name: [value / batches for value in values] for name, values in sums.items()}
+        _log_scores("solver.cpp:414", "Test", self.scores[i], net.output_loss_weights)
+        self.on_test(i)
+
+    # Going on later
+
+    def snapshot(self) -> tuple[str, str]:
+        """Write the weights and the state; return their paths, ``PREFIX_iter_N.caffemodel`` and ``.solverstate``.
+
+        With ``snapshot_format: HDF5`` both end in ``.h5``. Raises SpecError where they cannot be written.
+        """
+        hdf5 = self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5")
+        form, ending = ("HDF5", ".h5") if hdf5 else ("binary proto", "")
+        stem = f"{self.param.snapshot_prefix}_iter_{self.iteration}"
+        model, state = f"{stem}.caffemodel{ending}", f"{stem}.solverstate{ending}"
+        log.info("solver.cpp:474" if hdf5 else "solver.cpp:464", f"Snapshotting to {form} file {model}")
+        save_weights(self.net, model, self.param.snapshot_diff)
+        site = "sgd_solver.cpp:296" if hdf5 else "sgd_solver.cpp:284"
+        log.info(site, f"Snapshotting solver state to {form} file {state}")
+        history = [values.cpu().numpy() for values in self.history]
+        write_state(state, State(self.iteration, model, self.current_step, history))
+        return model, state
+
+    def restore(self, path: str | Path) -> None:
+        """Go on from a .solverstate or .solverstate.h5, Caffe's or ours, and from its weights.
+
+        As in Caffe the data layers begin again at their first record. Raises SpecError, and changes nothing, where the
+        state does not fit this solver's type and net.
+        """
+        where = Where(str(path))
+        state = read_state(path)
+        if len(state.history) != len(self.history):
+            found, expected = len(state.history), len(self.history)
+            message = (
+                f"incorrect length of history blobs: found {found}, expected {expected} for this net and solver type"
+            )
+            raise SpecError(f"{message} {self.param.type}", where)
+        for i, (mine, theirs) in enumerate(zip(self.history, state.history, strict=True)):
+            if not _same_shape(tuple(mine.shape), theirs.shape):
+                raise SpecError(f"history blob {i} has shape {theirs.shape}, expected {tuple(mine.shape)}", where)
+        learned_net = find_learned_net(state, path)
+        if learned_net is not None:
+            load_weights(self.net, learned_net)
+        log.info("sgd_solver.cpp:336", "SGDSolver: restoring history")
+        for mine, theirs in zip(self.history, state.history, strict=True):
+            mine.copy_(torch.tensor(theirs).view(mine.shape))
+        self.iteration = state.iteration
+        self.current_step = state.current_step
+        for net in (self.net, *self.test_nets):
+            net.restart_data()
+
+    def close(self) -> None:
+        """Let go of the files and threads of all nets."""
+        for net in (self.net, *self.test_nets):
+            net.close()
+
+
+def _log_scores(site: str, phase: str, scores: Scores, weights: dict[str, float]) -> None:
+    number = 0
+    for name, values in scores.items():
+        weight = weights[name]
+        for value in values:
+            ending = f" (* {log.number(weight)} = {log.number(weight * value)} loss)" if weight else ""
+            log.info(site, f"    {phase} net output #{number}: {name} = {log.number(value)}{ending}")
+            number += 1
+
+
+def _same_shape(mine: tuple[int, ...], theirs: tuple[int, ...]) -> bool:
+    """Say whether two shapes are equal, or theirs is one of the old ones of four axes, filled up with ones in front."""
+    return theirs == mine or theirs == (1,) * (4 - len(mine)) + mine
