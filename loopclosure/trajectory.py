@@ -18,6 +18,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 
@@ -215,6 +216,16 @@ def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MA
         quaternions=trajectory.quaternions[nearest[posed]],
         dropped=int((~posed).sum()),
     )
+
+
+def rotation_matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Camera-to-world matrices (N, 3, 3) of unit quaternions (N, 4) xyzw; their columns are the camera's axes."""
+    return Rotation.from_quat(quaternions).as_matrix()
+
+
+def quaternions_from_matrices(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternions (N, 4) xyzw, w not negative, of rotation matrices (N, 3, 3)."""
+    return Rotation.from_matrix(matrices).as_quat(canonical=True)
 
 
 def _content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple[int, str]]:
