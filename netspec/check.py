@@ -63,16 +63,15 @@ def check_file(
     allow_python: bool = False,
 ) -> list[Checked]:
     """Check a net for a phase, level and stages, or all nets of a solver."""
+    given = shapes or {}
     if is_solver(path):
-        from netspec.solver.solver import solver_nets
+        from netspec.solver.nets import solver_nets, with_train_state
 
         solver, node = parse_solver(path)
-        return [
-            check_net(net, source, label, shapes or {}, allow_python)
-            for label, net, source in solver_nets(solver, node, str(path), level=level, stages=tuple(stages))
-        ]
+        described = solver_nets(with_train_state(solver, level, stages), node)
+        return [check_net(part.net, part.source, part.label, given, allow_python) for part in described]
     net, source = parse_net(path)
-    return [check_net(with_state(net, phase, level, stages), source, str(path), shapes or {}, allow_python)]
+    return [check_net(with_state(net, phase, level, stages), source, str(path), given, allow_python)]
 
 
 def as_json(net: Net) -> dict[str, Any]:

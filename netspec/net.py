@@ -22,6 +22,7 @@ from netspec.graph import Report, raise_fault
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import Param, Plan, make_plan, plan_backward
 from netspec.graph.splits import insert_splits
+from netspec.in_place import Memory, is_overwritten, run_overwritten
 from netspec.layers import layer_class, layer_types
 from netspec.layers.base import Context, Layer, Random, Shape
 from netspec.proto.schema import NetParameter
@@ -122,6 +123,9 @@ class Net(torch.nn.Module):
         seed = int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed
         self.random = Random(seed)
         self.layers = self._build_layers(options)
+        self._overwritten = [
+            is_overwritten(layer, node, plan) for layer, node in zip(self.layers, plan.nodes, strict=False)
+        ]
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
 
@@ -254,11 +258,15 @@ class Net(torch.nn.Module):
             raise ValueError(f"{found}; this net's inputs: {', '.join(self.inputs) or 'none (it reads its own data)'}")
         kept = self._kept()
         values: dict[int, torch.Tensor] = {}
+        memories: dict[int, Memory] = {}
         loss: torch.Tensor | None = None
         for i, (node, layer) in enumerate(zip(self.plan.nodes, self.layers, strict=True)):
-            tops = self.run_layer(i, values, inputs)
+            memory = memories.setdefault(self.plan.final[node.tops[0]], Memory()) if self._overwritten[i] else None
+            tops = self.run_layer(i, values, inputs, memory)
             for v, top in zip(node.tops, tops, strict=False):
                 values[v] = top
+                if v in memories:
+                    memories[v].data = top.detach()
             for top, weight in zip(tops, self.loss_weights[i], strict=True):
                 if weight:
                     term = top.sum() if weight == 1 else top.sum() * weight
@@ -270,8 +278,13 @@ class Net(torch.nn.Module):
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
-    def run_layer(self, i: int, values: Mapping[int, torch.Tensor], inputs: Mapping[str, Array]) -> tuple[torch.Tensor, ...]:
-        """Run layer ``i`` alone on ``values`` (by value number) and return its tops."""
+    def run_layer(
+        self, i: int, values: Mapping[int, torch.Tensor], inputs: Mapping[str, Array], memory: Memory | None = None
+    ) -> tuple[torch.Tensor, ...]:
+        """Run layer ``i`` alone on ``values`` (by value number) and return its tops.
+
+        ``memory`` is what its gradient is to read where later layers write in place over its top.
+        """
         node, layer = self.plan.nodes[i], self.layers[i]
         if layer.is_input:
             return tuple(self._as_input(inputs[blob]) for blob in _tops(self.plan, node))
@@ -279,6 +292,8 @@ class Net(torch.nn.Module):
         for v, blocked in zip(node.bottoms, node.blocked, strict=True):
             stop = blocked and not self.param.force_backward
             bottoms.append(values[v].detach() if stop else values[v])
+        if memory is not None and torch.is_grad_enabled():
+            return run_overwritten(layer, bottoms[0], memory, node.in_place[0])
         return layer.run(*bottoms)
 
     def _as_input(self, value: Array) -> torch.Tensor:

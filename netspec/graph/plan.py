@@ -44,13 +44,17 @@ class Node:
 
 @dataclass(frozen=True)
 class Plan:
-    """A net in running order. ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values."""
+    """A net in running order. ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values.
+
+    ``final[v]`` is the value that Caffe's memory holds in the end where it held ``v``: the last in-place layer's.
+    """
 
     net: Any
     source: SourceMap
     nodes: tuple[Node, ...]
     blobs: tuple[str, ...]
     outputs: dict[str, int]
+    final: tuple[int, ...]
 
 
 def make_plan(net: Any, source: SourceMap, report: Report = raise_fault) -> Plan:
@@ -101,7 +105,16 @@ def make_plan(net: Any, source: SourceMap, report: Report = raise_fault) -> Plan
         blocked = tuple(not down for down in layer.propagate_down) or (False,) * len(bottoms)
         nodes.append(Node(layer.name, layer.type, bottoms, tuple(tops), tuple(in_place), tuple(params), blocked))
     outputs = {name: current[name] for name in sorted(available)}
-    return Plan(net, source, tuple(nodes), tuple(blobs), outputs)
+    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, _final(nodes, len(blobs)))
+
+
+def _final(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
+    final = list(range(count))
+    for node in reversed(nodes):
+        for j, replaces in enumerate(node.in_place):
+            if replaces and node.bottoms[j] >= 0:
+                final[node.bottoms[j]] = final[node.tops[j]]
+    return tuple(final)
 
 
 def _shared_multipliers(net: Any, source: SourceMap, report: Report) -> dict[str, tuple[float, float]]:

@@ -73,6 +73,7 @@ class Layer(torch.nn.Module):
     is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
     is_input: ClassVar[bool] = False  # its tops are given by the caller
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
+    gradient_reads: ClassVar[frozenset[str]] = frozenset()  # "bottom", "top": what Caffe's backward reads of the data
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
@@ -97,6 +98,13 @@ class Layer(torch.nn.Module):
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         """Return the tops."""
+        raise NotImplementedError
+
+    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """Return the bottom's gradient as Caffe computes it from what its memory holds at the time of backward.
+
+        Only for layers of one bottom and top whose ``gradient_reads`` is not empty: see netspec/in_place.py.
+        """
         raise NotImplementedError
 
     def restart(self) -> None:

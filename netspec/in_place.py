@@ -1,0 +1,52 @@
+"""Gradients where in-place layers follow one another, as Caffe's shared memory makes them.
+
+Caffe's backward reads the data of bottom and top where they lie. If a later layer has written over them in place, it
+reads that layer's result: behind an in-place ReLU that an in-place Sigmoid follows, every value is positive, and the ReLU
+passes every gradient. Nets were trained with these gradients, so they are computed here too. It matters only for
+layers whose backward reads what was overwritten; the others keep a copy or a mask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from netspec.graph.plan import Node, Plan
+from netspec.layers.base import Layer
+
+
+@dataclass
+class Memory:
+    """What a piece of Caffe's memory holds at the end of the forward pass."""
+
+    data: torch.Tensor | None = None
+
+
+def is_overwritten(layer: Layer, node: Node, plan: Plan) -> bool:
+    """Return whether the layer's backward reads data that it, or a later layer, has written over."""
+    if not layer.gradient_reads:
+        return False
+    later = plan.final[node.tops[0]] != node.tops[0]
+    return ("top" in layer.gradient_reads and later) or ("bottom" in layer.gradient_reads and node.in_place[0])
+
+
+def run_overwritten(layer: Layer, bottom: torch.Tensor, memory: Memory, in_place: bool) -> tuple[torch.Tensor, ...]:
+    """Run a layer whose gradient is to read ``memory`` for its top and, where it is in place, for its bottom."""
+    return (_Overwritten.apply(bottom, layer, memory, in_place),)
+
+
+class _Overwritten(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, bottom: torch.Tensor, layer: Layer, memory: Memory, in_place: bool) -> torch.Tensor:
+        ctx.layer, ctx.memory, ctx.in_place = layer, memory, in_place
+        if not in_place:
+            ctx.save_for_backward(bottom)
+        return layer.run(bottom)[0]
+
+    @staticmethod
+    def backward(ctx: Any, diff: torch.Tensor) -> Any:
+        held = ctx.memory.data
+        bottom = held if ctx.in_place else ctx.saved_tensors[0]
+        return ctx.layer.gradient_in_place(bottom, held, diff), None, None, None

@@ -1,0 +1,106 @@
+"""Passes on text: which layers a state includes, and Caffe's names for split blobs."""
+
+import pytest
+
+from netspec.errors import SpecError
+from netspec.graph.filter import filter_net, merged_state, with_state
+from netspec.graph.splits import insert_splits
+from netspec.proto.schema import NetState
+from netspec.proto.text import parse_net_text
+
+RULES = """
+layer { name: "always" type: "Silence" }
+layer { name: "train" type: "Silence" include { phase: TRAIN } }
+layer { name: "test" type: "Silence" include { phase: TEST } }
+layer { name: "deep" type: "Silence" include { min_level: 2 } }
+layer { name: "shallow" type: "Silence" include { max_level: 1 } }
+layer { name: "deploy" type: "Silence" include { stage: "deploy" stage: "fast" } }
+layer { name: "not_deploy" type: "Silence" exclude { stage: "deploy" } }
+layer { name: "no_val" type: "Silence" include { not_stage: "val" } }
+layer { name: "either" type: "Silence" include { stage: "val" } include { phase: TRAIN } }
+"""
+
+
+@pytest.mark.parametrize(
+    ("phase", "level", "stages", "expected"),
+    [
+        (0, 0, (), "always train shallow not_deploy no_val either"),
+        (1, 0, (), "always test shallow not_deploy no_val"),
+        (1, 2, ("val",), "always test deep not_deploy either"),
+        (1, 1, ("deploy",), "always test shallow no_val"),
+        (1, 1, ("deploy", "fast"), "always test shallow deploy no_val"),
+    ],
+)
+def test_layers_that_a_state_includes(phase: int, level: int, stages: tuple[str, ...], expected: str) -> None:
+    net, source = parse_net_text(RULES, "net")
+    filtered, places = filter_net(with_state(net, phase, level, stages), source)
+    assert " ".join(layer.name for layer in filtered.layer) == expected
+    lines = [RULES.splitlines()[place.where.line - 1] for place in places.layers]
+    assert [line.split('"')[1] for line in lines] == expected.split()
+    assert len(net.layer) == 9  # the argument is as it was
+
+
+def test_include_and_exclude_together_are_refused_with_their_place() -> None:
+    net, source = parse_net_text('layer { name: "a" type: "Silence"\n include { phase: TEST } exclude { level_: 1 } }'.replace("level_", "min_level"), "f")
+    with pytest.raises(SpecError, match=r"^f:2:\d+: layer \"a\" \(Silence\): found both include and exclude"):
+        filter_net(net, source)
+
+
+def test_states_merge_as_the_solver_merges_them() -> None:
+    state = merged_state(NetState(phase=0, level=1), NetState(stage=["a"]), NetState(level=3, stage=["b"]))
+    assert (state.phase, state.level, list(state.stage)) == (0, 3, ["a", "b"])
+
+
+def _split(text: str) -> list[str]:
+    net, source = parse_net_text(text, "net")
+    split, places = insert_splits(net, source)
+    assert len(places.layers) == len(split.layer)
+    again, _ = insert_splits(split, places)
+    assert again == split  # nothing is left to split
+    return [f"{layer.name}: {','.join(layer.bottom)} -> {','.join(layer.top)}" for layer in split.layer]
+
+
+def test_a_blob_used_twice_is_split_under_caffes_names() -> None:
+    text = """
+    layer { name: "data" type: "Input" top: "x" top: "y" }
+    layer { name: "a" type: "ReLU" bottom: "y" top: "a" }
+    layer { name: "b" type: "ReLU" bottom: "y" top: "b" }
+    """
+    assert _split(text) == [
+        "data:  -> x,y",
+        "y_data_1_split: y -> y_data_1_split_0,y_data_1_split_1",
+        "a: y_data_1_split_0 -> a",
+        "b: y_data_1_split_1 -> b",
+    ]
+
+
+def test_the_users_of_an_in_place_result_share_the_last_writers_split() -> None:
+    text = """
+    layer { name: "data" type: "Input" top: "x" }
+    layer { name: "relu" type: "ReLU" bottom: "x" top: "x" }
+    layer { name: "a" type: "TanH" bottom: "x" top: "a" }
+    layer { name: "b" type: "TanH" bottom: "x" top: "b" }
+    """
+    assert _split(text)[2] == "x_relu_0_split: x -> x_relu_0_split_0,x_relu_0_split_1"
+
+
+def test_a_loss_weight_is_a_use_and_moves_to_the_first_copy() -> None:
+    text = """
+    layer { name: "data" type: "Input" top: "x" }
+    layer { name: "sum" type: "Reduction" bottom: "x" top: "s" loss_weight: 0.5 }
+    layer { name: "b" type: "TanH" bottom: "s" top: "b" }
+    """
+    net, source = parse_net_text(text, "net")
+    split, _ = insert_splits(net, source)
+    assert list(split.layer[1].loss_weight) == []
+    assert list(split.layer[2].loss_weight) == [0.5, 0.0]
+    assert split.layer[3].bottom[0] == "s_sum_0_split_1"
+
+
+def test_unknown_bottom_names_its_place_and_the_likely_blob() -> None:
+    text = 'layer { name: "data" type: "Input" top: "pool1" }\nlayer { name: "c" type: "ReLU"\n  bottom: "pol1" top: "c" }'
+    net, source = parse_net_text(text, "net.prototxt")
+    with pytest.raises(SpecError) as caught:
+        insert_splits(net, source)
+    expected = 'net.prototxt:3:3: layer "c" (ReLU): unknown bottom blob "pol1"; did you mean "pool1"? available: pool1'
+    assert str(caught.value) == expected
