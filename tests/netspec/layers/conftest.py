@@ -1,0 +1,54 @@
+"""How the tests of single layers build one from text, and check its gradient."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from google.protobuf import text_format
+
+from netspec.errors import Where
+from netspec.layers import Context, Layer, Random, layer_class
+from netspec.layers.base import TEST
+from netspec.proto.schema import LayerParameter
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
+
+
+def _at(*path: str | int) -> Where:
+    """Say where a fault is by the path to it: an error reads ``convolution_param.pad.1: ...``."""
+    return Where(".".join(map(str, path)))
+
+
+@pytest.fixture
+def build() -> Callable[..., Layer]:
+    """``build(text, *bottom_shapes, tops=1, phase=TEST, seed=0)``: a layer from the text of a LayerParameter.
+
+    The text holds no bottoms and tops; their names are made up, one bottom for each shape.
+    """
+
+    def build_layer(text: str, *shapes: tuple[int, ...], tops: int = 1, phase: int = TEST, seed: int = 0) -> Layer:
+        param = LayerParameter()
+        text_format.Parse(text, param)
+        param.bottom.extend(f"bottom{i}" for i in range(len(shapes)))
+        param.top.extend(f"top{i}" for i in range(tops))
+        cls = layer_class(param.type)
+        assert cls is not None, param.type
+        return cls(param, shapes, Context(phase=phase, random=Random(seed), at=_at))
+
+    return build_layer
+
+
+@pytest.fixture
+def gradcheck() -> Callable[..., None]:
+    """``gradcheck(layer, *bottoms)``: in double, the gradients of bottoms and blobs are those of the function."""
+
+    def check(layer: Layer, *bottoms: torch.Tensor) -> None:
+        layer.double()
+        inputs = [bottom.double().requires_grad_() for bottom in bottoms]
+        learned = list(layer.blobs) if layer.default_param_lr else []
+        torch.autograd.gradcheck(lambda *args: layer.run(*args[: len(inputs)])[0], (*inputs, *learned))
+
+    return check
