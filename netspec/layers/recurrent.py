@@ -1,0 +1,214 @@
+"""Recurrent layers, time step by time step.
+
+Caffe: src/caffe/layers/recurrent_layer.cpp, which unrolls the time steps into a net of their own
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+
+from netspec.layers.base import Layer, Shape
+from netspec.layers.registry import register
+
+
+class Recurrent(Layer):
+    """Base of RNN and LSTM.
+
+    The hidden state lives on from one forward pass to the next until a cont of 0 ends its sequence. It is 0 at first,
+    and again when the number of streams changes. With expose_hidden the caller carries it instead, as bottoms and tops.
+    No gradient passes from a batch into the one before, through these bottoms and tops neither. Unlike Caffe's, the
+    number of time steps may change from batch to batch.
+    """
+
+    bottoms = (2, 5)
+    tops = (1, 3)
+    label_bottoms = frozenset({1})
+    state_names: ClassVar[tuple[str, ...]]
+    gates: ClassVar[int] = 1  # how many numbers a hidden unit takes in
+
+    def setup(self) -> None:
+        """Add the blobs that take x, x_static and h in; subclasses append theirs."""
+        p = self.param.recurrent_param
+        if p.num_output <= 0:
+            message = f"found num_output {p.num_output}, expected a positive number"
+            raise self.error(message, "recurrent_param", "num_output")
+        self.hidden: int = p.num_output
+        self.exposed: bool = p.expose_hidden
+        exposed = len(self.state_names) * self.exposed
+        self.has_static = len(self.bottom_shapes) == 3 + exposed
+        if len(self.bottom_shapes) != 2 + self.has_static + exposed:
+            names = ", ".join(("x", "cont", "[x_static]", *self.state_names[:exposed]))
+            raise self.error(f"found {len(self.bottom_shapes)} bottom blob(s), expected {names}", "bottom")
+        if self.num_tops != 1 + exposed:
+            names = ", ".join(("the output", *self.state_names[:exposed]))
+            raise self.error(f"found {self.num_tops} top blob(s), expected {names}", "top")
+        x = self.bottom_shapes[0]
+        if len(x) < 2:
+            raise self.error(f"found a bottom of shape {x}, expected (time steps, streams, ...)", "bottom", 0)
+        rows = self.gates * self.hidden
+        self.add_blob((rows, math.prod(x[2:])), p.weight_filler)
+        self.add_blob((rows,), p.bias_filler)
+        if self.has_static:
+            self.add_blob((rows, math.prod(self.bottom_shapes[2][1:])), p.weight_filler)
+        self.add_blob((rows, self.hidden), p.weight_filler)
+        self.state: tuple[torch.Tensor, ...] = ()
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the tops' shapes."""
+        x, cont = bottom_shapes[:2]
+        steps, streams = x[:2]
+        if tuple(cont) != (steps, streams):
+            raise self.error(f"found cont of shape {cont}, expected {(steps, streams)}, x being {x}", "bottom", 1)
+        if self.has_static and bottom_shapes[2][:1] != (streams,):
+            message = f"found x_static of shape {bottom_shapes[2]}, expected ({streams}, ...), x being {x}"
+            raise self.error(message, "bottom", 2)
+        state = (1, streams, self.hidden)
+        first = 2 + self.has_static
+        for i, shape in enumerate(bottom_shapes[first:], first):
+            if shape != state:
+                message = f"found {self.state_names[i - first]} of shape {shape}, expected {state}"
+                raise self.error(message, "bottom", i)
+        return [(steps, streams, self.hidden), *[state] * (self.num_tops - 1)]
+
+    def forward(self, x: torch.Tensor, cont: torch.Tensor, *others: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the output of every time step and, where exposed, the last state."""
+        steps, streams = x.shape[:2]
+        inputs = F.linear(x.reshape(steps, streams, -1), self.blob(0), self.blob(1))
+        if self.has_static:
+            inputs = inputs + F.linear(others[0].reshape(streams, -1), self.blob(2))
+        state = self._first_state(x, others[self.has_static :])
+        goes_on = cont.detach().to(x.dtype).unsqueeze(2)
+        outputs = []
+        for gate_input, keep in zip(inputs, goes_on, strict=True):
+            output, state = self.step(gate_input, keep, state)
+            outputs.append(output)
+        last = tuple(s.detach() for s in state)
+        if self.exposed:
+            return torch.stack(outputs), *(s.unsqueeze(0) for s in last)
+        self.state = last
+        return (torch.stack(outputs),)
+
+    def step(
+        self, inputs: torch.Tensor, keep: torch.Tensor, state: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        """Do one time step: return its output (streams, hidden) and the state after it.
+
+        ``inputs`` (streams, gates * hidden) is what x and x_static bring in, bias added; ``keep`` (streams, 1) is cont.
+        """
+        raise NotImplementedError
+
+    def _first_state(self, x: torch.Tensor, given: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        if self.exposed:
+            return tuple(s.detach().squeeze(0) for s in given)
+        shape = (x.shape[1], self.hidden)
+        if self.state and self.state[0].shape == shape:
+            return tuple(s.to(x) for s in self.state)
+        return (x.new_zeros(shape),) * len(self.state_names)
+
+
+@register("RNN")
+class RNN(Recurrent):
+    """h_t = tanh(W_hh (cont_t h_{t-1}) + W_xh x_t + b_h [+ W_xh_static x_static]), o_t = tanh(W_ho h_t + b_o).
+
+    bottom[0]  x (T, N, ...): T time steps of N streams
+    bottom[1]  cont (T, N): 0 where a sequence begins, else 1
+    bottom[2]  optional: x_static (N, ...), the same for all time steps
+    bottom[i]  with expose_hidden, after those: h_0 (1, N, num_output)
+    top[0]     o (T, N, num_output)
+    top[1]     with expose_hidden: h_T (1, N, num_output)
+    blobs      W_xh, b_h, [W_xh_static], W_hh, W_ho, b_o: (num_output, inputs) and (num_output,)
+    Caffe: src/caffe/layers/rnn_layer.cpp
+    """
+
+    bottoms = (2, 4)
+    tops = (1, 2)
+    state_names = ("h",)
+
+    def setup(self) -> None:
+        """Add the blobs."""
+        super().setup()
+        p = self.param.recurrent_param
+        self.add_blob((self.hidden, self.hidden), p.weight_filler)
+        self.add_blob((self.hidden,), p.bias_filler)
+
+    def step(
+        self, inputs: torch.Tensor, keep: torch.Tensor, state: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        """Do one time step; see :meth:`Recurrent.step`."""
+        hidden = 2 + self.has_static
+        h = torch.tanh(inputs + F.linear(keep * state[0], self.blob(hidden)))
+        return torch.tanh(F.linear(h, self.blob(hidden + 1), self.blob(hidden + 2))), (h,)
+
+
+def _lstm_unit(cell: torch.Tensor, gate_input: torch.Tensor, keep: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the next cell and hidden state; the gates come as input, forget, output, then the candidate."""
+    i, f, o, g = gate_input.chunk(4, -1)
+    cell = keep * torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)
+    return cell, torch.sigmoid(o) * torch.tanh(cell)
+
+
+@register("LSTM")
+class LSTM(Recurrent):
+    """Long short-term memory; its gate order is input, forget, output, candidate (i, f, o, g).
+
+    [i f o g] = W_xc x_t + b_c + W_hc (cont_t h_{t-1}) [+ W_xc_static x_static],
+    c_t = cont_t sigmoid(f) c_{t-1} + sigmoid(i) tanh(g), h_t = sigmoid(o) tanh(c_t).
+
+    bottom[0]  x (T, N, ...): T time steps of N streams
+    bottom[1]  cont (T, N): 0 where a sequence begins, else 1
+    bottom[2]  optional: x_static (N, ...), the same for all time steps
+    bottom[i]  with expose_hidden, after those: h_0, c_0 (1, N, num_output)
+    top[0]     h (T, N, num_output)
+    top[1..2]  with expose_hidden: h_T, c_T (1, N, num_output)
+    blobs      W_xc, b_c, [W_xc_static], W_hc: (4 num_output, inputs) and (4 num_output,)
+    Caffe: src/caffe/layers/lstm_layer.cpp
+    """
+
+    state_names = ("h", "c")
+    gates = 4
+
+    def step(
+        self, inputs: torch.Tensor, keep: torch.Tensor, state: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        """Do one time step; see :meth:`Recurrent.step`."""
+        h, c = state
+        c, h = _lstm_unit(c, inputs + F.linear(keep * h, self.blob(2 + self.has_static)), keep)
+        return h, (h, c)
+
+
+@register("LSTMUnit")
+class LSTMUnit(Layer):
+    """One time step of an LSTM from its gates' inputs; the part without blobs.
+
+    bottom[0]  c_{t-1} (1, N, D)
+    bottom[1]  gate inputs (1, N, 4 D): input, forget, output, candidate
+    bottom[2]  cont (1, N): 0 where a sequence begins, else 1
+    top[0]     c_t (1, N, D)
+    top[1]     h_t (1, N, D)
+    Caffe: src/caffe/layers/lstm_unit_layer.cpp
+    """
+
+    bottoms = (3, 3)
+    tops = (2, 2)
+    label_bottoms = frozenset({2})
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the tops' shapes."""
+        cell, gates, cont = bottom_shapes
+        if len(cell) != 3 or cell[0] != 1:
+            raise self.error(f"found a cell of shape {cell}, expected (1, streams, units)", "bottom", 0)
+        _, streams, units = cell
+        if tuple(gates) != (1, streams, 4 * units):
+            raise self.error(f"found gates of shape {gates}, expected {(1, streams, 4 * units)}", "bottom", 1)
+        if tuple(cont) != (1, streams):
+            raise self.error(f"found cont of shape {cont}, expected {(1, streams)}", "bottom", 2)
+        return [cell, cell]
+
+    def forward(self, cell: torch.Tensor, gates: torch.Tensor, cont: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the next cell and hidden state."""
+        return _lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2))

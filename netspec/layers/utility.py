@@ -1,0 +1,203 @@
+"""Utilities that compute: arithmetic between blobs and over axes; and the blob that stands by itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+
+from netspec.layers.base import Layer, Shape
+from netspec.layers.registry import register
+
+
+@register("Eltwise")
+class Eltwise(Layer):
+    """Element by element: SUM (coeff_i bottom_i), PROD, or MAX.
+
+    In a MAX of equals the second bottom beats the first, and a later one never beats an earlier: it alone gets the
+    gradient. PROD's gradient is always the stable one, product of the others; Caffe's for stable_prod_grad: false is
+    top / bottom, the same number or NaN at 0.
+
+    bottom[i]  equal shapes, two at least
+    top[0]     the same shape
+    Caffe: src/caffe/layers/eltwise_layer.cpp
+    """
+
+    PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
+    bottoms = (2, None)
+
+    def setup(self) -> None:
+        """Read the operation and its coefficients."""
+        p = self.param.eltwise_param
+        self.operation: int = p.operation
+        self.coeff: list[float] = list(p.coeff) or [1.0] * len(self.bottom_shapes)
+        if len(self.coeff) != len(self.bottom_shapes):
+            message = f"found {len(self.coeff)} coeff, expected none or one a bottom blob ({len(self.bottom_shapes)})"
+            raise self.error(message, "eltwise_param", "coeff")
+        if p.coeff and self.operation == self.PROD:
+            raise self.error("found coeff in a product, expected it for SUM only", "eltwise_param", "coeff")
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the bottoms' shape."""
+        for i, shape in enumerate(bottom_shapes):
+            if shape != bottom_shapes[0]:
+                message = f"found bottoms of shapes {bottom_shapes[0]} and {shape}, expected equal ones"
+                raise self.error(message, "bottom", i)
+        return bottom_shapes[:1]
+
+    def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
+        """Return the sum, product or maximum."""
+        if self.operation == self.SUM:
+            bottoms = tuple(x if c == 1 else x * c for x, c in zip(bottoms, self.coeff, strict=True))
+        top, *others = bottoms
+        if self.operation == self.MAX:
+            top = torch.where(top > others[0], top, others[0])
+            for x in others[1:]:
+                top = torch.where(x > top, x, top)
+            return top
+        for x in others:
+            top = top + x if self.operation == self.SUM else top * x
+        return top
+
+
+@register("Reduction")
+class Reduction(Layer):
+    """Reduce the axes from axis (default 0) to the last: coeff times SUM, ASUM (of |x|), SUMSQ (of x^2) or MEAN.
+
+    bottom[0]  any shape
+    top[0]     shape[:axis]
+    Caffe: src/caffe/layers/reduction_layer.cpp
+    """
+
+    SUM, ASUM, SUMSQ, MEAN = 1, 2, 3, 4  # caffe.proto: enum ReductionParameter.ReductionOp
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the top's shape."""
+        p, shape = self.param.reduction_param, bottom_shapes[0]
+        self.axis = self.canonical_axis(p.axis, shape, "reduction_param", "axis")
+        count = math.prod(shape[self.axis :])
+        self.coeff: float = p.coeff / count if p.operation == self.MEAN else p.coeff
+        return [shape[: self.axis]]
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the reduced bottom."""
+        operation = self.param.reduction_param.operation
+        if operation == self.ASUM:
+            x = x.abs()
+        elif operation == self.SUMSQ:
+            x = x.square()
+        return x.flatten(self.axis).sum(self.axis) * self.coeff
+
+
+@register("ArgMax")
+class ArgMax(Layer):
+    """Find the top_k largest along an axis, or among all numbers of an item where no axis is given. No gradient.
+
+    Of equal values the larger index comes first.
+
+    bottom[0]  any shape
+    top[0]     with axis: that axis top_k long, indices, or values where out_max_val;
+               without: (N, 1, top_k) of indices, or (N, 2, top_k) of indices and values, then a 1 for each further axis
+    Caffe: src/caffe/layers/argmax_layer.cpp
+    """
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the top's shape."""
+        p, shape = self.param.argmax_param, bottom_shapes[0]
+        self.axis = self.canonical_axis(p.axis, shape, "argmax_param", "axis") if p.HasField("axis") else None
+        size = math.prod(shape[1:]) if self.axis is None else shape[self.axis]
+        if not 1 <= p.top_k <= size:
+            raise self.error(f"found top_k {p.top_k}, expected 1 to {size}", "argmax_param", "top_k")
+        if self.axis is not None:
+            return [(*shape[: self.axis], p.top_k, *shape[self.axis + 1 :])]
+        return [(shape[0], 1 + p.out_max_val, p.top_k, *(1 for _ in shape[3:]))]
+
+    @torch.no_grad()
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return indices, values, or both."""
+        p = self.param.argmax_param
+        axis = 1 if self.axis is None else self.axis
+        if self.axis is None:
+            x = x.reshape(x.shape[0], math.prod(x.shape[1:]))
+        # A stable sort keeps equal values in order; in the reversed axis the larger index is the earlier.
+        values, order = torch.sort(x.flip(axis), dim=axis, descending=True, stable=True)
+        values, order = values.narrow(axis, 0, p.top_k), order.narrow(axis, 0, p.top_k)
+        indices = (x.shape[axis] - 1 - order).to(x.dtype)
+        if self.axis is not None:
+            return values if p.out_max_val else indices
+        top = torch.stack([indices, values], 1) if p.out_max_val else indices
+        return top.reshape(self.top_shapes[0])
+
+
+@register("Softmax")
+class Softmax(Layer):
+    """exp(x) / the sum of exp(x) along an axis (default 1).
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Caffe: src/caffe/layers/softmax_layer.cpp
+    """
+
+    gradient_reads = frozenset({"top"})
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the bottom's shape."""
+        self.axis = self.canonical_axis(self.param.softmax_param.axis, bottom_shapes[0], "softmax_param", "axis")
+        return bottom_shapes
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the probabilities."""
+        return F.softmax(x, self.axis)
+
+    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.gradient_in_place`."""
+        return (diff - (diff * top).sum(self.axis, keepdim=True)) * top
+
+
+@register("Silence")
+class Silence(Layer):
+    """Use blobs that would otherwise be the net's outputs.
+
+    bottom[i]  any shape
+    top        none
+    Caffe: src/caffe/layers/silence_layer.cpp
+    """
+
+    bottoms = (1, None)
+    tops = (0, 0)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return no shape."""
+        return []
+
+    def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return nothing."""
+        return ()
+
+
+@register("Parameter")
+class Parameter(Layer):
+    """Show a learnable blob as a top.
+
+    bottom     none
+    top[0]     parameter_param.shape
+    blobs[0]   the same shape, 0 at first
+    Caffe: include/caffe/layers/parameter_layer.hpp
+    """
+
+    bottoms = (0, 0)
+
+    def setup(self) -> None:
+        """Add the blob."""
+        self.add_blob(tuple(self.param.parameter_param.shape.dim))
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the blob's shape."""
+        return self.blob_shapes
+
+    def forward(self) -> torch.Tensor:
+        """Return the blob."""
+        blob = self.blob(0)
+        return blob.view_as(blob)
