@@ -70,8 +70,12 @@ def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) 
                 _open_readers[identity.st_dev, identity.st_ino] = reader
     except (ValueError, OSError) as fault:
         raise SpecError(f'database "{source}" {fault}', where or Where(source)) from None
-    log.info("db_lmdb.cpp:35" if found == "lmdb" else "db_leveldb.cpp:18", f"Opened {found} {source}")
+    _log_opened(found, source)
     return reader
+
+
+def _log_opened(backend: str, path: str) -> None:
+    log.info("db_lmdb.cpp:35" if backend == "lmdb" else "db_leveldb.cpp:18", f"Opened {backend} {path}")
 
 
 def _kind(source: str) -> str:
@@ -184,6 +188,7 @@ class Writer:
         except (OSError, ValueError, lmdb.Error) as fault:
             shutil.rmtree(self._partial, ignore_errors=True)
             raise SpecError(f"cannot write a database here ({fault})", Where(self.path)) from None
+        _log_opened(self._backend, self.path)
         return self
 
     def put(self, key: bytes, value: bytes) -> None:

@@ -77,6 +77,7 @@ class _Item:
     name: str
     image: np.ndarray
     label: int
+    where: Where | None
 
 
 class _ImageSource:
@@ -86,10 +87,9 @@ class _ImageSource:
     one's shape; raises SpecError, which names the record, where one does not.
     """
 
-    def __init__(self, cursor: Cursor, transformer: Transformer, where: Where | None) -> None:
+    def __init__(self, cursor: Cursor, transformer: Transformer) -> None:
         self.cursor = cursor
         self._transform = transformer
-        self._where = where
         first = self._item(cursor.records(0)[0])
         self._first_name = first.name
         self._shape = transformer.output_shape(first.image.shape)
@@ -116,15 +116,15 @@ class _ImageSource:
         if shape != self._shape:
             first = f'the first one, "{self._first_name}", {times(self._shape)}'
             advice = "all records must be of one size (or batch_size 1)"
-            raise SpecError(f'record "{item.name}" gives {times(shape)}, but {first}; {advice}', self._where)
+            raise SpecError(f'record "{item.name}" gives {times(shape)}, but {first}; {advice}', item.where)
 
 
 class DatabaseSource(_ImageSource):
     """The Datums of a database; Caffe's Data layer. Records are named by their keys."""
 
     def __init__(self, reader: Reader, cursor: Cursor, transformer: Transformer, where: Where | None = None) -> None:
-        self._reader = reader
-        super().__init__(cursor, transformer, where)
+        self._reader, self._where = reader, where
+        super().__init__(cursor, transformer)
 
     def keys(self, iteration: int) -> list[str]:
         """Return the keys of the records of an iteration."""
@@ -136,10 +136,8 @@ class DatabaseSource(_ImageSource):
     def _item(self, record: int) -> _Item:
         try:
             datum = parse_datum(self._reader.record(record))
-            return _Item(self._name(record), self._transform.decode(datum), datum.label)
+            return _Item(self._name(record), self._transform.decode(datum), datum.label, self._where)
         except ValueError as fault:
-            if isinstance(fault, SpecError):
-                raise
             raise SpecError(f'record "{self._name(record)}" {fault}', self._where) from None
 
 
@@ -159,7 +157,7 @@ class ImageListSource(_ImageSource):
         transformer: Transformer,
     ) -> None:
         self._images, self._root, self._color, self._size = images, root, color, size
-        super().__init__(cursor, transformer, None)
+        super().__init__(cursor, transformer)
 
     def keys(self, iteration: int) -> list[str]:
         """Return the names of the images of an iteration."""
@@ -168,6 +166,7 @@ class ImageListSource(_ImageSource):
     def _item(self, record: int) -> _Item:
         listed = self._images[record]
         try:
-            return _Item(listed.name, read_image(self._root + listed.name, self._color, self._size), listed.label)
+            image = read_image(self._root + listed.name, self._color, self._size)
         except ValueError as fault:
             raise SpecError(str(fault), listed.where) from None
+        return _Item(listed.name, image, listed.label, listed.where)

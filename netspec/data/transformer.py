@@ -6,17 +6,15 @@ Caffe: src/caffe/data_transformer.cpp
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
 
-from netspec import blobs, log
+from netspec import log
 from netspec.data.datum import datum_to_array, times
 from netspec.data.draws import words
+from netspec.data.mean import read_mean
 from netspec.errors import SpecError, Where
-from netspec.proto.schema import BlobProto
 
 Shape = tuple[int, ...]
 TRAIN = 0  # caffe.proto: enum Phase
@@ -102,17 +100,3 @@ class Transformer:
 
     def _error(self, message: str, field: str) -> SpecError:
         return SpecError(message, self._at("transform_param", field))
-
-
-def read_mean(path: str, where: Where | None = None) -> np.ndarray:
-    """Return the mean image of a .binaryproto file: float32 (C, H, W)."""
-    log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
-    try:
-        mean = blobs.to_array(BlobProto.FromString(Path(path).read_bytes()))
-    except OSError as fault:
-        raise SpecError(f'mean file "{path}" cannot be read: {fault.strerror}', where) from None
-    except (DecodeError, ValueError) as fault:
-        raise SpecError(f'mean file "{path}" is no BlobProto of a mean image ({fault})', where) from None
-    if mean.ndim != 3 and not (mean.ndim == 4 and mean.shape[0] == 1):
-        raise SpecError(f'mean file "{path}" holds a blob of shape {mean.shape}, expected one image', where)
-    return mean.reshape(mean.shape[-3:]).astype(np.float32)

@@ -18,8 +18,8 @@ import numpy as np
 from netspec import log
 from netspec.data.datum import decode_image, planar
 from netspec.data.draws import words
+from netspec.data.mean import read_mean
 from netspec.data.sources import Arrays, Cursor, Shape
-from netspec.data.transformer import read_mean
 from netspec.errors import SpecError, Where
 
 CHANNELS = 3  # images are always read in colour

@@ -1,0 +1,83 @@
+"""Mean images: read, computed and written as Caffe's .binaryproto.
+
+Caffe: src/caffe/data_transformer.cpp, tools/compute_image_mean.cpp
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from netspec import blobs, log
+from netspec.data.database import Reader
+from netspec.data.datum import datum_to_array, parse_datum, times
+from netspec.errors import SpecError, Where
+from netspec.proto.schema import BlobProto
+from netspec.whole_file import whole_file
+
+
+def read_mean(path: str, where: Where | None = None) -> np.ndarray:
+    """Return the mean image of a .binaryproto file: float32 (C, H, W).
+
+    ``where`` is the place that names the file. Raises SpecError where it cannot be read or holds no image.
+    """
+    log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
+    try:
+        mean = blobs.to_array(BlobProto.FromString(Path(path).read_bytes()))
+    except OSError as fault:
+        raise SpecError(f'mean file "{path}" cannot be read: {fault.strerror}', where) from None
+    except (DecodeError, ValueError) as fault:
+        raise SpecError(f'mean file "{path}" is no BlobProto of a mean image ({fault})', where) from None
+    if mean.ndim != 3 and not (mean.ndim == 4 and mean.shape[0] == 1):
+        raise SpecError(f'mean file "{path}" holds a blob of shape {mean.shape}, expected one image', where)
+    return mean.reshape(mean.shape[-3:]).astype(np.float32)
+
+
+def compute_mean(reader: Reader, where: Where) -> np.ndarray:
+    """Return the mean of all records of a database, encoded or not: float32 (C, H, W).
+
+    Sums are exact, where Caffe's floats begin to round at some 65,000 images. Raises SpecError for a record that is no
+    image, or of another size than the first.
+    """
+    first, total = "", np.zeros(0)
+    for i in range(len(reader)):
+        name = reader.key(i).decode(errors="backslashreplace")
+        try:
+            datum = parse_datum(reader.record(i))
+            image = datum_to_array(datum)
+        except ValueError as fault:
+            raise SpecError(f'record "{name}" {fault}', where) from None
+        if i == 0:
+            if datum.encoded:
+                log.info("compute_image_mean.cpp:57", "Decoding Datum")
+            log.info("compute_image_mean.cpp:70", "Starting iteration")
+            first, total = name, np.zeros(image.shape)
+        if image.shape != total.shape:
+            message = f'record "{name}" is {times(image.shape)}, but the first one, "{first}", {times(total.shape)}'
+            raise SpecError(f"{message}; a mean needs images of one size", where)
+        total += image
+        if (i + 1) % 10000 == 0:
+            log.info("compute_image_mean.cpp:95", f"Processed {i + 1} files.")
+    if len(reader) % 10000:
+        log.info("compute_image_mean.cpp:101", f"Processed {len(reader)} files.")
+    return (total / len(reader)).astype(np.float32)
+
+
+def write_mean(path: str, mean: np.ndarray) -> None:
+    """Write a mean image (C, H, W) with the old fields num, channels, height, width, as compute_image_mean does."""
+    log.info("compute_image_mean.cpp:108", f"Write to {path}")
+    channels, height, width = mean.shape
+    proto = BlobProto(num=1, channels=channels, height=height, width=width, data=mean.ravel().tolist())
+    with whole_file(path) as unfinished:
+        unfinished.write_bytes(proto.SerializeToString())
+
+
+def channel_means(mean: np.ndarray) -> list[float]:
+    """Return the mean of each channel, summed one by one in float32 as compute_image_mean does."""
+    log.info("compute_image_mean.cpp:114", f"Number of channels: {len(mean)}")
+    means = [float(np.cumsum(channel, dtype=np.float32)[-1] / np.float32(channel.size)) for channel in mean]
+    for c, value in enumerate(means):
+        log.info("compute_image_mean.cpp:119", f"mean_value channel [{c}]: {log.number(value)}")
+    return means
