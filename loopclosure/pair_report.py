@@ -29,7 +29,18 @@ PAPER = (
     ("Siamese + ResNet (256)", 0.850),
     ("Siamese + ResNet (512)", 0.877),
 )
-COLUMNS = ("net", "precision", "recall", "accuracy", "F1", "ROC AUC", "threshold", "ms/image", "parameters", "iteration")
+COLUMNS = (
+    "net",
+    "precision",
+    "recall",
+    "accuracy",
+    "F1",
+    "ROC AUC",
+    "threshold",
+    "ms/image",
+    "parameters",
+    "iteration",
+)
 
 
 @dataclass(frozen=True)
@@ -122,7 +133,7 @@ def text_table(runs: Sequence[Run]) -> str:
 
 
 def write_report(runs: Sequence[Run], folder: Path) -> list[Path]:
-    """Write ``table.csv``, ``losses.png`` (the paper's Figure 3) and ``distances.png`` to a folder; return the paths."""
+    """Write ``table.csv``, ``losses.png`` (the paper's Figure 3) and ``distances.png``; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in ("table.csv", "losses.png", "distances.png")]
     with paths[0].open("w", newline="") as file:
@@ -142,7 +153,11 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
             chosen = [loss for k, loss in run.losses if k == run.iteration]
             if chosen:
                 axes.plot(run.iteration, chosen[0], "o", markersize=9, markerfacecolor="none", color=line.get_color())
-    axes.set(xlabel="iteration", ylabel="contrastive loss of the validation pairs", title="Validation loss (circle: the snapshot judged)")
+    axes.set(
+        xlabel="iteration",
+        ylabel="contrastive loss of the validation pairs",
+        title="Validation loss (circle: judged)",
+    )
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, dpi=120)

@@ -42,9 +42,7 @@ def _reach(fault: SpecError) -> tuple[int, int]:
     return (fault.where.line, fault.where.column) if fault.where else (0, 0)
 
 
-def check_net(
-    net: Any, source: Any, label: str, shapes: Mapping[str, Shape], allow_python: bool = False
-) -> Checked:
+def check_net(net: Any, source: Any, label: str, shapes: Mapping[str, Shape], allow_python: bool = False) -> Checked:
     """Build a net (its ``state`` set) on no device and collect its faults."""
     faults: list[SpecError] = []
     options = BuildOptions(

@@ -33,7 +33,7 @@ def train(argv: Sequence[str] | None = None) -> int:
 
 
 def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
-    """Parse the words of a command line, run the command's ``run``, and turn a fault of the user's files into one line."""
+    """Parse a command line, run the command's ``run``, and turn a fault of the user's files into one line."""
     arguments = parser.parse_args([_gflag(word) for word in words])
     try:
         with _logging():
@@ -87,7 +87,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, function: Callable[[argparse.Namespace], int | None], summary: str) -> argparse.ArgumentParser:
+    def command(
+        name: str, function: Callable[[argparse.Namespace], int | None], summary: str
+    ) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
         added.set_defaults(run=function)
         return added
@@ -122,7 +124,12 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
     _add_state(p, phase="TEST")
     p.add_argument(
-        "--shape", action="append", default=[], type=_shape, metavar="BLOB=N,C,H,W", help="the shape of a data layer's top"
+        "--shape",
+        action="append",
+        default=[],
+        type=_shape,
+        metavar="BLOB=N,C,H,W",
+        help="the shape of a data layer's top",
     )
     p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")
     _add_python(p)
@@ -136,7 +143,9 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--iterations", type=_positive, help="batches to run (default: every record once)")
     p.add_argument("--images", metavar="FOLDER|LIST", help="image files instead of records")
     p.add_argument("--input", default="data", help="the blob that images go into (default: data)")
-    p.add_argument("--shape", type=_shape, metavar="BLOB=N,C,H,W", help="that blob's shape, where the data is not at hand")
+    p.add_argument(
+        "--shape", type=_shape, metavar="BLOB=N,C,H,W", help="that blob's shape, where the data is not at hand"
+    )
     _add_device(p)
     _add_state(p, phase="TEST")
     _add_python(p)
@@ -157,7 +166,9 @@ def _add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
 
 
 def _add_python(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--allow-python-layers", action="store_true", help="let Python layers of the net run their code")
+    parser.add_argument(
+        "--allow-python-layers", action="store_true", help="let Python layers of the net run their code"
+    )
 
 
 def _positive(text: str) -> int:
@@ -197,7 +208,9 @@ def _device(gpu: str) -> Any:
         raise SpecError(f"--gpu {gpu}: expected the number of a GPU")
     count = torch.cuda.device_count()
     if int(gpu) >= count:
-        raise SpecError(f"--gpu {gpu}: this machine has {count or 'no'} GPU(s) that torch can use; leave --gpu out for the CPU")
+        raise SpecError(
+            f"--gpu {gpu}: this machine has {count or 'no'} GPU(s) that torch can use; leave --gpu out for the CPU"
+        )
     return torch.device("cuda", int(gpu))
 
 
@@ -341,7 +354,7 @@ def _extract(arguments: argparse.Namespace) -> None:
         arrays = extract_records(net, arguments.blob, arguments.iterations, _bar("extract", "batch"))
     net.close()
     with out.open("wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def _layers(arguments: argparse.Namespace) -> None:

@@ -31,7 +31,7 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff
 
 @dataclass(frozen=True)
 class ImageList:
-    """Image files in order: ``paths``, the ``names`` they are known by, ``stamps`` in seconds where the list has them."""
+    """Image files in order: ``paths``, the ``names`` they are known by, ``stamps`` [s] where the list has them."""
 
     paths: tuple[Path, ...]
     names: tuple[str, ...]
@@ -88,7 +88,9 @@ def extract_records(
             for name in blobs:
                 value = net.blobs[name]
                 if value.dim() == 0 or value.shape[0] != batch:
-                    message = f'blob "{name}" has shape {tuple(value.shape)}, expected one row a record ({batch} a batch)'
+                    message = (
+                        f'blob "{name}" has shape {tuple(value.shape)}, expected one row a record ({batch} a batch)'
+                    )
                     raise SpecError(message, Where(net.plan.source.file))
                 parts[name].append(value.reshape(batch, -1).cpu().numpy())
     arrays = {name: np.concatenate(part)[:rows] for name, part in parts.items()}
@@ -107,9 +109,7 @@ def read_image_list(path: Path) -> ImageList:
     if path.is_dir():
         if (path / "rgb.txt").is_file():
             return read_image_list(path / "rgb.txt")
-        found = sorted(
-            (p for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=lambda p: _natural(p.name)
-        )
+        found = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=lambda p: _natural(p.name))
         if not found:
             raise SpecError("no image files in this folder", Where(str(path)))
         return ImageList(tuple(found), tuple(p.name for p in found), None)
@@ -126,7 +126,9 @@ def read_image_list(path: Path) -> ImageList:
         stamp = _as_stamp(first) if rest else None
         name = rest.strip() if stamp is not None else text
         if not (path.parent / name).is_file():
-            raise SpecError(f"image {name!r} is missing in {path.parent}", Where(str(path), number, line.find(name) + 1))
+            raise SpecError(
+                f"image {name!r} is missing in {path.parent}", Where(str(path), number, line.find(name) + 1)
+            )
         names.append(name)
         stamps.append(stamp)
     if not names:
@@ -135,9 +137,7 @@ def read_image_list(path: Path) -> ImageList:
     return ImageList(tuple(path.parent / name for name in names), tuple(names), known)
 
 
-def image_net(
-    model: str, blob: str, input_blob: str, shape: Shape | None, device: torch.device
-) -> tuple[Net, Scaling]:
+def image_net(model: str, blob: str, input_blob: str, shape: Shape | None, device: torch.device) -> tuple[Net, Scaling]:
     """Return the part of a net that computes ``blob`` from ``input_blob``, and what its data layer does to pixels.
 
     ``shape`` (N, C, H, W) of the input is read off the net where it is None: from its Input layer, or from the first
@@ -179,7 +179,11 @@ def extract_images(
             net(**{name: (np.stack(stack) - scaling.mean) * scaling.scale})
             parts.append(net.blobs[blob].reshape(len(stack), -1).cpu().numpy())
     seconds = (time.perf_counter() - begin) / len(images.paths)
-    arrays = {"features": np.concatenate(parts), "names": np.array(images.names), "seconds_per_image": np.array(seconds)}
+    arrays = {
+        "features": np.concatenate(parts),
+        "names": np.array(images.names),
+        "seconds_per_image": np.array(seconds),
+    }
     if images.stamps is not None:
         arrays["stamps"] = images.stamps
     return arrays

@@ -1,7 +1,7 @@
 """Gradients where in-place layers follow one another, as Caffe's shared memory makes them.
 
 Caffe's backward reads the data of bottom and top where they lie. If a later layer has written over them in place, it
-reads that layer's result: behind an in-place ReLU that an in-place Sigmoid follows, every value is positive, and the ReLU
+reads that layer's result: where an in-place Sigmoid follows an in-place ReLU, every value is positive, and the ReLU
 passes every gradient. Nets were trained with these gradients, so they are computed here too. It matters only for
 layers whose backward reads what was overwritten; the others keep a copy or a mask.
 """

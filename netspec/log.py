@@ -28,6 +28,7 @@ class GlogFormatter(logging.Formatter):
     """Format records as the glog of Caffe's time did: exactly four blank-separated fields before the message."""
 
     def format(self, record: logging.LogRecord) -> str:
+        """Return the record as one line."""
         moment = time.localtime(record.created)
         micros = int(record.created % 1 * 1e6)
         stamp = f"{time.strftime('%m%d %H:%M:%S', moment)}.{micros:06d}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ class BuildOptions:
     ``report`` gets each fault (the default raises the first); ``allow_python`` lets Python layers run code.
     """
 
-    device: torch.device = torch.device("cpu")
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     seed: int | None = None
     open_data: bool = True
     given_shapes: Mapping[str, Shape] | None = None
@@ -209,18 +209,19 @@ class Net(torch.nn.Module):
                 continue  # for a fault of the owner, which was reported
             owner = layers[owner_index]
             here, there = layer.blob_shapes[j], owner.blob_shapes[owner_blob]
+            owner_name = self.plan.nodes[owner_index].name
             fits = _count(here) == _count(there) if spec.permissive else here == there
             if not fits:
+                rule = "equal counts" if spec.permissive else "equal shapes (share_mode: STRICT)"
                 raise layer.error(
-                    f'cannot share param "{spec.name}" owned by layer "{self.plan.nodes[owner_index].name}", param index '
-                    f"{owner_blob}: shape {_spaced(here)} here, {_spaced(there)} there; "
-                    + ("the counts must be equal" if spec.permissive else "the shapes must be equal (share_mode: STRICT)"),
+                    f'cannot share param "{spec.name}" owned by layer "{owner_name}", param index {owner_blob}: '
+                    f"found shape {_spaced(here)} here and {_spaced(there)} there, expected {rule}",
                     "param",
                     j,
                 )
             layer.blobs[j] = owner.blobs[owner_blob]
-            owner_name = self.plan.nodes[owner_index].name
-            log.info("net.cpp:467", f"Sharing parameters '{spec.name}' owned by layer '{owner_name}', param index {owner_blob}")
+            place = f"owned by layer '{owner_name}', param index {owner_blob}"
+            log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {place}")
 
     def _finish(self, layers: list[Layer]) -> None:
         """Log what needs backward computation, as Caffe decides it, and what is put out."""
@@ -260,7 +261,7 @@ class Net(torch.nn.Module):
         values: dict[int, torch.Tensor] = {}
         memories: dict[int, Memory] = {}
         loss: torch.Tensor | None = None
-        for i, (node, layer) in enumerate(zip(self.plan.nodes, self.layers, strict=True)):
+        for i, node in enumerate(self.plan.nodes):
             memory = memories.setdefault(self.plan.final[node.tops[0]], Memory()) if self._overwritten[i] else None
             tops = self.run_layer(i, values, inputs, memory)
             for v, top in zip(node.tops, tops, strict=False):

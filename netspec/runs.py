@@ -50,7 +50,9 @@ def time_net(net: Net, iterations: int) -> None:
     for k in range(1, iterations + 1):
         start = time.perf_counter()
         _pass(net, forward, backward)
-        info("caffe.cpp:394", f"Iteration: {k} forward-backward time: {number((time.perf_counter() - start) * 1e3)} ms.")
+        info(
+            "caffe.cpp:394", f"Iteration: {k} forward-backward time: {number((time.perf_counter() - start) * 1e3)} ms."
+        )
     total = (time.perf_counter() - began) * 1e3
     info("caffe.cpp:397", "Average time per layer: ")
     for node, ahead, back in zip(net.plan.nodes, forward, backward, strict=True):

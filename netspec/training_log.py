@@ -11,7 +11,7 @@ _TESTING = re.compile(r"\] Iteration (\d+), Testing net \(#(\d+)\)")
 _SCORE = re.compile(r"\]\s+Test net output #\d+: (\S+) = (\S+)")
 
 
-def test_scores(path: str | Path, output: str, net: int = 0) -> list[tuple[int, float]]:
+def read_test_scores(path: str | Path, output: str, net: int = 0) -> list[tuple[int, float]]:
     """Return (iteration, value) of one output of test net ``net``, in the order of the log.
 
     Where the log holds several runs (a resumed training), the last value of an iteration counts.

@@ -23,7 +23,7 @@ from loopclosure.pair_report import read_runs, text_table, write_report
 from netspec.errors import SpecError, Where
 from netspec.graph.filter import filter_net, with_state
 from netspec.proto.text import parse_net, read_solver
-from netspec.training_log import test_scores
+from netspec.training_log import read_test_scores
 
 SHOWN = re.compile(r"\] (Iteration \d+|    Test net output|Snapshotting to|Optimization Done)")
 PHASES = {"train": 0, "validation": 1}
@@ -55,7 +55,9 @@ def read_entry(path: str) -> Entry:
     sources = {}
     for kind, phase in PHASES.items():
         filtered, _ = filter_net(with_state(net, phase), source)
-        sources[kind] = {layer.name: layer.data_param.source for layer in filtered.layer if layer.HasField("data_param")}
+        sources[kind] = {
+            layer.name: layer.data_param.source for layer in filtered.layer if layer.HasField("data_param")
+        }
     return Entry(
         solver=path,
         net=solver.net,
@@ -99,13 +101,11 @@ def best_snapshot(entry: Entry, log: Path, out: Path) -> tuple[int, Path, list[t
     Snapshots whose training left no log here are scored by ``netspec test``.
     """
     saved = snapshots(entry)
-    losses = dict(test_scores(log, entry.loss)) if log.is_file() else {}
+    losses = dict(read_test_scores(log, entry.loss)) if log.is_file() else {}
     for iteration, path in sorted(saved.items()):
         if iteration not in losses:
             score = out / f"{entry.name}_{iteration}.test.log"
-            netspec(
-                "test", "--model", entry.net, "--weights", str(path), "--iterations", str(entry.tests), log=score
-            )
+            netspec("test", "--model", entry.net, "--weights", str(path), "--iterations", str(entry.tests), log=score)
             match = re.search(rf"\] {re.escape(entry.loss)} = (\S+)", score.read_text())
             losses[iteration] = float(match[1]) if match else float("inf")
     best = min(saved, key=lambda iteration: (losses[iteration], iteration))
@@ -117,7 +117,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("solvers", nargs="+", metavar="SOLVER", help="solver prototxt files of Siamese nets")
     parser.add_argument("--no-train", action="store_true", help="take the snapshots that there are")
-    parser.add_argument("--out", type=Path, default=Path("out/compare"), help="folder for all files (default: out/compare)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/compare"), help="folder for all files (default: out/compare)"
+    )
     parser.add_argument("--gpu", default="", help="the GPU to run on")
     arguments = parser.parse_args()
     gpu = ["--gpu", arguments.gpu] if arguments.gpu else []

@@ -59,10 +59,14 @@ def _meets(state: Any, rule: Any, name: str) -> bool:
         log.info("net.cpp:296", f"The NetState phase ({state.phase}) differed from the phase ({rule.phase}) {ending}")
         return False
     if rule.HasField("min_level") and state.level < rule.min_level:
-        log.info("net.cpp:305", f"The NetState level ({state.level}) is below the min_level ({rule.min_level}) {ending}")
+        log.info(
+            "net.cpp:305", f"The NetState level ({state.level}) is below the min_level ({rule.min_level}) {ending}"
+        )
         return False
     if rule.HasField("max_level") and state.level > rule.max_level:
-        log.info("net.cpp:314", f"The NetState level ({state.level}) is above the max_level ({rule.max_level}) {ending}")
+        log.info(
+            "net.cpp:314", f"The NetState level ({state.level}) is above the max_level ({rule.max_level}) {ending}"
+        )
         return False
     for stage in rule.stage:
         if stage not in state.stage:

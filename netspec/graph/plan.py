@@ -20,7 +20,7 @@ PERMISSIVE = 1  # caffe.proto: ParamSpec.DimCheckMode
 
 @dataclass(frozen=True)
 class Param:
-    """One ``param { }`` of a layer. ``owner`` is (layer, index) of the parameter it shares by name, or None: its own."""
+    """One ``param { }`` of a layer. ``owner``: (layer, index) of the parameter that it shares by name, if any."""
 
     name: str
     lr_mult: float
@@ -44,8 +44,9 @@ class Node:
 
 @dataclass(frozen=True)
 class Plan:
-    """A net in running order. ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values.
+    """A net in running order.
 
+    ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values;
     ``final[v]`` is the value that Caffe's memory holds in the end where it held ``v``: the last in-place layer's.
     """
 
@@ -72,7 +73,7 @@ def make_plan(net: Any, source: SourceMap, report: Report = raise_fault) -> Plan
 
         if layer.propagate_down and len(layer.propagate_down) != len(layer.bottom):
             fault(
-                f"found {len(layer.propagate_down)} propagate_down, expected none or one a bottom ({len(layer.bottom)})",
+                f"found {len(layer.propagate_down)} propagate_down, expected 0 or {len(layer.bottom)}",
                 "propagate_down",
             )
         bottoms = tuple(current.get(blob, -1) for blob in layer.bottom)
@@ -131,7 +132,7 @@ def _shared_multipliers(net: Any, source: SourceMap, report: Report) -> dict[str
                 value = getattr(spec, field)
                 if given.setdefault(field, value) != value:
                     where = source.at(i, "param", j, field, layer=layer.name, type=layer.type)
-                    message = f'shared param "{spec.name}" has {field} {value:g} here and {given[field]:g} before; make them equal'
+                    message = f'shared param "{spec.name}" has {field} {value:g} here and {given[field]:g} before'
                     report(SpecError(message, where))
     return {name: (given.get("lr_mult", 1.0), given.get("decay_mult", 1.0)) for name, given in found.items()}
 

@@ -1,4 +1,4 @@
-"""The part of a net that computes given blobs from given inputs: how features are taken from images with a training net."""
+"""The part of a net that computes some blobs from others: how a training net gives the features of images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ def prune(
     for name in (*wanted, *given):
         if name not in blobs:
             known = ", ".join(dict.fromkeys(blobs))
-            raise SpecError(f'no blob "{name}" in this net{did_you_mean(name, blobs) or ";"} it has: {known}', Where(source.file))
+            raise SpecError(
+                f'no blob "{name}" in this net{did_you_mean(name, blobs) or ";"} it has: {known}', Where(source.file)
+            )
     needed = set(wanted)
     kept: list[int] = []
     for i in reversed(range(len(net.layer))):

@@ -166,5 +166,6 @@ class Layer(torch.nn.Module):
                 raise self.error(f"found {found} {what} blob(s), expected {wanted}", what)
         if self.same_tops and self.num_tops != len(self.bottom_shapes):
             raise self.error(
-                f"found {self.num_tops} top blob(s) for {len(self.bottom_shapes)} bottom blob(s), expected as many", "top"
+                f"found {self.num_tops} top blob(s) for {len(self.bottom_shapes)} bottom blob(s), expected as many",
+                "top",
             )

@@ -16,7 +16,16 @@ def test_import_contracts_hold() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["netspec", "netspec.proto.text", "netspec.data", "netspec.graph.plan", "netspec.cli", "lmdb_build.cli", "loopclosure.cli"]
+    "module",
+    [
+        "netspec",
+        "netspec.proto.text",
+        "netspec.data",
+        "netspec.graph.plan",
+        "netspec.cli",
+        "lmdb_build.cli",
+        "loopclosure.cli",
+    ],
 )
 def test_importing_needs_no_torch(module: str) -> None:
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"

@@ -41,7 +41,12 @@ def test_layers_that_a_state_includes(phase: int, level: int, stages: tuple[str,
 
 
 def test_include_and_exclude_together_are_refused_with_their_place() -> None:
-    net, source = parse_net_text('layer { name: "a" type: "Silence"\n include { phase: TEST } exclude { level_: 1 } }'.replace("level_", "min_level"), "f")
+    net, source = parse_net_text(
+        'layer { name: "a" type: "Silence"\n include { phase: TEST } exclude { level_: 1 } }'.replace(
+            "level_", "min_level"
+        ),
+        "f",
+    )
     with pytest.raises(SpecError, match=r"^f:2:\d+: layer \"a\" \(Silence\): found both include and exclude"):
         filter_net(net, source)
 
@@ -98,7 +103,9 @@ def test_a_loss_weight_is_a_use_and_moves_to_the_first_copy() -> None:
 
 
 def test_unknown_bottom_names_its_place_and_the_likely_blob() -> None:
-    text = 'layer { name: "data" type: "Input" top: "pool1" }\nlayer { name: "c" type: "ReLU"\n  bottom: "pol1" top: "c" }'
+    text = (
+        'layer { name: "data" type: "Input" top: "pool1" }\nlayer { name: "c" type: "ReLU"\n  bottom: "pol1" top: "c" }'
+    )
     net, source = parse_net_text(text, "net.prototxt")
     with pytest.raises(SpecError) as caught:
         insert_splits(net, source)

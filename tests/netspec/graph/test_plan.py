@@ -27,7 +27,11 @@ def test_an_in_place_layer_writes_a_new_value_under_the_old_name() -> None:
 
 
 def test_outputs_are_in_alphabetical_order() -> None:
-    assert list(plan('layer { name: "d" type: "Input" top: "zeta" top: "alpha" top: "Beta" }').outputs) == ["Beta", "alpha", "zeta"]
+    assert list(plan('layer { name: "d" type: "Input" top: "zeta" top: "alpha" top: "Beta" }').outputs) == [
+        "Beta",
+        "alpha",
+        "zeta",
+    ]
 
 
 def test_the_first_of_a_name_owns_and_multipliers_may_be_given_once() -> None:
@@ -59,7 +63,7 @@ def test_the_first_of_a_name_owns_and_multipliers_may_be_given_once() -> None:
         (
             'layer { name: "a" type: "Input" top: "x" top: "y" }\n'
             'layer { name: "b" type: "Eltwise" bottom: "x" bottom: "y" top: "z" propagate_down: true }',
-            r"net:2:\d+: .* found 1 propagate_down, expected none or one a bottom \(2\)",
+            r"net:2:\d+: .* found 1 propagate_down, expected 0 or 2",
         ),
     ],
 )
@@ -71,7 +75,9 @@ def test_faults_name_their_place(text: str, message: str) -> None:
 def test_faults_can_all_be_collected() -> None:
     faults: list[SpecError] = []
     net, source = parse_net_text(
-        'layer { name: "a" type: "ReLU" bottom: "no" top: "x" }\nlayer { name: "b" type: "ReLU" bottom: "nor" top: "x" }', "net"
+        'layer { name: "a" type: "ReLU" bottom: "no" top: "x" }\n'
+        'layer { name: "b" type: "ReLU" bottom: "nor" top: "x" }',
+        "net",
     )
     make_plan(*insert_splits(net, source, faults.append), faults.append)
     assert len(faults) == 3
