@@ -267,7 +267,8 @@ class _Reader:
         if token.kind == END:
             found = "the end of the file"
         elif token.kind == STRING:
-            found = f"the string {token.text if len(token.text) < 60 else token.text[:56] + '...'}"
+            line = token.text.splitlines()[0]
+            found = f"the string {token.text if len(line) == len(token.text) < 60 else line[:56] + '...'}"
         else:
             found = f'"{token.text}"'
         return self._error(f"expected {what}{' ' + where if where else ''}, found {found}{advice}", token)
@@ -278,8 +279,10 @@ class _Reader:
         for open_message, _ in reversed(self._open):
             if open_message.DESCRIPTOR.full_name in _LAYERS:
                 layer: Any = open_message
-                kind = layer.type if isinstance(layer.type, str) else ""
-                return SpecError(message, replace(place, layer=layer.name, type=kind))
+                name, kind = layer.name, layer.type if isinstance(layer.type, str) else ""
+                if (name + kind).isprintable():  # a missing quote makes them run over several lines
+                    place = replace(place, layer=name, type=kind)
+                break
         return SpecError(message, place)
 
     def _unknown_field(self, message: Message, name: str) -> str:
