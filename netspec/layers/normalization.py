@@ -76,8 +76,7 @@ class BatchNorm(Layer):
         top, mean, variance = _normalize(data, eps)
         if _far_from_zero(mean, variance, eps):
             # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
-            top, rest, variance = _normalize(data - _along(mean, 1, data), eps)
-            mean = mean + rest
+            top, _, variance = _normalize(data - _along(mean, 1, data), eps)
         if data.numel() == self.channels:
             variance = torch.zeros_like(variance)  # a single value: torch's unbiased variance is 0 / 0, Caffe's 0
         with torch.no_grad():
@@ -143,7 +142,7 @@ class Scale(_Affine):
     bottom[1]  optional, the factors: bottom[0]'s shape from ``axis`` on, as many axes as it has
     top[0]     bottom[0]'s shape
     blobs[0]   factors, bottom[0]'s shape from ``axis`` for ``num_axes``    unless bottom[1] is given
-    blobs[-1]  bias, the shape of the factors                               with bias_term: true
+    blobs[1]   bias, the shape of the factors                               with bias_term: true; blobs[0] if bottom[1]
     Caffe: src/caffe/layers/scale_layer.cpp
     """
 

@@ -79,7 +79,7 @@ def max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.
     values, indices = _native_max_pool(maps, windows)
     # torch lets NaN win, so the maxima betray whether any window needs Caffe's rule; maps without one pay only for
     # this look at the smaller output.
-    if not bool((values > LOWEST).all()):
+    if values.numel() and not bool(values.detach().amin() > LOWEST):
         values, indices = _native_max_pool(torch.where(maps > LOWEST, maps, LOWEST), windows)
         indices = torch.where(values > LOWEST, indices, -1)
     return values, indices

@@ -244,6 +244,13 @@ def test_an_operand_that_does_not_match_is_refused(build, kind: str, settings: s
     assert words in str(error.value)
 
 
+@pytest.mark.parametrize("kind", ["Scale", "Bias"])
+def test_a_scalar_operand_suits_any_bottom_whatever_the_axis(build, kind: str) -> None:
+    data = torch.randn(5)
+    top = build(f'type: "{kind}"', (5,), ()).run(data, torch.tensor(3.0))[0]
+    torch.testing.assert_close(top, data * 3 if kind == "Scale" else data + 3)
+
+
 def test_scale_takes_another_batch_but_no_other_channels(build) -> None:
     layer = build('type: "Scale"', SHAPE)
     assert layer.run(torch.randn(7, 3, 2))[0].shape == (7, 3, 2)
