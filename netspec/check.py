@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from netspec.advice import missing_data, net_advice, solver_advice
 from netspec.errors import SpecError
 from netspec.graph.filter import with_state
 from netspec.layers.base import Shape
@@ -18,11 +19,12 @@ from netspec.proto.text import parse_net, parse_solver
 
 @dataclass
 class Checked:
-    """One net of the file: ``label`` says which; ``net`` is None where its faults left nothing to build."""
+    """One net of the file: ``label`` says which; ``advice`` is about what is legal but likely wrong."""
 
     label: str
-    net: Net | None
+    net: Net
     faults: list[SpecError] = field(default_factory=list)
+    advice: list[str] = field(default_factory=list)
 
 
 def is_solver(path: str | Path) -> bool:
@@ -49,7 +51,8 @@ def check_net(net: Any, source: Any, label: str, shapes: Mapping[str, Shape], al
         torch.device("meta"), 0, open_data=False, given_shapes=shapes, report=faults.append, allow_python=allow_python
     )
     built = build_net(net, source, options)
-    return Checked(label, built, faults)
+    advice = [*missing_data(net, built.param, source), *(() if faults else net_advice(built))]
+    return Checked(label, built, faults, advice)
 
 
 def check_file(
@@ -67,7 +70,10 @@ def check_file(
 
         solver, node = parse_solver(path)
         described = solver_nets(with_train_state(solver, level, stages), node)
-        return [check_net(part.net, part.source, part.label, given, allow_python) for part in described]
+        checked = [check_net(part.net, part.source, part.label, given, allow_python) for part in described]
+        if not any(part.faults for part in checked):
+            checked[0].advice.extend(solver_advice(solver, node, [part.net for part in checked]))
+        return checked
     net, source = parse_net(path)
     return [check_net(with_state(net, phase, level, stages), source, str(path), given, allow_python)]
 

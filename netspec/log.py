@@ -24,6 +24,11 @@ def warning(site: str, message: str) -> None:
     logger.warning(message, extra={"site": site})
 
 
+def error(site: str, message: str) -> None:
+    """Log at the level at which some of Caffe's tools tell their progress; see :func:`info`."""
+    logger.error(message, extra={"site": site})
+
+
 class GlogFormatter(logging.Formatter):
     """Format records as the glog of Caffe's time did: exactly four blank-separated fields before the message."""
 
