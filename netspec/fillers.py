@@ -54,7 +54,7 @@ def _gaussian(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Te
         outputs = _first_axis(filler, shape)
         if filler.sparse > outputs:
             raise ValueError(f'filler "gaussian" needs sparse <= shape[0] = {outputs}, found {filler.sparse}')
-        values *= torch.empty(shape).bernoulli_(filler.sparse / outputs, generator=generator)
+        values *= torch.empty_like(values).bernoulli_(filler.sparse / outputs, generator=generator)
     return values
 
 
@@ -111,8 +111,8 @@ def _fan(filler: Any, shape: Shape) -> float:
 
 
 def _draw_uniform(shape: Shape, low: float, high: float, generator: torch.Generator) -> torch.Tensor:
-    return torch.empty(shape).uniform_(low, high, generator=generator)
+    return torch.empty(shape, dtype=torch.float32).uniform_(low, high, generator=generator)
 
 
 def _draw_normal(shape: Shape, mean: float, std: float, generator: torch.Generator) -> torch.Tensor:
-    return torch.empty(shape).normal_(mean, std, generator=generator)
+    return torch.empty(shape, dtype=torch.float32).normal_(mean, std, generator=generator)
