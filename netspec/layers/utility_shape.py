@@ -111,7 +111,8 @@ class Concat(Layer):
         first = bottom_shapes[0]
         self.axis = axis = _axis(self, first, "concat_param", "concat_dim")
         for i, shape in enumerate(bottom_shapes):
-            if [*shape[:axis], None, *shape[axis + 1 :]] != [*first[:axis], None, *first[axis + 1 :]]:
+            others = zip(first[:axis] + first[axis + 1 :], shape[:axis] + shape[axis + 1 :], strict=False)
+            if len(shape) != len(first) or any(a != b for a, b in others):
                 message = f"found bottoms of shapes {first} and {shape}, expected equal ones but for axis {axis}"
                 raise self.error(message, "bottom", i)
         return [(*first[:axis], sum(shape[axis] for shape in bottom_shapes), *first[axis + 1 :])]

@@ -1,0 +1,237 @@
+"""RNN, LSTM and LSTMUnit: against plain loops in numpy, and how Caffe carries the hidden state."""
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+
+T, N, INPUTS, STATIC, D = 4, 2, 3, 5, 6
+PARAM = (
+    f"recurrent_param {{ num_output: {D} expose_hidden: %s "
+    'weight_filler { type: "gaussian" std: 0.5 } bias_filler { type: "gaussian" std: 0.5 } }'
+)
+
+
+def text(kind: str, expose: bool = False) -> str:
+    return f'type: "{kind}" ' + PARAM % str(expose).lower()
+
+
+def states(kind: str) -> int:
+    return {"RNN": 1, "LSTM": 2}[kind]
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+def unroll(kind: str, blobs: list, x: np.ndarray, cont: np.ndarray, state: list, static: np.ndarray | None) -> tuple:
+    """Return the outputs of all time steps and the last state; the blobs in Caffe's order."""
+    w_x, b, *blobs = blobs
+    w_static = blobs.pop(0) if static is not None else None
+    w_h, *out = blobs
+    outputs = []
+    for step, keep in zip(x, cont, strict=True):
+        keep = keep[:, None]
+        z = step.reshape(len(keep), -1) @ w_x.T + b + (keep * state[0]) @ w_h.T
+        if static is not None:
+            z += static.reshape(len(keep), -1) @ w_static.T
+        if kind == "RNN":
+            state = [np.tanh(z)]
+            outputs.append(np.tanh(state[0] @ out[0].T + out[1]))
+        else:
+            i, f, o, g = (z[:, k * D : (k + 1) * D] for k in range(4))
+            c = keep * sigmoid(f) * state[1] + sigmoid(i) * np.tanh(g)
+            state = [sigmoid(o) * np.tanh(c), c]
+            outputs.append(state[0])
+    return np.stack(outputs), state
+
+
+def blobs_of(layer) -> list:
+    return [blob.detach().double().numpy() for blob in layer.blobs]
+
+
+def zeros(kind: str) -> list:
+    return [np.zeros((N, D))] * states(kind)
+
+
+def some(*shape: int) -> np.ndarray:
+    return torch.randn(shape).double().numpy()
+
+
+@pytest.mark.parametrize("kind", ["RNN", "LSTM"])
+@pytest.mark.parametrize("with_static", [False, True])
+def test_recurrence_is_its_formula(build, kind: str, with_static: bool) -> None:
+    shapes = [(T, N, INPUTS, 2), (T, N), *([(N, STATIC)] if with_static else [])]
+    layer = build(text(kind), *shapes)
+    x, cont = some(*shapes[0]), np.array([[0, 0], [1, 1], [1, 0], [1, 1]])
+    static = some(N, STATIC) if with_static else None
+    bottoms = [x, cont, *([static] if with_static else [])]
+    found = layer.run(*(torch.tensor(b).float() for b in bottoms))
+    expected, _ = unroll(kind, blobs_of(layer), x, cont, zeros(kind), static)
+    assert layer.top_shapes == [(T, N, D)]
+    np.testing.assert_allclose(found[0].detach().numpy(), expected, atol=1e-5)
+
+
+def test_blobs_come_in_caffes_order(build) -> None:
+    shapes = [(T, N, INPUTS), (T, N), (N, STATIC)]
+    assert build(text("LSTM"), *shapes[:2]).blob_shapes == [(4 * D, INPUTS), (4 * D,), (4 * D, D)]
+    assert build(text("LSTM"), *shapes).blob_shapes == [(4 * D, INPUTS), (4 * D,), (4 * D, STATIC), (4 * D, D)]
+    assert build(text("RNN"), *shapes[:2]).blob_shapes == [(D, INPUTS), (D,), (D, D), (D, D), (D,)]
+    assert build(text("RNN"), *shapes).blob_shapes == [(D, INPUTS), (D,), (D, STATIC), (D, D), (D, D), (D,)]
+
+
+@pytest.mark.parametrize("kind", ["RNN", "LSTM"])
+def test_hidden_state_lives_on_from_batch_to_batch(build, kind: str) -> None:
+    layer = build(text(kind), (T, N, INPUTS), (T, N))
+    x, cont = some(2 * T, N, INPUTS), np.ones((2 * T, N))
+    cont[T, 1] = 0  # the second stream begins anew with the second batch
+    expected, _ = unroll(kind, blobs_of(layer), x, cont, zeros(kind), None)
+    for part in (slice(0, T), slice(T, 2 * T)):
+        found = layer.run(torch.tensor(x[part]).float(), torch.tensor(cont[part]).float())[0]
+        np.testing.assert_allclose(found.detach().numpy(), expected[part], atol=1e-5)
+    found.sum().backward()  # reaches back to this batch's beginning only
+
+
+@pytest.mark.parametrize("kind", ["RNN", "LSTM"])
+def test_hidden_state_starts_at_zero_again_when_the_streams_change(build, kind: str) -> None:
+    layer = build(text(kind), (T, N, INPUTS), (T, N))
+    layer.run(torch.randn(T, N, INPUTS), torch.ones(T, N))
+    x = some(T + 1, N + 1, INPUTS)  # more time steps, too
+    found = layer.run(torch.tensor(x).float(), torch.ones(T + 1, N + 1))[0]
+    start = [np.zeros((N + 1, D))] * states(kind)
+    expected, _ = unroll(kind, blobs_of(layer), x, np.ones((T + 1, N + 1)), start, None)
+    np.testing.assert_allclose(found.detach().numpy(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["RNN", "LSTM"])
+@pytest.mark.parametrize("with_static", [False, True])
+def test_exposed_state_goes_in_and_out_without_gradient(build, kind: str, with_static: bool) -> None:
+    state_shapes = [(1, N, D)] * states(kind)
+    static_shape = [(N, STATIC)] if with_static else []
+    layer = build(text(kind, True), (T, N, INPUTS), (T, N), *static_shape, *state_shapes, tops=1 + states(kind))
+    assert layer.top_shapes == [(T, N, D), *state_shapes]
+    x, cont, start = some(T, N, INPUTS), np.ones((T, N)), [some(N, D) for _ in state_shapes]
+    static = some(N, STATIC) if with_static else None
+    given = [torch.tensor(s[None]).float().requires_grad_() for s in start]
+    middle = [torch.tensor(static).float()] if with_static else []
+    for _ in range(2):  # nothing lives on inside
+        found = layer.run(torch.tensor(x).float(), torch.tensor(cont).float(), *middle, *given)
+    expected, last = unroll(kind, blobs_of(layer), x, cont, start, static)
+    np.testing.assert_allclose(found[0].detach().numpy(), expected, atol=1e-5)
+    for top, state in zip(found[1:], last, strict=True):
+        np.testing.assert_allclose(top.detach().numpy(), state[None], atol=1e-5)
+        assert not top.requires_grad
+    found[0].sum().backward()
+    assert [s.grad for s in given] == [None] * states(kind)
+
+
+@pytest.mark.parametrize("kind", ["RNN", "LSTM"])
+def test_gradients_go_back_through_time(build, gradcheck, kind: str) -> None:
+    layer = build(text(kind), (3, N, INPUTS), (3, N), (N, 2))
+    cont = torch.tensor([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0]]).double()
+
+    class WithCont(torch.nn.Module):
+        default_param_lr = 1.0
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner, self.blobs = layer, layer.blobs
+
+        def run(self, x: torch.Tensor, static: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return layer.run(x, cont, static)
+
+    gradcheck(WithCont(), torch.randn(3, N, INPUTS), torch.randn(N, 2))
+
+
+# LSTMUnit
+
+
+def test_lstm_unit_takes_gates_in_the_order_i_f_o_g_and_cont_zero_forgets_the_cell(build) -> None:
+    layer = build('type: "LSTMUnit"', (1, N, D), (1, N, 4 * D), (1, N), tops=2)
+    assert layer.top_shapes == [(1, N, D)] * 2
+    cell, gates, cont = some(1, N, D), some(1, N, 4 * D), np.array([[1.0, 0.0]])
+    c, h = layer.run(*(torch.tensor(b).float() for b in (cell, gates, cont)))
+    i, f, o, g = np.split(gates, 4, 2)
+    expected = cont[:, :, None] * sigmoid(f) * cell + sigmoid(i) * np.tanh(g)
+    np.testing.assert_allclose(c.numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(h.numpy(), sigmoid(o) * np.tanh(expected), atol=1e-6)
+
+
+def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
+    layer = build('type: "LSTMUnit"', (1, N, D), (1, N, 4 * D), (1, N), tops=2)
+    cont = torch.tensor([[1.0, 0.0]]).double().requires_grad_()
+    cell, gates = torch.randn(1, N, D).double().requires_grad_(), torch.randn(1, N, 4 * D).double().requires_grad_()
+    torch.autograd.gradcheck(lambda cell, gates: layer.run(cell, gates, cont), (cell, gates))
+    sum(top.sum() for top in layer.run(cell, gates, cont)).backward()
+    assert cont.grad is None
+
+
+# Faults
+
+
+@pytest.mark.parametrize(
+    ("layer", "shapes", "tops", "message"),
+    [
+        (
+            'type: "LSTM"',
+            [(T, N, 3), (T, N)],
+            1,
+            "recurrent_param.num_output: found num_output 0, expected a positive number",
+        ),
+        (
+            text("LSTM"),
+            [(T, N, 3), (N, T)],
+            1,
+            "bottom.1: found cont of shape (2, 4), expected (4, 2), x being (4, 2, 3)",
+        ),
+        (
+            text("LSTM"),
+            [(T,), (T, N)],
+            1,
+            "bottom.0: found a bottom of shape (4,), expected (time steps, streams, ...)",
+        ),
+        (
+            text("RNN"),
+            [(T, N, 3), (T, N), (T, 5)],
+            1,
+            "bottom.2: found x_static of shape (4, 5), expected (2, ...), x being (4, 2, 3)",
+        ),
+        (text("LSTM"), [(T, N, 3), (T, N)], 3, "top: found 3 top blob(s), expected the output"),
+        (
+            text("LSTM", True),
+            [(T, N, 3), (T, N), (1, N, D)],
+            3,
+            "bottom: found 3 bottom blob(s), expected x, cont, [x_static], h, c",
+        ),
+        (
+            text("LSTM", True),
+            [(T, N, 3), (T, N), (1, N, D), (1, N, D)],
+            1,
+            "top: found 1 top blob(s), expected the output, h, c",
+        ),
+        (
+            text("LSTM", True),
+            [(T, N, 3), (T, N), (1, N, D), (N, D)],
+            3,
+            "bottom.3: found c of shape (2, 6), expected (1, 2, 6)",
+        ),
+        (
+            'type: "LSTMUnit"',
+            [(1, N, D), (1, N, D), (1, N)],
+            2,
+            "bottom.1: found gates of shape (1, 2, 6), expected (1, 2, 24)",
+        ),
+        ('type: "LSTMUnit"', [(N, D), (1, N, D), (1, N)], 2, "bottom.0: found a cell of shape (2, 6), expected (1,"),
+        (
+            'type: "LSTMUnit"',
+            [(1, N, D), (1, N, 4 * D), (N,)],
+            2,
+            "bottom.2: found cont of shape (2,), expected (1, 2)",
+        ),
+    ],
+)
+def test_bad_recurrence_is_refused(build, layer: str, shapes: list, tops: int, message: str) -> None:
+    with pytest.raises(SpecError) as fault:
+        build(layer, *shapes, tops=tops)
+    assert str(fault.value).startswith(message)

@@ -1,0 +1,480 @@
+"""The utilities: shapes, parts, copies, rows, arithmetic between blobs and over axes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+
+
+def counting(*shape: int) -> torch.Tensor:
+    return torch.arange(float(math.prod(shape))).reshape(shape)
+
+
+# Flatten and Reshape
+
+
+@pytest.mark.parametrize(
+    ("text", "bottom", "top"),
+    [
+        ("", (2, 3, 4, 5), (2, 60)),
+        ("axis: 2", (2, 3, 4, 5), (2, 3, 20)),
+        ("axis: 1 end_axis: 2", (2, 3, 4, 5), (2, 12, 5)),
+        ("axis: -3 end_axis: -2", (2, 3, 4, 5), (2, 12, 5)),
+        ("axis: 0", (2, 3), (6,)),
+        ("axis: 1 end_axis: 1", (2, 3, 4), (2, 3, 4)),
+    ],
+)
+def test_flatten_joins_axes(build, text: str, bottom: tuple, top: tuple) -> None:
+    layer = build(f'type: "Flatten" flatten_param {{ {text} }}', bottom)
+    assert layer.top_shapes == [top]
+    assert torch.equal(layer.run(counting(*bottom))[0], counting(*top))
+
+
+@pytest.mark.parametrize(
+    ("text", "bottom", "top"),
+    [
+        ("shape { dim: 2 dim: 8 }", (2, 8, 1, 1), (2, 8)),
+        ("shape { dim: 0 dim: -1 }", (2, 3, 4), (2, 12)),  # 0 copies, -1 is inferred
+        ("shape { dim: 0 dim: 0 dim: -1 dim: 2 }", (2, 3, 4), (2, 3, 2, 2)),
+        ("shape { dim: -1 }", (2, 3, 4), (24,)),
+        ("shape { dim: 3 dim: 1 } axis: 1 num_axes: 1", (2, 3, 4), (2, 3, 1, 4)),
+        ("shape { dim: 1 } axis: -1 num_axes: 0", (2, 3), (2, 3, 1)),  # -1: after the last
+        ("shape { dim: 1 } axis: 0 num_axes: 0", (2, 3), (1, 2, 3)),
+        ("axis: 1 num_axes: 1", (2, 1, 3), (2, 3)),  # no shape: the axes go
+        ("shape { dim: -1 dim: 0 } axis: 1", (2, 6, 2), (2, 6, 2)),  # 0 copies the axis of its own place
+    ],
+)
+def test_reshape_replaces_axes(build, text: str, bottom: tuple, top: tuple) -> None:
+    layer = build(f'type: "Reshape" reshape_param {{ {text} }}', bottom)
+    assert layer.top_shapes == [top]
+    assert torch.equal(layer.run(counting(*bottom))[0], counting(*top))
+
+
+def test_reshape_follows_the_batch(build) -> None:
+    layer = build('type: "Reshape" reshape_param { shape { dim: 0 dim: -1 } }', (2, 3, 4))
+    assert layer.run(counting(5, 3, 4))[0].shape == (5, 12)
+
+
+# Concat and Slice
+
+
+@pytest.mark.parametrize(
+    ("text", "shapes", "axis"),
+    [
+        ("", [(2, 3, 4), (2, 1, 4)], 1),
+        ("axis: -1", [(2, 3, 4), (2, 3, 2), (2, 3, 1)], 2),
+        ("concat_dim: 0", [(2, 3), (1, 3)], 0),
+        ("axis: 0", [(2, 3)], 0),
+    ],
+)
+def test_concat_joins_along_an_axis(build, text: str, shapes: list, axis: int) -> None:
+    layer = build(f'type: "Concat" concat_param {{ {text} }}', *shapes)
+    bottoms = [torch.randn(shape) for shape in shapes]
+    top = layer.run(*bottoms)[0]
+    expected = np.concatenate([b.numpy() for b in bottoms], axis)
+    np.testing.assert_array_equal(top.numpy(), expected)
+    assert layer.top_shapes == [expected.shape]
+
+
+@pytest.mark.parametrize(
+    ("text", "tops", "sizes", "axis"),
+    [
+        ("", 3, [2, 2, 2], 1),
+        ("slice_point: 1 slice_point: 4", 3, [1, 3, 2], 1),
+        ("slice_dim: 2 slice_point: 3", 2, [3, 1], 2),
+        ("axis: -3", 2, [1, 1], 0),
+        ("", 1, [6], 1),
+    ],
+)
+def test_slice_cuts_an_axis(build, text: str, tops: int, sizes: list, axis: int) -> None:
+    layer = build(f'type: "Slice" slice_param {{ {text} }}', (2, 6, 4), tops=tops)
+    bottom = torch.randn(2, 6, 4)
+    parts = layer.run(bottom)
+    assert [part.shape[axis] for part in parts] == sizes
+    assert torch.equal(torch.cat(parts, axis), bottom)
+    assert layer.top_shapes == [part.shape for part in parts]
+
+
+# Split, Tile, Silence, Parameter
+
+
+def test_split_gives_each_top_a_gradient_of_its_own_and_adds_them_up(build) -> None:
+    layer = build('type: "Split"', (2, 2), tops=3)
+    bottom = torch.randn(2, 2, requires_grad=True)
+    tops = layer.run(bottom)
+    for top in tops:
+        top.retain_grad()
+    torch.autograd.backward(tops, [torch.full((2, 2), float(g)) for g in (1, 10, 100)])
+    assert [top.grad[0, 0].item() for top in tops] == [1, 10, 100]
+    assert bottom.grad.tolist() == [[111, 111], [111, 111]]
+
+
+@pytest.mark.parametrize(("text", "top"), [("tiles: 3", (2, 9, 2)), ("axis: -1 tiles: 2", (2, 3, 4))])
+def test_tile_repeats_the_whole_axis(build, text: str, top: tuple) -> None:
+    layer = build(f'type: "Tile" tile_param {{ {text} }}', (2, 3, 2))
+    assert layer.top_shapes == [top]
+    bottom = torch.randn(2, 3, 2)
+    axis = 1 if top[1] == 9 else 2
+    assert torch.equal(layer.run(bottom)[0], torch.cat([bottom] * (top[axis] // bottom.shape[axis]), axis))
+
+
+def test_silence_has_no_top(build) -> None:
+    layer = build('type: "Silence"', (2, 3), (4,), tops=0)
+    assert layer.top_shapes == []
+    assert layer.run(torch.ones(2, 3), torch.ones(4)) == ()
+
+
+def test_parameter_is_a_blob_of_zeros_that_learns(build) -> None:
+    layer = build('type: "Parameter" parameter_param { shape { dim: 2 dim: 3 } }')
+    assert (layer.top_shapes, layer.blob_shapes) == ([(2, 3)], [(2, 3)])
+    top = layer.run()[0]
+    assert top.tolist() == [[0] * 3] * 2
+    top.sum().backward()
+    assert layer.blobs[0].grad.tolist() == [[1] * 3] * 2
+
+
+# BatchReindex and Filter
+
+
+def test_batch_reindex_adds_up_the_gradients_of_an_item_chosen_twice(build) -> None:
+    layer = build('type: "BatchReindex"', (3, 2), (4,))
+    assert layer.top_shapes == [(4, 2)]
+    bottom = counting(3, 2).requires_grad_()
+    top = layer.run(bottom, torch.tensor([2.0, 0.0, 2.0, 2.0]))[0]
+    assert top.tolist() == [[4, 5], [0, 1], [4, 5], [4, 5]]
+    top.backward(counting(4, 2))
+    assert bottom.grad.tolist() == [[2, 3], [0, 0], [10, 13]]
+
+
+@pytest.mark.parametrize("index", [-1, 3])
+def test_batch_reindex_names_an_index_out_of_range(build, index: int) -> None:
+    layer = build('type: "BatchReindex"', (3, 2), (2,))
+    with pytest.raises(SpecError, match=rf"bottom.1: found index {index}, expected 0 to 2"):
+        layer.run(torch.ones(3, 2), torch.tensor([0.0, index]))
+
+
+def test_filter_declares_the_whole_batch_and_keeps_what_is_selected(build) -> None:
+    layer = build('type: "Filter"', (4, 2), (4,), (4, 1), tops=2)
+    assert layer.top_shapes == [(4, 2), (4,)]
+    data = counting(4, 2).requires_grad_()
+    kept, labels = layer.run(data, torch.tensor([5.0, 6.0, 7.0, 8.0]), torch.tensor([[0.0], [1.0], [0.0], [-0.5]]))
+    assert (kept.tolist(), labels.tolist()) == ([[2, 3], [6, 7]], [6, 8])
+    kept.sum().backward()
+    assert data.grad.tolist() == [[0, 0], [1, 1], [0, 0], [1, 1]]
+
+
+def test_filter_may_keep_nothing(build) -> None:
+    layer = build('type: "Filter"', (3, 2), (3,))
+    assert layer.run(torch.ones(3, 2), torch.zeros(3))[0].shape == (0, 2)
+
+
+# Eltwise
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", lambda a, b, c: a + b + c),
+        ("coeff: 1 coeff: -0.5 coeff: 2", lambda a, b, c: a - 0.5 * b + 2 * c),
+        ("operation: PROD", lambda a, b, c: a * b * c),
+        ("operation: MAX", lambda a, b, c: np.maximum(np.maximum(a, b), c)),
+    ],
+)
+def test_eltwise_combines_element_by_element(build, gradcheck, text: str, expected) -> None:
+    layer = build(f'type: "Eltwise" eltwise_param {{ {text} }}', (2, 3), (2, 3), (2, 3))
+    bottoms = [torch.randn(2, 3) for _ in range(3)]
+    found = layer.run(*bottoms)[0].numpy()
+    np.testing.assert_allclose(found, expected(*(b.numpy() for b in bottoms)), rtol=1e-6)
+    gradcheck(layer, *bottoms)
+
+
+def test_eltwise_max_gives_a_tie_to_the_second_bottom_never_to_a_later_one(build) -> None:
+    layer = build('type: "Eltwise" eltwise_param { operation: MAX }', (4,), (4,), (4,))
+    bottoms = [
+        torch.tensor(values, requires_grad=True)
+        for values in ([1.0, 1.0, 2.0, 1.0], [1.0, 1.0, 1.0, 2.0], [0.0, 1.0, 2.0, 2.0])
+    ]
+    top = layer.run(*bottoms)[0]
+    assert top.tolist() == [1, 1, 2, 2]
+    top.sum().backward()
+    assert [b.grad.tolist() for b in bottoms] == [[0, 0, 1, 0], [1, 1, 0, 1], [0, 0, 0, 0]]
+
+
+@pytest.mark.parametrize("stable", ["true", "false"])
+def test_eltwise_prod_has_the_true_gradient_at_zeros(build, stable: str) -> None:
+    # Caffe's for stable_prod_grad: false is top / bottom, 0 / 0 here.
+    layer = build(f'type: "Eltwise" eltwise_param {{ operation: PROD stable_prod_grad: {stable} }}', (3,), (3,), (3,))
+    bottoms = [
+        torch.tensor(values, requires_grad=True) for values in ([0.0, 0.0, 2.0], [3.0, 0.0, 3.0], [5.0, 5.0, 5.0])
+    ]
+    layer.run(*bottoms)[0].sum().backward()
+    assert [b.grad.tolist() for b in bottoms] == [[15, 0, 15], [0, 0, 10], [0, 0, 6]]
+
+
+# Reduction
+
+
+@pytest.mark.parametrize("axis", [0, 1, -1])
+@pytest.mark.parametrize(
+    ("operation", "expected"),
+    [
+        ("SUM", lambda x, axes: x.sum(axes)),
+        ("ASUM", lambda x, axes: np.abs(x).sum(axes)),
+        ("SUMSQ", lambda x, axes: (x**2).sum(axes)),
+        ("MEAN", lambda x, axes: x.mean(axes)),
+    ],
+)
+def test_reduction_takes_the_axes_to_the_end(build, gradcheck, operation: str, expected, axis: int) -> None:
+    layer = build(f'type: "Reduction" reduction_param {{ operation: {operation} axis: {axis} coeff: 2 }}', (2, 3, 4))
+    bottom = torch.randn(2, 3, 4)
+    top = layer.run(bottom)[0].numpy()
+    np.testing.assert_allclose(top, 2 * expected(bottom.numpy(), tuple(range(axis % 3, 3))), rtol=1e-5, atol=1e-5)
+    assert layer.top_shapes == [top.shape]
+    gradcheck(layer, bottom)
+
+
+def test_reduction_asum_has_no_gradient_at_zero(build) -> None:
+    bottom = torch.tensor([-2.0, 0.0, 3.0], requires_grad=True)
+    build('type: "Reduction" reduction_param { operation: ASUM }', (3,)).run(bottom)[0].backward()
+    assert bottom.grad.tolist() == [-1, 0, 1]
+
+
+# ArgMax
+
+
+def argmax(values: list[float], top_k: int) -> list[tuple[float, int]]:
+    """As Caffe: pairs of value and index, the greatest first."""
+    return sorted(((v, i) for i, v in enumerate(values)), reverse=True)[:top_k]
+
+
+def test_argmax_gives_ties_to_the_larger_index(build) -> None:
+    layer = build('type: "ArgMax" argmax_param { top_k: 3 }', (1, 5))
+    assert layer.run(torch.tensor([[2.0, 7.0, 7.0, 1.0, 7.0]]))[0].tolist() == [[[4, 2, 1]]]
+
+
+@pytest.mark.parametrize(
+    ("text", "bottom", "top"),
+    [
+        ("", (2, 5), (2, 1, 1)),
+        ("top_k: 2", (2, 3, 4), (2, 1, 2)),
+        ("top_k: 2 out_max_val: true", (2, 3, 4, 5), (2, 2, 2, 1)),
+        ("top_k: 3", (2, 3, 2, 2, 2), (2, 1, 3, 1, 1)),
+        ("out_max_val: true", (3,), (3, 2, 1)),
+    ],
+)
+def test_argmax_without_axis_flattens_each_item(build, text: str, bottom: tuple, top: tuple) -> None:
+    layer = build(f'type: "ArgMax" argmax_param {{ {text} }}', bottom)
+    x = torch.randint(0, 4, bottom).float().requires_grad_()
+    found = layer.run(x)[0]
+    assert layer.top_shapes == [top] == [tuple(found.shape)]
+    assert not found.requires_grad
+    for item, row in zip(x.reshape(bottom[0], -1).tolist(), found.reshape(top[:3]).tolist(), strict=True):
+        pairs = argmax(item, top[2])
+        assert row[0] == [i for _, i in pairs]
+        assert row[1:] == ([[v for v, _ in pairs]] if top[1] == 2 else [])
+
+
+@pytest.mark.parametrize("out_max_val", ["false", "true"])
+def test_argmax_along_an_axis_gives_indices_or_values(build, out_max_val: str) -> None:
+    layer = build(f'type: "ArgMax" argmax_param {{ axis: -2 top_k: 2 out_max_val: {out_max_val} }}', (2, 4, 3))
+    x = torch.randint(0, 3, (2, 4, 3)).float()
+    found = layer.run(x)[0]
+    assert layer.top_shapes == [(2, 2, 3)]
+    for n, c in np.ndindex(2, 3):
+        pairs = argmax(x[n, :, c].tolist(), 2)
+        assert found[n, :, c].tolist() == [v if out_max_val == "true" else i for v, i in pairs]
+
+
+# Softmax
+
+
+@pytest.mark.parametrize(("text", "axis"), [("", 1), ("axis: -1", 2), ("axis: 0", 0)])
+def test_softmax_along_an_axis(build, gradcheck, text: str, axis: int) -> None:
+    layer = build(f'type: "Softmax" softmax_param {{ {text} }}', (2, 3, 4))
+    bottom = torch.randn(2, 3, 4) * 50
+    e = np.exp(bottom.double().numpy() - bottom.double().numpy().max(axis, keepdims=True))
+    np.testing.assert_allclose(layer.run(bottom)[0].numpy(), e / e.sum(axis, keepdims=True), atol=1e-6)
+    gradcheck(layer, torch.randn(2, 3, 4))
+
+
+def test_softmax_gradient_is_made_of_what_memory_holds(build) -> None:
+    layer = build('type: "Softmax"', (1, 3))
+    top, diff = torch.tensor([[1.0, 2.0, -1.0]]), torch.tensor([[3.0, 0.5, 1.0]])
+    assert layer.gradient_in_place(torch.zeros(1, 3), top, diff).tolist() == [[0, -5, 2]]
+
+
+# Gradients and faults
+
+
+@pytest.mark.parametrize(
+    ("text", "tops"),
+    [
+        ('type: "Flatten"', 1),
+        ('type: "Reshape" reshape_param { shape { dim: 0 dim: -1 } }', 1),
+        ('type: "Slice" slice_param { slice_point: 1 }', 2),
+        ('type: "Tile" tile_param { tiles: 2 }', 1),
+    ],
+)
+def test_moving_numbers_moves_gradients(build, gradcheck, text: str, tops: int) -> None:
+    gradcheck(build(text, (2, 3, 2), tops=tops), torch.randn(2, 3, 2))
+
+
+def test_concat_moves_gradients(build, gradcheck) -> None:
+    gradcheck(build('type: "Concat"', (2, 3), (2, 1)), torch.randn(2, 3), torch.randn(2, 1))
+
+
+@pytest.mark.parametrize(
+    ("text", "shapes", "tops", "message"),
+    [
+        (
+            'type: "Flatten" flatten_param { axis: 2 end_axis: 1 }',
+            [(2, 3, 4)],
+            1,
+            "flatten_param: found axis 2 after end_axis 1 for a bottom of shape (2, 3, 4)",
+        ),
+        (
+            'type: "Reshape" reshape_param { shape { dim: -1 dim: -1 } }',
+            [(2, 3)],
+            1,
+            "reshape_param.shape: found shape [-1, -1], expected at most one -1 (inferred) and nothing below it",
+        ),
+        (
+            'type: "Reshape" reshape_param { shape { dim: 4 dim: -1 } }',
+            [(2, 3)],
+            1,
+            "reshape_param.shape: cannot make shape (4, -1) of a bottom of shape (2, 3): (4, 1) holds 4 numbers, the "
+            "bottom 6",
+        ),
+        (
+            'type: "Reshape" reshape_param { shape { dim: 2 dim: 3 dim: 0 } }',
+            [(2, 3)],
+            1,
+            "reshape_param.shape: found a 0 for axis 2, but a bottom of shape (2, 3) has no such axis to copy",
+        ),
+        (
+            'type: "Reshape" reshape_param { axis: 1 num_axes: 3 }',
+            [(2, 3)],
+            1,
+            "reshape_param.num_axes: num_axes 3 from axis 1 on is out of range for a bottom of shape (2, 3)",
+        ),
+        (
+            'type: "Reshape" reshape_param { axis: 3 }',
+            [(2, 3)],
+            1,
+            "reshape_param.axis: axis 3 is out of range for a bottom of shape (2, 3)",
+        ),
+        (
+            'type: "Concat"',
+            [(2, 3, 4), (2, 3, 5)],
+            1,
+            "bottom.1: found bottoms of shapes (2, 3, 4) and (2, 3, 5), expected equal ones but for axis 1",
+        ),
+        (
+            'type: "Concat"',
+            [(2, 3), (2,)],
+            1,
+            "bottom.1: found bottoms of shapes (2, 3) and (2,), expected equal ones but for axis 1",
+        ),
+        (
+            'type: "Concat" concat_param { axis: 1 concat_dim: 1 }',
+            [(2, 3)],
+            1,
+            "concat_param.concat_dim: found both axis and concat_dim, expected one of them",
+        ),
+        (
+            'type: "Slice" slice_param { slice_dim: 2 }',
+            [(2, 3)],
+            1,
+            "slice_param.slice_dim: axis 2 is out of range for a blob of 2 axes, shape (2, 3)",
+        ),
+        (
+            'type: "Slice"',
+            [(2, 5)],
+            2,
+            "slice_param: axis 1 of the bottom, shape (2, 5), cannot be cut evenly into 2 tops",
+        ),
+        (
+            'type: "Slice" slice_param { slice_point: 1 }',
+            [(2, 5)],
+            3,
+            "slice_param.slice_point: found 1 slice_point, expected 2: one fewer than tops",
+        ),
+        (
+            'type: "Slice" slice_param { slice_point: 3 slice_point: 3 }',
+            [(2, 5)],
+            3,
+            "slice_param.slice_point: found slice_point [3, 3], expected rising ones from 1 to 4 (axis 1 of (2, 5))",
+        ),
+        (
+            'type: "Slice" slice_param { slice_point: 5 }',
+            [(2, 5)],
+            2,
+            "slice_param.slice_point: found slice_point [5], expected rising ones from 1 to 4 (axis 1 of (2, 5))",
+        ),
+        ('type: "Tile"', [(2, 3)], 1, "tile_param.tiles: found tiles 0, expected a positive number"),
+        ('type: "BatchReindex"', [(2, 3), (2, 1)], 1, "bottom.1: found indices of shape (2, 1), expected one axis"),
+        (
+            'type: "Filter"',
+            [(2, 3), (2,)],
+            2,
+            "top: found 2 top blob(s), expected 1: one a bottom but for the selector",
+        ),
+        (
+            'type: "Filter"',
+            [(2, 3), (2, 3)],
+            1,
+            "bottom.1: found a selector of shape (2, 3), expected one number an item",
+        ),
+        (
+            'type: "Filter"',
+            [(3, 3), (2,)],
+            1,
+            "bottom.0: found a bottom of shape (3, 3) and a selector of shape (2,), expected as many items",
+        ),
+        (
+            'type: "Eltwise"',
+            [(2, 3), (3, 2)],
+            1,
+            "bottom.1: found bottoms of shapes (2, 3) and (3, 2), expected equal ones",
+        ),
+        (
+            'type: "Eltwise" eltwise_param { coeff: 1 }',
+            [(2,), (2,)],
+            1,
+            "eltwise_param.coeff: found 1 coeff, expected none or one a bottom blob (2)",
+        ),
+        (
+            'type: "Eltwise" eltwise_param { operation: PROD coeff: 1 coeff: 1 }',
+            [(2,), (2,)],
+            1,
+            "eltwise_param.coeff: found coeff in a product, expected it for SUM only",
+        ),
+        (
+            'type: "Reduction" reduction_param { axis: 2 }',
+            [(2, 3)],
+            1,
+            "reduction_param.axis: axis 2 is out of range for a blob of 2 axes, shape (2, 3)",
+        ),
+        (
+            'type: "ArgMax" argmax_param { top_k: 7 }',
+            [(2, 3, 2)],
+            1,
+            "argmax_param.top_k: found top_k 7, expected 1 to 6",
+        ),
+        (
+            'type: "ArgMax" argmax_param { axis: 1 top_k: 0 }',
+            [(2, 3)],
+            1,
+            "argmax_param.top_k: found top_k 0, expected 1 to 3",
+        ),
+        ('type: "Silence"', [(2,)], 1, "top: found 1 top blob(s), expected 0"),
+        ('type: "Eltwise"', [(2,)], 1, "bottom: found 1 bottom blob(s), expected at least 2"),
+    ],
+)
+def test_bad_utility_is_refused(build, text: str, shapes: list, tops: int, message: str) -> None:
+    with pytest.raises(SpecError) as fault:
+        build(text, *shapes, tops=tops)
+    assert str(fault.value) == message
