@@ -1,0 +1,111 @@
+"""The list file of pairs: ``first second label`` a line, its settings in comment lines before them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.errors import InputError
+
+ROOT_FOLDER = "root folder"  # the setting that says what a list's images are relative to, seen from the list's folder
+
+
+@dataclass(frozen=True)
+class ListedPair:
+    """One line of a list: two image names below the root folder, and 1 for the same place, 0 for other places."""
+
+    first: str
+    second: str
+    label: int
+    line: int
+
+
+def write_pair_list(path: Path, pairs: Iterable[tuple[str, str, int]], settings: Mapping[str, str]) -> None:
+    """Write a list; ``settings`` become the lines ``# name: value`` of its head.
+
+    Raises InputError for an image name that a list cannot hold, or where the file cannot be written.
+    """
+    lines = ["# first second label; 1: the same place, 0: other places"]
+    lines += [f"# {name}: {value}" for name, value in settings.items()]
+    for first, second, label in pairs:
+        for name in (first, second):
+            if name.split() != [name] or name.startswith("#"):
+                raise InputError(f'cannot list the image "{name}": a name has no blanks and no # at its beginning')
+        lines.append(f"{first} {second} {label}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+
+
+def read_pair_list(path: Path) -> list[ListedPair]:
+    """Read a list. Raises InputError (file:line:column) for a line that is not one."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise InputError(
+            f'cannot be read ({reason}); expected a list of pairs, "a.png b.png 1" a line', path
+        ) from error
+    pairs = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        fields = line.split()
+        if len(fields) != 3:
+            raise InputError(
+                f'expected two images and a label, "a.png b.png 1", found "{line.strip()}"', path, number, 1
+            )
+        if fields[2] not in ("0", "1"):
+            column = line.rindex(fields[2]) + 1
+            raise InputError(f'a label is 1 (same place) or 0 (other places), not "{fields[2]}"', path, number, column)
+        pairs.append(ListedPair(fields[0], fields[1], int(fields[2]), number))
+    if not pairs:
+        raise InputError("lists no pair", path)
+    return pairs
+
+
+def read_settings(path: Path) -> dict[str, str]:
+    """Return the ``# name: value`` lines of a list's head."""
+    settings = {}
+    for line in path.read_text(encoding="utf-8-sig").splitlines():
+        if not line.startswith("#"):
+            break
+        name, colon, value = line[1:].partition(": ")
+        if colon:
+            settings[name.strip()] = value.strip()
+    return settings
+
+
+def root_of(path: Path) -> Path:
+    """Return the folder that a list's images are relative to, as its head says; the list's own folder otherwise."""
+    return path.parent / read_settings(path).get(ROOT_FOLDER, ".")
+
+
+def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = None) -> tuple[int, Path]:
+    """Write the pairs of several lists, shuffled together, as one; return their number and the common root folder.
+
+    Images are named anew, relative to ``root`` or to the common parent of the lists' roots.
+    """
+    roots = [root_of(path).resolve() for path in lists]
+    common = Path(os.path.commonpath(roots)) if root is None else root.resolve()
+    pairs = []
+    for path, own_root in zip(lists, roots, strict=True):
+        prefix = Path(os.path.relpath(own_root, common)).as_posix()
+        if prefix.startswith(".."):
+            raise InputError(f"its images lie in {own_root}, not below the root folder {common}; name another", path)
+        above = "" if prefix == "." else prefix + "/"
+        pairs += [(above + pair.first, above + pair.second, pair.label) for pair in read_pair_list(path)]
+    order = np.random.default_rng(seed).permutation(len(pairs))
+    settings = {
+        "source": "the lists " + ", ".join(Path(os.path.relpath(path, out.parent)).as_posix() for path in lists),
+        ROOT_FOLDER: Path(os.path.relpath(common, out.parent.resolve())).as_posix(),
+        "seed": str(seed),
+    }
+    write_pair_list(out, (pairs[index] for index in order), settings)
+    return len(pairs), common
