@@ -56,19 +56,26 @@ _active: dict[str, Dialect] = {}
 
 
 def announce(dialect: Dialect) -> None:
-    """Make a dialect known, so that errors about its fields and layer types say that it has them."""
+    """Make a dialect known, so that errors about its fields and layer types say that it has them.
+
+    Raises SpecError where its declarations cannot be read, or extend a message that Caffe does not have.
+    """
+    for full_name, _ in dialect.fields():
+        try:
+            pool.FindMessageTypeByName(full_name)
+        except KeyError:
+            raise SpecError(f'Caffe has no message "{full_name}" to extend', Where(dialect.declarations.name)) from None
     _known[dialect.name] = dialect
 
 
 def activate(dialect: Dialect) -> None:
     """Announce a dialect and add its fields and messages to the schema. Does nothing if it is active.
 
-    Raises SpecError where its declarations cannot be read, or where the schema or another active dialect has a field or
-    a number of it already.
+    Raises SpecError as :func:`announce`, and where Caffe or another active dialect has a field or a number of it.
     """
-    announce(dialect)
     if dialect.name in _active:
         return
+    announce(dialect)
     file = dialect.declarations
     for full_name, field in dialect.fields():
         if field in fields_of(pool.FindMessageTypeByName(full_name)):

@@ -5,7 +5,7 @@ no generated module ties netspec to one version of protobuf. ``caffe.desc`` is `
 there.
 """
 
-# ruff: noqa: D101, D105, D107 (the messages are described in caffe.proto)
+# ruff: noqa: D101 (the messages are described in caffe.proto)
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _load() -> None:
 _load()
 
 
-def message(name: str) -> type[Message]:
+def message(name: str) -> type[CaffeMessage]:
     """Return the class of a message of the schema, e.g. ``message("PoolingParameter")``.
 
     Raises KeyError for a name that the schema does not have.
