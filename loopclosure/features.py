@@ -63,7 +63,7 @@ class Features:
 
 
 def read_features(path: str | Path) -> Features:
-    """Read a features.npz: ``features`` (N, D), or one array of any name (a blob's); names, stamps, seconds where there."""
+    """Read a features.npz; without an array ``features`` its only array of any name, a blob's, is taken."""
     path = Path(path)
     try:
         with np.load(path, allow_pickle=False) as archive:

@@ -36,12 +36,14 @@ class MethodResult:
 
     scores   (Q, R) floats, higher = more alike; NaN where the method says nothing (the upper triangle of an online one)
     seconds  stage -> seconds spent on it in all, in the order of the work
+    once     those of the stages that are done once, on training images, rather than for each frame
     notes    sentences for the report: settings, sizes of vocabularies, what was left out
     """
 
     scores: np.ndarray
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    once: tuple[str, ...] = ()
 
 
 class Method(Protocol):

@@ -1,0 +1,118 @@
+"""Any set of methods on one data set: scores, figures in both conventions, times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.datasets import DataSet
+from loopclosure.errors import InputError
+from loopclosure.methods import Method, Progress, Setting, make_method, silent
+from loopclosure.precision_recall import BestMatches, PrecisionRecall, all_pairs, best_match, best_matches, recall_at_k
+
+RECALL_AT = (1, 5, 10)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One method, judged.
+
+    scores     (Q, R), as the method gave them
+    pairs      the curve over all pairs;  best  that of the best match of each query
+    matches    the best match of each query
+    recall_at  k -> share of the queries with a loop that have one among their best k
+    seconds    stage -> seconds in all
+    once       the stages done once, on training images
+    """
+
+    name: str
+    scores: np.ndarray
+    pairs: PrecisionRecall
+    best: PrecisionRecall
+    matches: BestMatches
+    recall_at: dict[int, float]
+    seconds: dict[str, float]
+    once: tuple[str, ...]
+    notes: list[str]
+
+    @property
+    def seconds_on_frames(self) -> float:
+        """Return the seconds in all that grew with the frames, training left out."""
+        return sum(seconds for stage, seconds in self.seconds.items() if stage not in self.once)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All methods on one data set; ``train`` says on which images vocabularies and the like were made."""
+
+    data: DataSet
+    outcomes: list[Outcome]
+    train: str = "no training images"
+
+    @property
+    def images(self) -> int:
+        """Return the number of images a method has to describe."""
+        return len(self.data.query_images) + len(self.data.reference_images or [])
+
+
+def named_method(text: str, setting: Setting) -> tuple[str, Method]:
+    """Build a method from ``LABEL=METHOD`` or ``METHOD``, and the name it is shown by."""
+    label, equals, spec = text.partition("=")
+    if not equals or ":" in label:  # the = of a setting, which follows the colon of its method
+        method = make_method(text, setting)
+        return method.name, method
+    return label.strip(), make_method(spec, setting)
+
+
+def evaluate(
+    data: DataSet,
+    methods: Sequence[tuple[str, Method]],
+    train_images: Sequence[Path] = (),
+    train: str = "",
+    progress: Progress = silent,
+) -> Evaluation:
+    """Run the methods one after the other on ``data`` and judge each; ``train`` says what the training images are."""
+    names = [name for name, _ in methods]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f'two methods are called "{twice[0]}"; name them, as in --method "first=features:a.npz"')
+    outcomes = [judge(name, method, data, list(train_images), progress) for name, method in methods]
+    return Evaluation(data, outcomes, train or f"{len(train_images)} training images")
+
+
+def judge(name: str, method: Method, data: DataSet, train_images: list[Path], progress: Progress = silent) -> Outcome:
+    """Run one method and judge what it says."""
+    result = method.score(data.query_images, data.reference_images, train_images, progress)
+    silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
+    notes = list(result.notes)
+    if silent_pairs:
+        judged = int(np.count_nonzero(data.truth.judged))
+        notes.append(f"it says nothing of {silent_pairs} of {judged} judged pairs, which counts as no loop")
+    return Outcome(
+        name=name,
+        scores=result.scores,
+        pairs=all_pairs(result.scores, data.truth),
+        best=best_match(result.scores, data.truth),
+        matches=best_matches(result.scores, data.truth),
+        recall_at=recall_at_k(result.scores, data.truth, RECALL_AT),
+        seconds=result.seconds,
+        once=result.once,
+        notes=notes,
+    )
+
+
+def figures(outcome: Outcome) -> dict[str, dict[str, float]]:
+    """Return the figures of a method by convention: convention -> name of the figure -> value in 0..1."""
+    table = {
+        curve.convention: {
+            "average precision": curve.average_precision,
+            "recall at 100 % precision": curve.recall_at_full_precision,
+            "best F1": curve.best_f1,
+        }
+        for curve in (outcome.pairs, outcome.best)
+    }
+    table[outcome.best.convention].update({f"recall at {k}": value for k, value in outcome.recall_at.items()})
+    return table

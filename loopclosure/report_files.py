@@ -1,0 +1,157 @@
+"""The figures of an evaluation as CSV, JSON and text; every file says its convention and what was excluded."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome, figures
+from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, PrecisionRecall
+
+EXPLANATION = {
+    ALL_PAIRS: "every judged pair of frames is a sample",
+    BEST_MATCH: "each query names its best reference; recall is the share of queries with a loop whose match is right",
+}
+
+
+def write_files(evaluation: Evaluation, folder: Path, command: str = "") -> None:
+    """Write figures.csv, times.csv, report.json, and curve_*.csv and matches_*.csv of each method."""
+    _write_figures_csv(evaluation, folder / "figures.csv")
+    _write_times_csv(evaluation, folder / "times.csv")
+    slugs = _slugs([outcome.name for outcome in evaluation.outcomes])
+    for slug, outcome in zip(slugs, evaluation.outcomes, strict=True):
+        _write_curves_csv(outcome, folder / f"curve_{slug}.csv")
+        _write_matches_csv(evaluation, outcome, folder / f"matches_{slug}.csv")
+    text = json.dumps(summary(evaluation, command), indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "report.json").write_text(text + "\n", "utf-8")
+
+
+def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
+    """Return the whole evaluation as what JSON can hold; a figure that is not defined is null."""
+    data, truth = evaluation.data, evaluation.data.truth
+    return {
+        "data_set": data.name,
+        "truth_and_exclusion": truth.sentence,
+        "queries": len(data.query_images),
+        "references": len(data.references),
+        "judged_pairs": int(np.count_nonzero(truth.judged)),
+        "true_pairs": truth.positives,
+        "queries_with_a_loop": int(np.count_nonzero(truth.queries_with_a_loop)),
+        "training": evaluation.train,
+        "notes": data.notes,
+        "conventions": EXPLANATION,
+        "command": command,
+        "methods": [
+            {
+                "name": outcome.name,
+                "figures": {
+                    convention: {name: _number(value) for name, value in values.items()}
+                    for convention, values in figures(outcome).items()
+                },
+                "seconds": {stage: round(seconds, 6) for stage, seconds in outcome.seconds.items()},
+                "milliseconds_a_frame": {
+                    stage: round(1e3 * seconds / evaluation.images, 6)
+                    for stage, seconds in outcome.seconds.items()
+                    if stage not in outcome.once
+                },
+                "notes": outcome.notes,
+            }
+            for outcome in evaluation.outcomes
+        ],
+    }
+
+
+def figures_text(evaluation: Evaluation) -> str:
+    """Return the table of figures for a terminal, with what it was judged by."""
+    heads = ["method", "AP", "R@P=1", "F1", "AP", "R@P=1", "F1", *(f"R@{k}" for k in RECALL_AT), "ms/frame"]
+    rows = []
+    for outcome in evaluation.outcomes:
+        values = figures(outcome)
+        cells = [share(v) for v in (*values[ALL_PAIRS].values(), *values[BEST_MATCH].values())]
+        rows.append([outcome.name, *cells, f"{1e3 * outcome.seconds_on_frames / evaluation.images:.2f}"])
+    widths = [max(len(row[i]) for row in [heads, *rows]) for i in range(len(heads))]
+    lines = [
+        "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+        for row in [heads, *rows]
+    ]
+    pairs_width = sum(widths[1:4]) + 4
+    over = f"{'':{widths[0]}}  {ALL_PAIRS:-^{pairs_width}}  {' ' + BEST_MATCH + ' ':-^{sum(widths[4:10]) + 10}}"
+    data = evaluation.data
+    return "\n".join([f"{data.name}: {data.truth.sentence}", over, *lines])
+
+
+def _write_figures_csv(evaluation: Evaluation, path: Path) -> None:
+    rows = [["method", "convention", "figure", "value", "truth and exclusion"]]
+    for outcome in evaluation.outcomes:
+        for convention, values in figures(outcome).items():
+            for name, value in values.items():
+                rows.append([outcome.name, convention, name, f"{value:.6f}", evaluation.data.truth.sentence])
+    _write_csv(path, rows)
+
+
+def _write_times_csv(evaluation: Evaluation, path: Path) -> None:
+    rows = [["method", "stage", "seconds", "milliseconds a frame", "frames"]]
+    for outcome in evaluation.outcomes:
+        for stage, seconds in outcome.seconds.items():
+            each = "" if stage in outcome.once else f"{1e3 * seconds / evaluation.images:.6f}"
+            rows.append([outcome.name, stage, f"{seconds:.6f}", each, str(evaluation.images)])
+    _write_csv(path, rows)
+
+
+def _write_curves_csv(outcome: Outcome, path: Path) -> None:
+    """Write the points at which recall rises, which is all that average precision sums over."""
+    rows = [["convention", "threshold", "precision", "recall", "truth and exclusion"]]
+    for curve in (outcome.pairs, outcome.best):
+        for i in _rises(curve):
+            values = [f"{v[i]:.9g}" for v in (curve.thresholds, curve.precision, curve.recall)]
+            rows.append([curve.convention, *values, curve.exclusion])
+    _write_csv(path, rows)
+
+
+def _rises(curve: PrecisionRecall) -> np.ndarray:
+    return np.flatnonzero(np.diff(curve.recall, prepend=0.0) > 0)
+
+
+def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> None:
+    data, matches = evaluation.data, outcome.matches
+    loops = data.truth.queries_with_a_loop
+    rows = [["query", "reference", "score", "verdict", "query has a loop", "query image", "reference image"]]
+    for query in np.flatnonzero(matches.reference >= 0):
+        reference = int(matches.reference[query])
+        verdict = "right" if matches.right[query] else "ignored" if matches.ignored[query] else "wrong"
+        images = [str(data.query_images[query]), str(data.references[reference])]
+        rows.append(
+            [str(query), str(reference), f"{matches.score[query]:.9g}", verdict, str(int(loops[query])), *images]
+        )
+    _write_csv(path, rows)
+
+
+def _write_csv(path: Path, rows: list[list[str]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream).writerows(rows)
+
+
+def _slugs(names: list[str]) -> list[str]:
+    """Return a file name for each method, no two alike."""
+    slugs: list[str] = []
+    for name in names:
+        slug = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") or "method"
+        while slug in slugs:
+            slug += "_"
+        slugs.append(slug)
+    return slugs
+
+
+def _number(value: float) -> float | None:
+    return round(value, 6) if math.isfinite(value) else None
+
+
+def share(value: float) -> str:
+    """Print a share in 0..1; a dash where it is not defined."""
+    return "–" if math.isnan(value) else f"{value:.3f}"
