@@ -51,7 +51,7 @@ class MaskSource:
         self._min_gap = int((marked[:, 1] - marked[:, 0]).min()) if min_gap is None else min_gap
         self._marked = marked
         self.settings = {
-            "source": f"mask {_relative(mask, root)} of {_relative(images, root)}, camera {camera}",
+            "source": f"mask {mask.name} of {images.name}, camera {camera}",
             "least gap": f"{self._min_gap} images",
         }
 
@@ -147,7 +147,7 @@ def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0)
     names = [_relative(folder[place], root) for folder in (first, second) for place in places]
     unpaired = len(first) + len(second) - 2 * len(places)
     settings = {
-        "source": f"equal names in {_relative(folder_a, root)} and {_relative(folder_b, root)}, {unpaired} unpaired",
+        "source": f"equal names in {folder_a.name} and {folder_b.name}, {unpaired} unpaired",
         "least gap": f"{min_gap} places",
     }
     positives = [(number, number + len(places)) for number in range(len(places))]
@@ -158,7 +158,7 @@ def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0)
 def singles_source(folder: Path, root: Path) -> PlaceSource:
     """Take each image of a folder (or list) for a place of its own; positives can only be made by warping."""
     names = [_relative(path, root) for path in image_paths(folder)]
-    return PlaceSource(names, names, [], {"source": f"single images of {_relative(folder, root)}"}, "image")
+    return PlaceSource(names, names, [], {"source": f"single images of {folder.name}"}, "image")
 
 
 def table_source(table: Path, root: Path, group: str | None = None, index: Path | None = None) -> PlaceSource:
@@ -193,7 +193,7 @@ def table_source(table: Path, root: Path, group: str | None = None, index: Path 
                 raise InputError(f'image "{image}" is not in {index}', table, number, 1)
     numbers = {image: number for number, image in enumerate(group_of)}
     names = [_relative(table.parent / image, root) for image in group_of]
-    settings = {"source": f"positives of {_relative(table, root)}; negatives of different {group or 'places'}"}
+    settings = {"source": f"positives of {table.name}; negatives of different {group or 'places'}"}
     positives = [(numbers[a], numbers[b]) for a, b in pairs]
     of_second = {b for _, b in pairs}
     two_sided = index is None and not of_second & {a for a, _ in pairs}
@@ -228,7 +228,7 @@ def index_source(index: Path, root: Path, group: str, track: str, time: str, max
     names = [_relative(index.parent / row[column], root) for _, row in rows]
     groups = [_cell(index, line, row, group) for line, row in rows]
     settings = {
-        "source": f"frames of {_relative(index, root)}; negatives of different {group}",
+        "source": f"frames of {index.name}; negatives of different {group}",
         "positive": f"at most {max_gap:g} in {time} apart, of one {track}",
     }
     return PlaceSource(names, groups, positives, settings, group)

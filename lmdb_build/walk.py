@@ -130,7 +130,7 @@ def lap_light(seed: int, lap: int, rooms: int) -> Light:
     daylight = day * np.array([1 - warmth, 1, 1 + warmth])
     on = rng.uniform(size=rooms) < 0.4 + 0.5 * (day < 0.6)
     lamps = np.where(on, rng.uniform(0.5, 1.0, rooms), 0.05)[:, None] * np.array([0.78, 0.94, 1.05])
-    return Light(0.3 * daylight + 0.18, daylight, lamps)
+    return Light(0.3 * daylight + 0.22, daylight, lamps)
 
 
 class _Carrier:
