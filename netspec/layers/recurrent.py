@@ -93,6 +93,13 @@ class Recurrent(Layer):
         self.state = last
         return (torch.stack(outputs),)
 
+    def multiply_adds(self) -> int:
+        """Return the weights of every matrix, times the time steps (x_static's: once) and the streams."""
+        steps, streams = self.bottom_shapes[0][:2]
+        matrices = [math.prod(shape) for shape in self.blob_shapes if len(shape) == 2]
+        once = matrices.pop(1) if self.has_static else 0
+        return streams * (steps * sum(matrices) + once)
+
     def step(
         self, inputs: torch.Tensor, keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
@@ -121,7 +128,7 @@ class RNN(Recurrent):
     bottom[i]  with expose_hidden, after those: h_0 (1, N, num_output)
     top[0]     o (T, N, num_output)
     top[1]     with expose_hidden: h_T (1, N, num_output)
-    blobs      W_xh, b_h, [W_xh_static], W_hh, W_ho, b_o: (num_output, inputs) and (num_output,)
+    blobs[i]   W_xh, b_h, [W_xh_static], W_hh, W_ho, b_o: (num_output, inputs) and (num_output,)
     Caffe: src/caffe/layers/rnn_layer.cpp
     """
 
@@ -165,7 +172,7 @@ class LSTM(Recurrent):
     bottom[i]  with expose_hidden, after those: h_0, c_0 (1, N, num_output)
     top[0]     h (T, N, num_output)
     top[1..2]  with expose_hidden: h_T, c_T (1, N, num_output)
-    blobs      W_xc, b_c, [W_xc_static], W_hc: (4 num_output, inputs) and (4 num_output,)
+    blobs[i]   W_xc, b_c, [W_xc_static], W_hc: (4 num_output, inputs) and (4 num_output,)
     Caffe: src/caffe/layers/lstm_layer.cpp
     """
 

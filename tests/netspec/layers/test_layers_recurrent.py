@@ -81,6 +81,12 @@ def test_blobs_come_in_caffes_order(build) -> None:
     assert build(text("RNN"), *shapes).blob_shapes == [(D, INPUTS), (D,), (D, STATIC), (D, D), (D, D), (D,)]
 
 
+def test_work_is_counted_by_matrix_and_time_step(build) -> None:
+    shapes = [(T, N, INPUTS), (T, N), (N, STATIC)]
+    assert build(text("LSTM"), *shapes[:2]).multiply_adds() == T * N * 4 * D * (INPUTS + D)
+    assert build(text("RNN"), *shapes).multiply_adds() == N * D * (T * (INPUTS + D + D) + STATIC)
+
+
 @pytest.mark.parametrize("kind", ["RNN", "LSTM"])
 def test_hidden_state_lives_on_from_batch_to_batch(build, kind: str) -> None:
     layer = build(text(kind), (T, N, INPUTS), (T, N))
