@@ -33,13 +33,35 @@ FLT_MIN = 1.17549435e-38  # SoftmaxWithLoss takes no logarithm of less
 LOG_THRESHOLD = 1e-20  # nor MultinomialLogisticLoss and InfogainLoss of less than this
 
 
+class SoftmaxLoss(Loss, Classified):
+    """Base of the two losses that begin with a softmax, their optional second top, which brings no gradient."""
+
+    tops = (1, 2)
+    normalization: int
+
+    def reshape_tops(self, bottom_shapes: Sequence[Shape], axis: int, *path: str) -> Sequence[Shape]:
+        """Return the shapes of the tops; the classes lie along an axis."""
+        shapes = [*super().reshape(bottom_shapes), bottom_shapes[0]]
+        self.reshape_scores(bottom_shapes, axis, *path)
+        return shapes[: self.num_tops]
+
+    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, log_p: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the normalised sum of the losses (outer, inner) that count and, for a second top, the softmax."""
+        if valid is not None:
+            losses = losses.where(valid, 0)
+        loss = losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
+        if self.num_tops == 1:
+            return (loss,)
+        return loss, log_p.detach().exp().reshape(self.bottom_shapes[0])
+
+
 @register("SoftmaxWithLoss")
-class SoftmaxWithLoss(Loss, Classified):
+class SoftmaxWithLoss(SoftmaxLoss):
     """-log(softmax(scores)[label]), summed and normalised.
 
-    The logarithm is taken of no less than FLT_MIN, so one prediction costs 87.34 at most; the gradient is p - 1 all
-    the same. Real Caffe refuses a second top unless loss_weight is written twice; here it needs nothing. As in Caffe no
-    gradient comes from it.
+    The logarithm is taken of no less than FLT_MIN, so one prediction costs 87.34 at most; its label's gradient is p - 1
+    all the same. Real Caffe refuses a second top unless loss_weight is written twice; here it needs nothing. As in
+    Caffe no gradient comes from it.
 
     bottom[0]  scores (N, C, ...), C at softmax_param.axis
     bottom[1]  labels, one a prediction, (N,), (N, 1, ...) or (N, ...)
@@ -48,8 +70,6 @@ class SoftmaxWithLoss(Loss, Classified):
     Caffe: src/caffe/layers/softmax_loss_layer.cpp
     """
 
-    tops = (1, 2)
-
     def setup(self) -> None:
         """Read the ignored label and the normalisation (default VALID)."""
         self.ignore_label = ignore_label(self.param.loss_param)
@@ -57,9 +77,7 @@ class SoftmaxWithLoss(Loss, Classified):
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the tops' shapes."""
-        shapes = [*super().reshape(bottom_shapes), bottom_shapes[0]]
-        self.reshape_scores(bottom_shapes, self.param.softmax_param.axis, "softmax_param", "axis")
-        return shapes[: self.num_tops]
+        return self.reshape_tops(bottom_shapes, self.param.softmax_param.axis, "softmax_param", "axis")
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss and, where there is a second top, the softmax."""
@@ -67,17 +85,11 @@ class SoftmaxWithLoss(Loss, Classified):
         valid = self.valid(label, self.ignore_label)
         log_p = F.log_softmax(x, 1)
         chosen = log_p.gather(1, (label if valid is None else label * valid).unsqueeze(1)).squeeze(1)
-        losses = Floor.apply(chosen, math.log(FLT_MIN))
-        if valid is not None:
-            losses = losses.where(valid, 0)
-        loss = -losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
-        if self.num_tops == 1:
-            return (loss,)
-        return loss, log_p.detach().exp().reshape(scores.shape)
+        return self.sum_up(-Floor.apply(chosen, math.log(FLT_MIN)), valid, log_p)
 
 
 @register("InfogainLoss")
-class InfogainLoss(Loss, Classified):
+class InfogainLoss(SoftmaxLoss):
     """-sum over classes of H[label, class] log(softmax(scores)[class]), summed and normalised.
 
     The logarithm is taken of no less than 1e-20; the gradient takes no notice of that.
@@ -91,16 +103,16 @@ class InfogainLoss(Loss, Classified):
     """
 
     bottoms = (2, 3)
-    tops = (1, 2)
     label_bottoms = frozenset({1, 2})
 
     def setup(self) -> None:
         """Read the ignored label, the normalisation (default VALID) and, without a third bottom, the matrix."""
         loss_param, source = self.param.loss_param, self.param.infogain_loss_param.source
         if loss_param.HasField("normalize"):
-            raise self.error("InfogainLoss does not take the old field normalize; use normalization", "loss_param")
+            message = "InfogainLoss does not take the old field normalize; use normalization"
+            raise self.error(message, "loss_param", "normalize")
         self.ignore_label = ignore_label(loss_param)
-        self.normalization: int = loss_param.normalization
+        self.normalization = loss_param.normalization
         self.matrix: torch.Tensor | None
         self.register_buffer("matrix", None, persistent=False)
         if len(self.bottom_shapes) == 3:
@@ -121,13 +133,13 @@ class InfogainLoss(Loss, Classified):
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the tops' shapes."""
-        shapes = [*super().reshape(bottom_shapes), bottom_shapes[0]]
-        self.reshape_scores(bottom_shapes, self.param.infogain_loss_param.axis, "infogain_loss_param", "axis")
+        axis = self.param.infogain_loss_param.axis
+        shapes = self.reshape_tops(bottom_shapes, axis, "infogain_loss_param", "axis")
         if len(bottom_shapes) == 3:
             self._check_matrix(bottom_shapes[2], "bottom", 2)
         elif self.matrix is not None:
             self._check_matrix(tuple(self.matrix.shape), "infogain_loss_param", "source")
-        return shapes[: self.num_tops]
+        return shapes
 
     def _check_matrix(self, shape: Shape, *path: str | int) -> None:
         if math.prod(shape) != self.classes**2:
@@ -143,13 +155,8 @@ class InfogainLoss(Loss, Classified):
         gain = matrix.detach().to(x.dtype).reshape(self.classes, self.classes)
         log_p = F.log_softmax(x, 1)
         weights = gain[label if valid is None else label * valid].movedim(2, 1)  # (outer, classes, inner)
-        losses = (weights * Floor.apply(log_p, math.log(LOG_THRESHOLD))).sum(1)
-        if valid is not None:
-            losses = losses.where(valid, 0)
-        loss = -losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
-        if self.num_tops == 1:
-            return (loss,)
-        return loss, log_p.detach().exp().reshape(scores.shape)
+        losses = -(weights * Floor.apply(log_p, math.log(LOG_THRESHOLD))).sum(1)
+        return self.sum_up(losses, valid, log_p)
 
 
 @register("MultinomialLogisticLoss")

@@ -80,7 +80,7 @@ class Python(Layer):
 
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Run the code's reshape and forward, as Caffe does at each pass."""
-        tensors = (*bottoms, *self.blobs)
+        tensors = (*bottoms, *(self.blob(i) for i in range(len(self.blobs))))
         return _Call.apply(self, *tensors) if self.top else self.call_forward(tensors)
 
     def call_forward(self, tensors: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -117,7 +117,7 @@ class Python(Layer):
             raise self.error(message + _describe(fault), "python_param", "module") from fault
         cls = getattr(module, p.layer, None)
         if cls is None:
-            message = f'module "{p.module}" ({module.__file__}) has no class "{p.layer}"'
+            message = f'module "{p.module}" ({getattr(module, "__file__", "built in")}) has no class "{p.layer}"'
             raise self.error(message + did_you_mean(p.layer, dir(module)), "python_param", "layer")
         try:
             code = cls(self.param)

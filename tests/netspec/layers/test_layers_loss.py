@@ -434,7 +434,7 @@ def test_labels_never_get_a_gradient_and_batches_may_change(build, kind: str, sh
         (
             'type: "InfogainLoss" loss_param { normalize: true }',
             [(4, 3), (4,), (3, 3)],
-            "loss_param: InfogainLoss does not take the old field normalize; use normalization",
+            "loss_param.normalize: InfogainLoss does not take the old field normalize; use normalization",
         ),
         (
             'type: "InfogainLoss"',
