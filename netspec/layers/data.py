@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 
@@ -19,6 +20,7 @@ from netspec.data.feed import Feed
 from netspec.data.images import read_image_list
 from netspec.data.sources import Cursor, DatabaseSource, ImageListSource, Source, draw_skip
 from netspec.data.transformer import Transformer
+from netspec.errors import SpecError
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 
@@ -52,14 +54,16 @@ class ReadingLayer(Layer):
     def setup(self) -> None:
         """Open the files, or find out the shapes without them."""
         self.batch_size = self.batch_size_of_param()
-        self.source: Source | None = None
-        if self.context.open_data:
-            self.source = self.open()
-            self._shapes = list(self.source.shapes)[: self.num_tops]
-        else:
+        self._source: Source | None = None
+        self._feed: Feed[Batch] | None = None
+        if not self.context.open_data:
             self._shapes = self.shapes_without_data()
+            return
+        self._source = self.open()
+        self._shapes = list(self._source.shapes)[: self.num_tops]
+        make = partial(_make, self._source, self.num_tops, self.context.device.type == "cuda")
         ahead: int = self.param.data_param.prefetch
-        self._feed: Feed[Batch] = Feed(self._make, ahead, workers=max(1, min(ahead, os.cpu_count() or 1)))
+        self._feed = Feed(make, ahead, workers=max(1, min(ahead, os.cpu_count() or 1)))
 
     def shapes_without_data(self) -> list[Shape]:
         """Return the tops' shapes as given by the caller or fixed by the prototxt; a label goes with each image."""
@@ -69,7 +73,7 @@ class ReadingLayer(Layer):
             raise self.shape_wanted(self.param.top[0], f"{self.batch_size},C,H,W")
         return [data, *(given.get(top) or data[:1] for top in self.param.top[1:])]
 
-    def shape_wanted(self, blob: str, example: str) -> Exception:
+    def shape_wanted(self, blob: str, example: str) -> SpecError:
         """Return the error that asks for the shape of a top."""
         return self.error(f'the shape of "{blob}" is known by its data only; say --shape {blob}={example}', "top")
 
@@ -78,36 +82,39 @@ class ReadingLayer(Layer):
         return self._shapes
 
     @property
-    def opened(self) -> Source:
-        """The source; raises SpecError where no data was opened."""
-        if self.source is None:
-            raise self.error("this net was built without opening its data, so it cannot run")
-        return self.source
+    def source(self) -> Source:
+        """Where the batches come from, for a layer that opened its data."""
+        assert self._source is not None, "built without opening data"
+        return self._source
 
     @property
     def num_records(self) -> int:
         """How many records there are; a batch may read past the last one, on from the first."""
-        return self.opened.cursor.count
+        return self.source.cursor.count
 
     @property
     def iteration(self) -> int:
         """The iteration whose batch the next forward pass returns."""
-        return self._feed.position
+        return self._feed.position if self._feed else 0
 
     def keys(self, iteration: int) -> list[str]:
         """Return the keys (or file names) of the records of an iteration, one a row of the tops."""
-        return self.opened.keys(iteration)
+        return self.source.keys(iteration)
 
     def restart(self, iteration: int = 0) -> None:
         """Return to the first record, or to the first one of ``iteration``."""
-        self._feed.restart(iteration)
+        if self._feed:
+            self._feed.restart(iteration)
 
     def close(self) -> None:
         """Stop the threads that read ahead."""
-        self._feed.close()
+        if self._feed:
+            self._feed.close()
 
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the next batch."""
+        if self._feed is None:
+            raise self.error("this net was built without opening its data, so it cannot run")
         tops, wraps = self._feed.next()
         for _ in range(wraps):
             self.log_restart()
@@ -116,14 +123,6 @@ class ReadingLayer(Layer):
 
     def log_restart(self) -> None:
         """Say that the last record was passed, where Caffe says so."""
-
-    def _make(self, iteration: int) -> Batch:
-        """Make a batch, in whatever thread; page-locked where it goes to a GPU, so that the copy need not wait."""
-        source = self.opened
-        tops = tuple(torch.from_numpy(array) for array in source.batch(iteration)[: self.num_tops])
-        if self.context.device.type == "cuda":
-            tops = tuple(top.pin_memory() for top in tops)
-        return tops, source.cursor.wraps(iteration)
 
     # What the subclasses share
 
@@ -161,6 +160,15 @@ class ReadingLayer(Layer):
     def log_size(self, source: Source, site: str) -> None:
         """Log the shape of a batch."""
         log.info(site, "output data size: " + ",".join(map(str, source.shapes[0])))
+
+
+def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:
+    """Make a batch, in whatever thread; page-locked where it goes to a GPU, so that the copy need not wait.
+
+    It knows nothing of the layer, so that a layer nobody needs any more goes at once, and its threads with it.
+    """
+    tops = tuple(torch.from_numpy(array) for array in source.batch(iteration)[:num_tops])
+    return tuple(top.pin_memory() if pinned else top for top in tops), source.cursor.wraps(iteration)
 
 
 @register("Data")

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from netspec.data.datum import array_to_datum, datum_to_array, encoded_datum, parse_datum, planar
+from netspec.proto.schema import Datum
+
+COLOURS = np.random.default_rng(0).integers(0, 256, (3, 5, 7), np.uint8)
+
+
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image.transpose(1, 2, 0))[1].tobytes()
+
+
+def test_uint8_goes_through_data() -> None:
+    datum = parse_datum(array_to_datum(COLOURS, 3).SerializeToString())
+    assert (datum.channels, datum.height, datum.width, datum.label) == (3, 5, 7, 3)
+    assert not datum.float_data
+    found = datum_to_array(datum)
+    assert found.dtype == np.uint8
+    assert (found == COLOURS).all()
+
+
+def test_floats_go_through_float_data() -> None:
+    values = np.linspace(-2, 2, 24, dtype=np.float64).reshape(2, 3, 4)
+    datum = array_to_datum(values)
+    assert not datum.HasField("data")
+    assert not datum.HasField("label")
+    found = datum_to_array(datum)
+    assert found.dtype == np.float32
+    assert (found == values.astype(np.float32)).all()
+
+
+def test_data_is_preferred_where_both_are_given() -> None:  # data_transformer.cpp:53
+    datum = Datum(channels=1, height=1, width=2, data=b"\x05\xff", float_data=[1.5, 2.5])
+    assert datum_to_array(datum).tolist() == [[[5, 255]]]
+
+
+@pytest.mark.parametrize(("color", "channels"), [(None, 3), (True, 3), (False, 1)])
+def test_encoded_images_are_decoded_as_asked(color: bool | None, channels: int) -> None:
+    found = datum_to_array(encoded_datum(png(COLOURS), 1), color)
+    assert found.shape == (channels, 5, 7)
+    if channels == 3:
+        assert (found == COLOURS).all()
+
+
+def test_a_grey_file_stays_grey_unless_colour_is_forced() -> None:
+    datum = encoded_datum(png(COLOURS[:1]))
+    assert (datum_to_array(datum) == COLOURS[:1]).all()
+    assert (datum_to_array(datum, color=True) == COLOURS[[0, 0, 0]]).all()
+
+
+def test_planar_takes_grey_and_colour() -> None:
+    assert planar(np.zeros((4, 5), np.uint8)).shape == (1, 4, 5)
+    assert planar(np.zeros((4, 5, 3), np.uint8)).shape == (3, 4, 5)
+
+
+@pytest.mark.parametrize(
+    ("datum", "message"),
+    [
+        (Datum(channels=3, height=2, width=2, data=b"1234"), "holds 4 values in data, but says .* 3 x 2 x 2"),
+        (Datum(channels=1, height=2, width=2, float_data=[1.0]), "holds 1 values in float_data"),
+        (Datum(), "holds 0 values"),
+        (Datum(encoded=True, data=b"no image"), "cannot be decoded"),
+        (Datum(encoded=True), "cannot be decoded"),
+        (encoded_datum(cv2.imencode(".png", np.zeros((2, 2), np.uint16))[1].tobytes()), "uint16 .* only 8 bits"),
+    ],
+)
+def test_contradictions_are_named(datum: Datum, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        datum_to_array(datum)
+
+
+def test_what_is_no_datum_is_refused() -> None:
+    with pytest.raises(ValueError, match="is no Datum"):
+        parse_datum(b"\xff\xff\xff")
+
+
+def test_an_array_needs_three_axes() -> None:
+    with pytest.raises(ValueError, match="channels x height x width"):
+        array_to_datum(np.zeros((2, 2), np.uint8))

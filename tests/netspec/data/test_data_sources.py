@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from netspec.data.database import Writer, open_reader
+from netspec.data.datum import array_to_datum
+from netspec.data.sources import Cursor, DatabaseSource, draw_skip
+from netspec.data.transformer import Transformer
+from netspec.errors import SpecError, Where
+from netspec.proto.schema import TransformationParameter
+
+PLACE = Where("net.prototxt", 9, 5)
+
+
+def source(path: Path, shapes: list[tuple[int, int, int]], batch_size: int, **transform: object) -> DatabaseSource:
+    with Writer(str(path)) as writer:
+        for i, shape in enumerate(shapes):
+            writer.put(b"%08d" % i, array_to_datum(np.full(shape, i, np.uint8), i).SerializeToString())
+    reader = open_reader(str(path))
+    transformer = Transformer(TransformationParameter(**transform), 1, lambda *path: PLACE)
+    return DatabaseSource(reader, Cursor(len(reader), batch_size), transformer, PLACE)
+
+
+def test_the_cursor_wraps_and_says_when() -> None:
+    cursor = Cursor(count=5, batch_size=2)
+    assert [cursor.records(i) for i in range(4)] == [[0, 1], [2, 3], [4, 0], [1, 2]]
+    assert [cursor.wraps(i) for i in range(5)] == [0, 0, 1, 0, 1]  # the last record is read in batches 2 and 4
+
+
+def test_a_batch_may_be_larger_than_the_database() -> None:
+    cursor = Cursor(count=3, batch_size=7)
+    assert cursor.records(0) == [0, 1, 2, 0, 1, 2, 0]
+    assert [cursor.wraps(i) for i in range(3)] == [2, 2, 3]
+
+
+def test_records_are_skipped_at_the_very_start_only() -> None:
+    cursor = Cursor(count=5, batch_size=4, skip=3)
+    assert [cursor.records(0), cursor.records(1)] == [[3, 4, 0, 1], [2, 3, 4, 0]]
+
+
+def test_each_epoch_has_an_order_of_its_own() -> None:
+    cursor = Cursor(count=50, batch_size=10, shuffle=True, seed=1, stream="x")
+    epochs = [[record for i in range(5 * e, 5 * e + 5) for record in cursor.records(i)] for e in range(3)]
+    assert all(sorted(epoch) == list(range(50)) for epoch in epochs)
+    assert epochs[0] != epochs[1] != epochs[2] != list(range(50))
+    again = Cursor(count=50, batch_size=10, shuffle=True, seed=1, stream="x")
+    assert again.records(12) == cursor.records(12)
+
+
+def test_rand_skip_is_one_draw_below_its_limit() -> None:
+    skips = {draw_skip(10, seed, "data/TRAIN") for seed in range(100)}
+    assert skips == set(range(10))
+    assert draw_skip(0, 1, "data/TRAIN") == 0
+
+
+def test_batches_have_images_labels_and_keys(tmp_path: Path) -> None:
+    found = source(tmp_path / "db", [(2, 3, 4)] * 5, 2)
+    data, labels = found.batch(2)
+    assert list(found.shapes) == [(2, 2, 3, 4), (2,)]
+    assert labels.tolist() == [4, 0]
+    assert data[:, 1, 2, 3].tolist() == [4, 0]
+    assert found.keys(2) == ["00000004", "00000000"]
+
+
+def test_a_record_of_another_size_is_named(tmp_path: Path) -> None:
+    found = source(tmp_path / "db", [(3, 4, 4)] * 3 + [(1, 4, 4)], 2)
+    found.batch(0)
+    with pytest.raises(SpecError) as fault:
+        found.batch(1)
+    assert str(fault.value).startswith(
+        'net.prototxt:9:5: record "00000003" gives 1 x 4 x 4, but the first one, "00000000", 3 x 4 x 4'
+    )
+
+
+def test_a_batch_of_one_takes_any_size(tmp_path: Path) -> None:  # Caffe: the first datum of a batch sets its shape
+    found = source(tmp_path / "db", [(3, 4, 4), (3, 6, 5)], 1)
+    assert [found.batch(i)[0].shape for i in range(2)] == [(1, 3, 4, 4), (1, 3, 6, 5)]
+
+
+def test_a_crop_brings_sizes_together(tmp_path: Path) -> None:
+    found = source(tmp_path / "db", [(3, 4, 4), (3, 6, 5)], 2, crop_size=3)
+    assert found.batch(0)[0].shape == (2, 3, 3, 3)
+
+
+def test_a_record_that_is_no_datum_is_named(tmp_path: Path) -> None:
+    with Writer(str(tmp_path / "db")) as writer:
+        writer.put(b"first", array_to_datum(np.zeros((1, 1, 1), np.uint8)).SerializeToString())
+        writer.put(b"second", b"\xff\xff\xff")
+    reader = open_reader(str(tmp_path / "db"))
+    transformer = Transformer(TransformationParameter(), 1, lambda *path: PLACE)
+    found = DatabaseSource(reader, Cursor(2, 1), transformer, PLACE)
+    with pytest.raises(SpecError, match=r'^net.prototxt:9:5: record "second" is no Datum \(3 bytes\)$'):
+        found.batch(1)
