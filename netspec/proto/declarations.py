@@ -33,6 +33,7 @@ _SCALARS = {
     name: FieldDescriptorProto.Type.Value(f"TYPE_{name.upper()}")
     for name in ("double", "float", "int64", "uint64", "int32", "uint32", "bool", "string", "bytes")
 }
+_INTEGERS = {_SCALARS[name] for name in ("int64", "uint64", "int32", "uint32")}
 
 
 def read_declarations(source: str, file: str, package: str) -> FileDescriptorProto:
@@ -133,7 +134,7 @@ class _Declarations:
                 self._take("=")
                 value = self._take()
                 if option == "default":
-                    result.default_value = value[1:-1] if value.startswith('"') else value
+                    result.default_value = self._default(result.type, value)
                 elif option == "packed":
                     result.options.packed = value == "true"
                 else:
@@ -142,6 +143,12 @@ class _Declarations:
                     break
                 self._take(",")
         self._take(";")
+
+    def _default(self, kind: int, value: str) -> str:
+        """Return a default as descriptors have it: strings without quotes, integers in decimal."""
+        if value.startswith('"'):
+            return value[1:-1]
+        return str(int(value, 0)) if kind in _INTEGERS and value.lower().startswith(("0x", "-0x")) else value
 
     def _integer(self) -> int:
         word = self._take()

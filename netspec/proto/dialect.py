@@ -26,7 +26,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
 from netspec.errors import SpecError, Where
 from netspec.proto.declarations import read_declarations
-from netspec.proto.schema import PACKAGE, added_fields, as_field, fields_of, pool
+from netspec.proto.schema import PACKAGE, add_file, added_fields, as_field, fields_of, pool
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def activate(dialect: Dialect) -> None:
 
 def _add(file: FileDescriptorProto) -> None:
     try:
-        pool.Add(file)
+        add_file(file)
     except TypeError as fault:
         raise SpecError(f"these declarations do not fit Caffe's schema: {fault}", Where(file.name)) from None
 

@@ -21,6 +21,20 @@ _LAST_NUMBER = 1 << 29  # field numbers end before this
 
 #: The pool; :mod:`netspec.proto.dialect` adds the messages and fields of forks to it.
 pool = descriptor_pool.DescriptorPool()
+_declarations: dict[str, descriptor_pb2.DescriptorProto] = {}  # by the message's full name
+
+
+def add_file(file: descriptor_pb2.FileDescriptorProto) -> None:
+    """Add the messages of a file to the schema. Raises TypeError where they do not fit it."""
+    pool.Add(file)
+    for declared in file.message_type:
+        _declare(f"{file.package}.{declared.name}", declared)
+
+
+def _declare(full_name: str, declared: descriptor_pb2.DescriptorProto) -> None:
+    _declarations[full_name] = declared
+    for nested in declared.nested_type:
+        _declare(f"{full_name}.{nested.name}", nested)
 
 
 def _load() -> None:
@@ -31,7 +45,7 @@ def _load() -> None:
             # Numbers above Caffe's own are open for the fields of forks: as extensions they can come later, and do
             # not change the classes below.
             declared.extension_range.add(start=max(f.number for f in declared.field) + 1, end=_LAST_NUMBER)
-        pool.Add(file)
+        add_file(file)
 
 
 _load()
@@ -42,7 +56,8 @@ def message(name: str) -> type[CaffeMessage]:
 
     Raises KeyError for a name that the schema does not have.
     """
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))
+    found: Any = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))
+    return found
 
 
 if TYPE_CHECKING:
@@ -157,9 +172,8 @@ def fields_of(descriptor: Any) -> dict[str, Field]:
     """Return the fields of a message's descriptor by name: the schema's own, then those of the active dialects."""
     name = descriptor.full_name
     if name not in _own_fields:
-        declared = descriptor_pb2.DescriptorProto()
-        descriptor.CopyToProto(declared)
-        _own_fields[name] = {f.name: as_field(f, descriptor.fields_by_name[f.name]) for f in declared.field}
+        declared = _declarations[name].field
+        _own_fields[name] = {f.name: as_field(f, descriptor.fields_by_name[f.name]) for f in declared}
     return {**_own_fields[name], **added_fields[name]} if name in added_fields else _own_fields[name]
 
 
