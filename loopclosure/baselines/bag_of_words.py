@@ -24,8 +24,7 @@ class BagOfWords:
     metric: str = "l1"
 
     def __post_init__(self) -> None:
-        if self.metric not in METRICS:
-            raise InputError(f'unknown metric "{self.metric}" of the bag of words; known: {", ".join(METRICS)}')
+        check_metric(self.metric)
 
     @classmethod
     def learn(cls, words: np.ndarray, metric: str = "l1") -> BagOfWords:
@@ -52,3 +51,9 @@ class BagOfWords:
             return a @ b.T
         # |a - b| = |a| + |b| - 2 (what they share), and the lengths are 1, or 0 for images without words.
         return (a.sum(axis=1)[:, None] + b.sum(axis=1)[None, :] - cdist(a, b, "cityblock")) / 2.0
+
+
+def check_metric(metric: str) -> None:
+    """Raise InputError for a metric that is not known."""
+    if metric not in METRICS:
+        raise InputError(f'unknown metric "{metric}" of the bag of words; known: {", ".join(METRICS)}')

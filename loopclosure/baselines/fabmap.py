@@ -108,19 +108,23 @@ def mean_field_table(tree: WordTree, settings: FabMapSettings) -> np.ndarray:
     return _mix(tree, settings, tree.marginal[:, None])[:, 0]
 
 
+def _detector(settings: FabMapSettings) -> np.ndarray:
+    """Return p(z | cause) as (2, 2), indexed [z, cause]."""
+    seen = np.array([settings.false_alarm, settings.hit])
+    return np.stack([1.0 - seen, seen])
+
+
 def _belief(tree: WordTree, settings: FabMapSettings) -> np.ndarray:
     """Return p(cause of the word is there | L) as (v, 2)."""
-    p_seen = np.array([settings.false_alarm, settings.hit])  # [cause]
-    p_image = np.stack([1.0 - p_seen, p_seen])  # [L, cause]
+    by_cause = _detector(settings)  # [L, cause]
     prior = tree.marginal[:, None]
-    there, absent = p_image[:, 1] * prior, p_image[:, 0] * (1.0 - prior)
+    there, absent = by_cause[:, 1] * prior, by_cause[:, 0] * (1.0 - prior)
     return there / (there + absent)
 
 
 def _mix(tree: WordTree, settings: FabMapSettings, belief: np.ndarray) -> np.ndarray:
     """Average p(z | cause, a) over the belief (v, m) in the cause: (v, m, 2, 2), indexed [word, ., z, a]."""
-    detector = np.array([settings.false_alarm, settings.hit])  # p(z = 1 | cause)
-    detector = np.stack([1.0 - detector, detector])[:, :, None]  # [z, cause, a]
+    detector = _detector(settings)[:, :, None]  # [z, cause, a]
     if settings.naive:
         by_cause = np.broadcast_to(detector, (len(tree), 2, 2, 2))  # [word, z, cause, a]
     else:

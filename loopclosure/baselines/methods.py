@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from loopclosure.baselines.bag_of_words import BagOfWords
+from loopclosure.baselines.bag_of_words import BagOfWords, check_metric
 from loopclosure.baselines.fabmap import FabMapModel, FabMapSettings, score_sequence, score_sets
 from loopclosure.baselines.images import read_grey, refuse_overlap, timed
 from loopclosure.baselines.settings import configure
@@ -115,6 +115,9 @@ class BagOfWordsMethod(_WordsOfImages):
 
     metric: str = "l1"
     name: str = "bow"
+
+    def __post_init__(self) -> None:
+        check_metric(self.metric)
 
     def score(
         self,

@@ -25,8 +25,9 @@ KINDS = {"sift": 128, "orb": 256}
 @lru_cache(maxsize=8)
 def _detector(kind: str, max_features: int, contrast: float) -> Any:
     if kind == "orb":
-        return cv2.ORB_create(nfeatures=max_features)
-    return cv2.SIFT_create(nfeatures=max_features, contrastThreshold=contrast)
+        return cv2.ORB_create(nfeatures=max_features)  # pyright: ignore[reportAttributeAccessIssue]
+    sift = cv2.SIFT_create  # pyright: ignore[reportAttributeAccessIssue]
+    return sift(nfeatures=max_features, contrastThreshold=contrast)
 
 
 @dataclass(frozen=True)
