@@ -1,0 +1,90 @@
+"""Whether two images show the same thing by their geometry: SIFT, the ratio test, RANSAC on the fundamental matrix.
+
+The fundamental matrix is not determined by a flat scene or a camera that only turns; its inliers still count points
+that agree, so such pairs are accepted rather than lost. What a pair needs is texture: two views of a bare wall fail.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from loopclosure.errors import InputError
+
+# Of fewer matches eight-point estimates say nothing: any seven points have a fundamental matrix.
+LEAST_MATCHES = 8
+
+
+@dataclass(frozen=True)
+class LocalFeatures:
+    """Points of an image (K, 2) float32, x and y in pixels, and their SIFT descriptors (K, 128) uint8."""
+
+    points: np.ndarray
+    descriptors: np.ndarray
+
+
+@dataclass(frozen=True)
+class GeometricCheck:
+    """Decides by the number of point matches that agree with one fundamental matrix.
+
+    max_features   SIFT points of an image, the strongest: 66 kB of memory a frame for 500
+    ratio          a match must be nearer than ``ratio`` times the next best (Lowe's test)
+    max_error_px   distance of an inlier from its epipolar line, in pixels
+    confidence     of RANSAC
+    min_inliers    a loop needs at least so many
+    """
+
+    max_features: int = 500
+    ratio: float = 0.8
+    max_error_px: float = 2.0
+    confidence: float = 0.985
+    min_inliers: int = 20
+
+    def describe(self, image: np.ndarray) -> LocalFeatures:
+        """Find the points of an image (H, W) or (H, W, 3) uint8; there may be none."""
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        points, descriptors = cv2.SIFT.create(self.max_features).detectAndCompute(grey, None)
+        if descriptors is None or not len(points):
+            return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
+        # OpenCV's SIFT descriptors are whole numbers up to 255, in float32: bytes hold them without loss.
+        places = np.array([point.pt for point in points], np.float32)
+        return LocalFeatures(places[: self.max_features], descriptors[: self.max_features].astype(np.uint8))
+
+    def matches(self, a: LocalFeatures, b: LocalFeatures) -> np.ndarray:
+        """Return the matches (M, 2), point of ``a`` and point of ``b``, that pass the ratio test; none of b twice."""
+        if len(a.points) < 2 or len(b.points) < 2:
+            return np.zeros((0, 2), np.int64)
+        products = a.descriptors.astype(np.float32) @ b.descriptors.astype(np.float32).T
+        lengths = [np.sum(f.descriptors.astype(np.float32) ** 2, axis=1) for f in (a, b)]
+        squares = lengths[0][:, None] + lengths[1][None, :] - 2 * products
+        rows = np.arange(len(squares))
+        nearest = np.argmin(squares, axis=1)
+        best = np.maximum(squares[rows, nearest], 0)
+        squares[rows, nearest] = np.inf
+        passed = np.flatnonzero(best < self.ratio**2 * squares.min(axis=1))
+        passed = passed[np.argsort(best[passed], kind="stable")]
+        _, first = np.unique(nearest[passed], return_index=True)
+        kept = np.sort(passed[first])
+        return np.stack([kept, nearest[kept]], axis=1)
+
+    def inliers(self, a: LocalFeatures, b: LocalFeatures) -> int:
+        """Count the matches that agree with one fundamental matrix; 0 where there are too few to tell."""
+        matches = self.matches(a, b)
+        if len(matches) < LEAST_MATCHES:
+            return 0
+        points = a.points[matches[:, 0]], b.points[matches[:, 1]]
+        _, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, self.max_error_px, self.confidence)
+        return 0 if mask is None else int(np.count_nonzero(mask))
+
+    def accepts(self, inliers: int) -> bool:
+        """Tell whether so many inliers are enough."""
+        return inliers >= self.min_inliers
+
+    def __post_init__(self) -> None:
+        if self.max_features < LEAST_MATCHES or self.min_inliers < LEAST_MATCHES or not 0 < self.ratio <= 1:
+            raise InputError(
+                f"geometric check: {self.max_features} features, {self.min_inliers} inliers, ratio {self.ratio:g}; "
+                f"expected at least {LEAST_MATCHES} of both and a ratio in 0..1"
+            )
