@@ -13,14 +13,12 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-from google.protobuf.message import DecodeError
 
 from netspec import blobs, log
 from netspec.errors import SpecError, Where
 from netspec.net import Net
+from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import NetParameter
-from netspec.proto.source_map import SourceMap
-from netspec.proto.upgrade import upgrade_net
 from netspec.whole_file import whole_file
 
 Copies = list[tuple[torch.Tensor, np.ndarray]]
@@ -33,10 +31,7 @@ def load_weights(net: Net, path: str | Path) -> None:
     Raises SpecError for a file that cannot be read, and for blobs of other number or shape than the net's.
     """
     path = Path(path)
-    try:
-        copies = _from_hdf5(net, path) if h5py.is_hdf5(path) else _from_binary(net, path)
-    except OSError as fault:
-        raise SpecError(f"the weights cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+    copies = _from_hdf5(net, path) if h5py.is_hdf5(path) else _from_binary(net, path)
     with torch.no_grad():
         for blob, values in copies:
             blob.copy_(torch.tensor(values).view(blob.shape))
@@ -61,6 +56,8 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
     for layer in net.layers:
         written = proto.layer.add()
         written.CopyFrom(layer.param)
+        if layer.is_loss and layer.num_tops == 1 and not written.loss_weight:
+            written.loss_weight.append(1)  # Caffe's loss layers note their default (loss_layer.cpp)
         del written.blobs[:]
         for j in range(len(layer.blobs)):
             written.blobs.append(blobs.from_array(_values(layer, j), _gradient(layer, j) if diff else None))
@@ -71,15 +68,9 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
 
 
 def _from_binary(net: Net, path: Path) -> Copies:
-    proto = NetParameter()
-    try:
-        proto.ParseFromString(path.read_bytes())
-    except DecodeError:
-        raise SpecError("these are not weights: neither a NetParameter of Caffe's nor HDF5", Where(str(path))) from None
-    proto, _ = upgrade_net(proto, SourceMap.unknown(str(path), len(proto.layer) + len(proto.layers)))
     targets = _layers_by_name(net)
     copies: Copies = []
-    for source in proto.layer:
+    for source in read_net_binary(path).layer:
         target = targets.get(source.name)
         if target is None:
             _ignore(source.name)

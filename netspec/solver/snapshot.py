@@ -11,10 +11,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from google.protobuf.message import DecodeError
 
 from netspec import blobs
 from netspec.errors import SpecError, Where
+from netspec.proto.binary import read_binary
 from netspec.proto.schema import SolverState
 from netspec.whole_file import whole_file
 
@@ -36,21 +36,16 @@ class State:
 
 def read_state(path: str | Path) -> State:
     """Read a .solverstate or .solverstate.h5, Caffe's or ours. Raises SpecError."""
-    where = Where(str(path))
-    try:
-        if h5py.is_hdf5(path):
-            return _read_hdf5(path)
-        proto = SolverState.FromString(Path(path).read_bytes())
-        history = [blobs.to_array(blob) for blob in proto.history]
-        return State(proto.iter, proto.learned_net, proto.current_step, history)
-    except OSError as fault:
-        raise SpecError(f"the solver state cannot be read: {fault.strerror or fault}", where) from None
-    except (DecodeError, KeyError):
-        raise SpecError(
-            "this is not a solver state: neither a SolverState of Caffe's nor its HDF5 form", where
-        ) from None
-    except ValueError as fault:
-        raise SpecError(f"the solver state is damaged: {fault}", where) from None
+    if h5py.is_hdf5(path):
+        return _read_hdf5(path)
+    proto = read_binary(path, SolverState)
+    history = []
+    for i, blob in enumerate(proto.history):
+        try:
+            history.append(blobs.to_array(blob))
+        except ValueError as fault:
+            raise SpecError(f"history blob {i}: {fault}", Where(str(path))) from None
+    return State(proto.iter, proto.learned_net, proto.current_step, history)
 
 
 def write_state(path: str | Path, state: State) -> None:
@@ -79,6 +74,9 @@ def find_learned_net(state: State, path: str | Path) -> Path | None:
 def _read_hdf5(path: str | Path) -> State:
     with h5py.File(path, "r") as opened:
         file: Any = opened
+        for name in ("iter", "current_step", "history"):
+            if name not in file:
+                raise SpecError(f"this is not a solver state: the HDF5 file has no /{name}", Where(str(path)))
         history = file["history"]
         learned_net = file["learned_net"][()].decode() if "learned_net" in file else ""
         arrays = [history[str(i)][()] for i in range(len(history))]

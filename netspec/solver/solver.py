@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from netspec.proto.source_map import Node
 from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
 from netspec.solver.checks import check_settings, check_writable
+from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
 from netspec.weights import load_weights, save_weights
@@ -221,11 +223,15 @@ class Solver:
         total = 0.0
         outputs: dict[str, torch.Tensor] = {}
         for _ in range(self.param.iter_size):
-            loss, outputs = self.net.forward_loss()
-            if loss.requires_grad:
-                loss.backward()
+            with self._debugged(self.net, self._is_due(self.param.display)):
+                loss, outputs = self.net.forward_loss()
+                if loss.requires_grad:
+                    loss.backward()
             total += loss.item()
         return total / self.param.iter_size, outputs
+
+    def _debugged(self, net: Net, wanted: bool = True) -> AbstractContextManager[None]:
+        return debug_info(net) if wanted and self.param.debug_info else nullcontext()
 
     @torch.no_grad()
     def _apply_update(self) -> None:
@@ -292,7 +298,8 @@ class Solver:
             if self.stopped:
                 log.info("solver.cpp:396", "Test interrupted.")
                 return
-            loss, outputs = net.forward_loss()
+            with self._debugged(net):
+                loss, outputs = net.forward_loss()
             total += loss.item()
             for name, blob in outputs.items():
                 scores = blob.reshape(-1).tolist()
