@@ -11,6 +11,7 @@ from netspec.layers.base import TRAIN
 from netspec.net import Net
 from netspec.proto.source_map import Node
 
+LMDB = 1  # caffe.proto: DataParameter.DB
 FAR = 0.1  # of the records may be missed, or met twice, by a test
 
 
@@ -107,7 +108,8 @@ def _test_size(iterations: int, where: Where, net: Net) -> Iterator[str]:
         if not source or not layer.top_shapes:
             continue
         try:
-            reader = open_reader(source, layer.param.data_param.backend, where)
+            backend = "lmdb" if layer.param.data_param.backend == LMDB else "leveldb"
+            reader = open_reader(source, backend, where)
         except SpecError:
             return
         records, read = len(reader), iterations * layer.top_shapes[0][0]
