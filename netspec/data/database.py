@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 import threading
+import time
 import weakref
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -23,6 +24,7 @@ from netspec.errors import SpecError, Where
 
 BACKENDS = ("lmdb", "leveldb")
 _SCAN = 4096  # keys listed ahead of the one that is asked for
+_PATIENCE = 1.0  # seconds
 _FIRST_MAP_SIZE = 16 << 20
 _COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a transaction's pages stay in memory until it is committed
 
@@ -99,10 +101,7 @@ class _LmdbReader(Reader):
         size = os.path.getsize(os.path.join(source, "data.mdb"))
         if not size:
             raise ValueError("has an empty data.mdb, so it was never written")
-        try:
-            self._env = lmdb.open(source, readonly=True, lock=False, readahead=True, max_spare_txns=64)
-        except lmdb.Error as fault:
-            raise ValueError(f"cannot be opened as an LMDB ({fault})") from None
+        self._env = _open_lmdb(source)
         stat = self._env.stat()
         pages = 2 + stat["branch_pages"] + stat["leaf_pages"] + stat["overflow_pages"]
         if size < pages * stat["psize"]:  # a read beyond the end of a mapped file kills the process
@@ -132,6 +131,18 @@ class _LmdbReader(Reader):
             while more and len(self._keys) < upto:
                 self._keys.append(cursor.key())
                 more = cursor.next()
+
+
+def _open_lmdb(source: str) -> lmdb.Environment:
+    """Open an environment, with patience: a reader that another thread has just let go of may still be closing."""
+    patience = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            return lmdb.open(source, readonly=True, lock=False, readahead=True, max_spare_txns=64)
+        except lmdb.Error as fault:
+            if "already open" not in str(fault) or time.monotonic() > patience:
+                raise ValueError(f"cannot be opened as an LMDB ({fault})") from None
+            time.sleep(0.001)
 
 
 class _LevelDbReader(Reader):

@@ -77,6 +77,11 @@ def datum_to_array(datum: Any, color: bool | None = None) -> np.ndarray:
 
 def decode_image(image: bytes, color: bool | None = None) -> np.ndarray:
     """Decode an image file's bytes to uint8 (C, H, W); ``color`` as in :func:`datum_to_array`."""
+    return planar(decode_pixels(image, color))
+
+
+def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
+    """Decode an image file's bytes as OpenCV lays them out, uint8 (H, W) or (H, W, C); see :func:`decode_image`."""
     flag = cv2.IMREAD_UNCHANGED if color is None else cv2.IMREAD_COLOR if color else cv2.IMREAD_GRAYSCALE
     try:
         pixels = cv2.imdecode(np.frombuffer(image, np.uint8), flag) if image else None
@@ -86,7 +91,7 @@ def decode_image(image: bytes, color: bool | None = None) -> np.ndarray:
         raise ValueError("cannot be decoded as an image")
     if pixels.dtype != np.uint8:
         raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits a channel can be read")
-    return planar(pixels)
+    return pixels
 
 
 def planar(pixels: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from netspec.data.datum import decode_image, planar
+from netspec.data.datum import decode_pixels, planar
 from netspec.errors import SpecError, Where
 
 
@@ -32,18 +32,15 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
     Raises ValueError, which names the file, where it is missing or no image.
     """
     try:
-        image = decode_image(Path(path).read_bytes(), color)
+        pixels = decode_pixels(Path(path).read_bytes(), color)
     except OSError as fault:
         raise ValueError(f'image "{path}" cannot be read: {fault.strerror}') from None
     except ValueError as fault:
         raise ValueError(f'image "{path}" {fault}') from None
-    return resize(image, size) if size else image
-
-
-def resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return a uint8 image (C, H, W) resized to ``size`` = (height, width)."""
-    height, width = size
-    return planar(cv2.resize(image.transpose(1, 2, 0), (width, height), interpolation=cv2.INTER_LINEAR))
+    if size:
+        height, width = size
+        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_LINEAR)
+    return planar(pixels)
 
 
 def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Where]]:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from netspec import log
-from netspec.data.datum import decode_image, planar
+from netspec.data.datum import decode_pixels, planar
 from netspec.data.draws import words
 from netspec.data.mean import read_mean
 from netspec.data.sources import Arrays, Cursor, Shape
@@ -148,7 +148,7 @@ class WindowSource:
     def _cut(self, out: np.ndarray, window: Window, mirror: bool) -> None:
         path = self._file.images[window.image]
         try:
-            pixels = decode_image(self._bytes(path), color=True).transpose(1, 2, 0)
+            pixels = decode_pixels(self._bytes(path), color=True)
         except (OSError, ValueError) as fault:
             raise SpecError(f'image "{path}" cannot be read: {fault}', self._where) from None
         box, (top, left), (height, width) = self._fit(window, pixels.shape[0], pixels.shape[1], mirror)

@@ -74,6 +74,34 @@ def test_two_layers_may_read_one_database() -> None:
     assert first.record(0) == second.record(0)
 
 
+def test_readers_come_and_go_in_threads() -> None:  # liblmdb must not open what is still being closed
+    faults: list[Exception] = []
+
+    def come_and_go() -> None:
+        for _ in range(200):
+            try:
+                open_reader(str(GOLDEN / "pairs" / "test_lmdb")).record(5)
+            except SpecError as fault:
+                faults.append(fault)
+
+    threads = [threading.Thread(target=come_and_go) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not faults
+
+
+def test_a_database_that_other_code_holds_open_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object, **options: object) -> None:
+        raise lmdb.Error("The environment is already open in this process.")
+
+    monkeypatch.setattr(database, "_PATIENCE", 0.02)
+    monkeypatch.setattr(database.lmdb, "open", refuse)
+    with pytest.raises(SpecError, match="already open in this process"):
+        open_reader(str(GOLDEN / "images" / "lmdb_gray"))
+
+
 def test_a_database_made_anew_at_the_same_path_is_read_anew(tmp_path: Path) -> None:
     write(tmp_path / "db", {b"a": b"old"})
     old = open_reader(str(tmp_path / "db"))
