@@ -206,7 +206,7 @@ class SeqSlam:
             costs = np.where(valid, trajectory_costs(distances, self.settings), np.nan)
             scores = -costs if self.scored == "cost" else self._unique(costs)
         notes = [*found.notes, f"SeqSLAM, score: {self.scored}; {self.settings}"]
-        return MethodResult(scores, seconds, notes)
+        return MethodResult(scores, seconds, notes, found.once)
 
     def _unique(self, costs: np.ndarray) -> np.ndarray:
         match, ratio = best_matches(costs, self.match_window)

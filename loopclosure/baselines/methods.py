@@ -17,7 +17,7 @@ from loopclosure.baselines.images import read_grey, refuse_overlap, timed
 from loopclosure.baselines.settings import configure
 from loopclosure.baselines.thumbnails import Thumbnailer, differences
 from loopclosure.baselines.vocabulary import Extractor
-from loopclosure.baselines.word_model import Training, WordModel, train
+from loopclosure.baselines.word_model import TRAINING_STAGES, Training, WordModel, train
 from loopclosure.errors import InputError
 from loopclosure.methods import Method, MethodResult, Progress, Setting
 
@@ -106,7 +106,8 @@ class FabMapMethod(_WordsOfImages):
             else:
                 scores = score_sets(fabmap, queries, references)
         notes.append(f"FAB-MAP {self.settings.version}, score: {self.scored}; {self.settings}")
-        return MethodResult(scores.log_odds if self.scored == "log_odds" else scores.posterior, seconds, notes)
+        chosen = scores.log_odds if self.scored == "log_odds" else scores.posterior
+        return MethodResult(chosen, seconds, notes, TRAINING_STAGES)
 
 
 @dataclass
@@ -133,7 +134,7 @@ class BagOfWordsMethod(_WordsOfImages):
             bag = BagOfWords.learn(model.training_words, self.metric)
             scores = bag.similarity(queries, queries if references is None else references)
         notes.append(f"tf-idf, {self.metric}")
-        return MethodResult(scores, seconds, notes)
+        return MethodResult(scores, seconds, notes, TRAINING_STAGES)
 
 
 @dataclass

@@ -20,6 +20,8 @@ from loopclosure.errors import InputError
 from loopclosure.methods import Progress, silent
 
 FORMAT = 1
+# The stages of ``train``: done once, whatever the number of tested images.
+TRAINING_STAGES = ("training features", "vocabulary", "training words", "tree")
 
 
 @dataclass(frozen=True)
