@@ -105,16 +105,16 @@ def _test_size(iterations: int, where: Where, net: Net) -> Iterator[str]:
     """Compare the records that a test reads with those there are, where the database is at hand."""
     for layer in net.layers:
         source = layer.param.data_param.source
-        if not source or not layer.top_shapes:
+        if not source:
             continue
         try:
             backend = "lmdb" if layer.param.data_param.backend == LMDB else "leveldb"
             reader = open_reader(source, backend, where)
         except SpecError:
             return
-        records, read = len(reader), iterations * layer.top_shapes[0][0]
+        batch = layer.param.data_param.batch_size
+        records, read = len(reader), iterations * batch
         if abs(read - records) > FAR * records:
-            batch = layer.top_shapes[0][0]
             yield f'{where}: test_iter {iterations} x batch {batch} = {read}, but "{source}" has {records} records'
         return
 
