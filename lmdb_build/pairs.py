@@ -135,9 +135,10 @@ def split_by_group(
                 f"give more {word}s, split by time, or ask fewer splits for pairs"
             )
         order = np.random.default_rng([seed, 0]).permutation(count)
-        spare = count - len(splits)  # beyond the one that each split gets
-        edges = np.round(np.cumsum(list(shares.values())) / sum(shares.values()) * spare).astype(int)
-        edges += np.arange(1, len(splits) + 1)
+        edges = np.round(np.cumsum(list(shares.values())) / sum(shares.values()) * count).astype(int)
+        for number in range(len(edges)):  # at least one group each, for those before and those after
+            least = edges[number - 1] + 1 if number else 1
+            edges[number] = np.clip(edges[number], least, count - len(edges) + 1 + number)
         for number, part in enumerate(np.split(order, edges[:-1])):
             owner[part] = number
     return {split: np.flatnonzero(owner[source.groups] == number) for number, split in enumerate(splits)}
