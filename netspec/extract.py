@@ -76,7 +76,7 @@ def extract_records(
         raise SpecError("no layer of this net reads records; give image files instead", Where(net.plan.source.file))
     reader = readers[0]
     batch = reader.top_shapes[0][0]
-    records = reader.num_records
+    records, first = reader.num_records, reader.iteration
     rounds = -(-records // batch) if iterations is None else iterations
     rows = min(records, rounds * batch) if iterations is None else rounds * batch
     net.keep = list(blobs)
@@ -96,7 +96,8 @@ def extract_records(
     arrays = {name: np.concatenate(part)[:rows] for name, part in parts.items()}
     arrays["seconds_per_record"] = np.array((time.perf_counter() - begin) / (rounds * batch))
     arrays["parameters"] = np.array(sum(learnable.parameter.numel() for learnable in net.learnable))
-    arrays["keys"] = np.array([reader.key(i % records) for i in range(rows)])
+    keys = [key for i in range(first, first + rounds) for key in reader.keys(i)]
+    arrays["keys"] = np.array(keys[:rows])
     return arrays
 
 
