@@ -103,8 +103,8 @@ def enhance_contrast(distances: np.ndarray, window: int = 10, valid: np.ndarray 
     for here, there in neighbours:
         squares[:, here] += np.where(valid[:, there], known[:, there] - mean[:, here], 0.0) ** 2
     deviation = np.sqrt(squares / np.maximum(count - 1, 1))
-    alike = deviation <= 1e-12 * np.maximum(np.abs(mean), 1e-300)
-    enhanced = np.divide(known - mean, deviation, out=np.zeros_like(known), where=~alike)
+    differ = deviation > 1e-12 * np.abs(mean)  # the rounded mean of equal distances may leave a trace of a deviation
+    enhanced = np.divide(known - mean, deviation, out=np.zeros_like(known), where=differ)
     enhanced[~valid] = np.nan
     return enhanced - np.nanmin(enhanced)
 
@@ -203,6 +203,8 @@ class SeqSlam:
             distances = np.where(valid, -found.scores, np.nan)
             if self.settings.contrast:
                 distances = enhance_contrast(distances, self.settings.contrast, valid)
+            elif self.scored == "uniqueness":  # a ratio needs costs that are not negative; log-odds have no such end
+                distances -= distances.min(where=valid, initial=0.0)
             costs = np.where(valid, trajectory_costs(distances, self.settings), np.nan)
             scores = -costs if self.scored == "cost" else self._unique(costs)
         notes = [*found.notes, f"SeqSLAM, score: {self.scored}; {self.settings}"]

@@ -190,6 +190,24 @@ def test_uniqueness_as_the_score() -> None:
     assert result.scores[query[second], reference[second]].min() > 0.3
 
 
+def test_uniqueness_of_scores_that_may_be_of_either_sign() -> None:
+    log_odds = 40.0 * (two_laps() + 1.0)
+    settings = SequenceSettings(contrast=0)
+    result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(
+        frames(40), None, [], silent
+    )
+    found = result.scores[np.isfinite(result.scores)]
+    assert len(found) > 20
+    assert np.all((found >= 0) & (found <= 1))
+
+
+def test_a_sequence_shorter_than_the_exclusion_has_no_scores() -> None:
+    for settings in (SequenceSettings(), SequenceSettings(contrast=0)):
+        for scored in ("cost", "uniqueness"):
+            method = SeqSlam(Fixed(np.zeros((4, 4))), settings, scored, exclude_frames=5)
+            assert np.isnan(method.score(frames(4), None, [], silent).scores).all()
+
+
 def test_the_command_line_builds_it() -> None:
     method = make_method("seqslam:length=6,directions=both,width=32,patch=4", Setting(exclude_frames=7))
     assert isinstance(method, SeqSlam)
