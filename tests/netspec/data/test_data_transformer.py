@@ -73,7 +73,7 @@ def test_training_does_what_caffes_loops_do_with_the_same_draws(tmp_path: Path, 
 def test_mirroring_happens_in_test_too() -> None:  # as in Caffe: only the crop knows the phase
     found = transformer(TEST, mirror=True)(list(IMAGES), 0)
     mirrored = [(top == image[:, :, ::-1]).all() for top, image in zip(found, IMAGES, strict=True)]
-    assert mirrored == [bool(m % 2) for m in words(5, "data", 0, 40)[:, 0]]
+    assert mirrored == [m % 2 == 1 for m in words(5, "data", 0, 40)[:, 0].tolist()]
 
 
 def test_records_are_transformed_alike_in_any_batch() -> None:
