@@ -45,15 +45,8 @@ def write_pair_list(path: Path, pairs: Iterable[tuple[str, str, int]], settings:
 
 def read_pair_list(path: Path) -> list[ListedPair]:
     """Read a list. Raises InputError (file:line:column) for a line that is not one."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise InputError(
-            f'cannot be read ({reason}); expected a list of pairs, "a.png b.png 1" a line', path
-        ) from error
     pairs = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(_read_lines(path), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         fields = line.split()
@@ -73,7 +66,7 @@ def read_pair_list(path: Path) -> list[ListedPair]:
 def read_settings(path: Path) -> dict[str, str]:
     """Return the ``# name: value`` lines of a list's head."""
     settings = {}
-    for line in path.read_text(encoding="utf-8-sig").splitlines():
+    for line in _read_lines(path):
         if not line.startswith("#"):
             break
         name, colon, value = line[1:].partition(": ")
@@ -109,3 +102,11 @@ def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = 
     }
     write_pair_list(out, (pairs[index] for index in order), settings)
     return len(pairs), common
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise InputError(f'cannot be read ({reason}); expected lines such as "a.png b.png 1"', path) from error

@@ -16,7 +16,7 @@ def report(source: PairSource, pairs: Pairs, split: str, images: int) -> str:
     """Return a split's report: counts of each kind, then quantiles and a histogram of each measure."""
     used = len(np.unique(np.concatenate([pairs.first, pairs.second])))
     lines = [f"{split}: {len(pairs)} pairs of {images} images, {used} of them used"]
-    lines += [f"  {kind:<36}{number:>8}" for kind, number in kinds(source, pairs).items()]
+    lines += [f"  {kind:<44}{number:>8}" for kind, number in kinds(source, pairs).items()]
     plain = ~pairs.warped
     first, second, labels = pairs.first[plain], pairs.second[plain], pairs.labels[plain]
     for name, values in source.measures(first, second).items():

@@ -241,7 +241,8 @@ def _read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]
             reader = csv.DictReader(stream, restval="")
             rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"cannot be read ({error}); expected a CSV table with a head line", path) from error
+        reason = error.strerror if isinstance(error, OSError) else "not a table"
+        raise InputError(f"cannot be read ({reason}); expected a CSV table with a head line", path) from error
     if not rows:
         raise InputError("has no row below its head line", path)
     columns = [name for name, text in rows[0][1].items() if str(text).lower().endswith(IMAGE_SUFFIXES)]

@@ -1,5 +1,6 @@
 """The choice of pairs: seeded, balanced, no image in two splits, every label as the rule has it."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +107,7 @@ def test_a_split_by_time_keeps_stretches_whole_and_a_gap_between_them() -> None:
             stamps = source.stamps[images[source.tracks[images] == track]]
             np.testing.assert_allclose(np.diff(stamps), 0.1)
             spans.append((stamps[0], stamps[-1]))
-        for (_, end), (begin, _) in zip(spans, spans[1:], strict=False):
+        for (_, end), (begin, _) in pairwise(spans):
             assert begin - end >= 1.0 - 1e-9
     assert len(splits["train"]) == 160
 
