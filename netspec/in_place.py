@@ -4,6 +4,9 @@ Caffe's backward reads the data of bottom and top where they lie. If a later lay
 reads that layer's result: where an in-place Sigmoid follows an in-place ReLU, every value is positive, and the ReLU
 passes every gradient. Nets were trained with these gradients, so they are computed here too. It matters only for
 layers whose backward reads what was overwritten; the others keep a copy or a mask.
+
+What a layer's backward reads, its ``gradient_reads`` say: the "bottom", only the "sign" of the bottom, which its own
+top has too, or the "top".
 """
 
 from __future__ import annotations
@@ -28,25 +31,27 @@ def is_overwritten(layer: Layer, node: Node, plan: Plan) -> bool:
     """Return whether the layer's backward reads data that it, or a later layer, has written over."""
     if not layer.gradient_reads:
         return False
-    later = plan.final[node.tops[0]] != node.tops[0]
-    return ("top" in layer.gradient_reads and later) or ("bottom" in layer.gradient_reads and node.in_place[0])
+    in_place, later = node.in_place[0], plan.final[node.tops[0]] != node.tops[0]
+    reads = layer.gradient_reads
+    return ("bottom" in reads and in_place) or ("sign" in reads and in_place and later) or ("top" in reads and later)
 
 
 def run_overwritten(layer: Layer, bottom: torch.Tensor, memory: Memory, in_place: bool) -> tuple[torch.Tensor, ...]:
     """Run a layer whose gradient is to read ``memory`` for its top and, where it is in place, for its bottom."""
-    return (_Overwritten.apply(bottom, layer, memory, in_place),)
+    held = in_place and bool(layer.gradient_reads & {"bottom", "sign"})
+    return (_Overwritten.apply(bottom, layer, memory, held),)
 
 
 class _Overwritten(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, bottom: torch.Tensor, layer: Layer, memory: Memory, in_place: bool) -> torch.Tensor:
-        ctx.layer, ctx.memory, ctx.in_place = layer, memory, in_place
-        if not in_place:
+    def forward(ctx: Any, bottom: torch.Tensor, layer: Layer, memory: Memory, bottom_is_held: bool) -> torch.Tensor:
+        ctx.layer, ctx.memory, ctx.bottom_is_held = layer, memory, bottom_is_held
+        if not bottom_is_held:
             ctx.save_for_backward(bottom)
         return layer.run(bottom)[0]
 
     @staticmethod
     def backward(ctx: Any, diff: torch.Tensor) -> Any:
         held = ctx.memory.data
-        bottom = held if ctx.in_place else ctx.saved_tensors[0]
+        bottom = held if ctx.bottom_is_held else ctx.saved_tensors[0]
         return ctx.layer.gradient_in_place(bottom, held, diff), None, None, None

@@ -32,11 +32,10 @@ class ReLU(Activation):
     Caffe: src/caffe/layers/relu_layer.cpp
     """
 
-    gradient_reads = frozenset({"bottom"})
-
     def setup(self) -> None:
         """Read the slope of the negative side."""
         self.slope: float = self.param.relu_param.negative_slope
+        self.gradient_reads = frozenset({"sign" if self.slope >= 0 else "bottom"})  # the top's sign is the bottom's
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the rectified bottom."""
@@ -79,11 +78,10 @@ class ELU(Activation):
     Caffe: src/caffe/layers/elu_layer.cpp
     """
 
-    gradient_reads = frozenset({"bottom", "top"})
-
     def setup(self) -> None:
         """Read the scale of the negative side."""
         self.alpha: float = self.param.elu_param.alpha
+        self.gradient_reads = frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom."""
@@ -324,6 +322,8 @@ class Swish(Activation):
     Caffe: src/caffe/layers/swish_layer.cpp
     """
 
+    gradient_reads = frozenset({"top"})
+
     def setup(self) -> None:
         """Read the sigmoid's scale."""
         self.beta: float = self.param.swish_param.beta
@@ -331,3 +331,8 @@ class Swish(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom."""
         return x * torch.sigmoid(self.beta * x)
+
+    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.gradient_in_place`."""
+        gate = torch.sigmoid(self.beta * bottom)
+        return diff * (self.beta * top * (1 - gate) + gate)

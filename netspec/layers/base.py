@@ -73,7 +73,7 @@ class Layer(torch.nn.Module):
     is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
     is_input: ClassVar[bool] = False  # its tops are given by the caller
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
-    gradient_reads: ClassVar[frozenset[str]] = frozenset()  # "bottom", "top": what Caffe's backward reads of the data
+    gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (the bottom's), "top": see netspec/in_place.py
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:

@@ -184,6 +184,7 @@ def test_clip_without_both_ends_is_refused(build) -> None:
         ('type: "Exp" exp_param { base: 2 scale: 3 shift: 1 }', lambda b, t: t * 3 * math.log(2)),
         ('type: "Log" log_param { base: 2 scale: 3 shift: 5 }', lambda b, t: 3 / math.log(2) / (3 * b + 5)),
         ('type: "BNLL"', lambda b, t: sigmoid(b)),
+        ('type: "Swish" swish_param { beta: 2 }', lambda b, t: 2 * t + sigmoid(2 * b) * (1 - 2 * t)),
         ('type: "Clip" clip_param { min: -0.5 max: 0.75 }', lambda b, t: (b >= -0.5) & (b <= 0.75)),
     ],
 )
