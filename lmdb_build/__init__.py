@@ -1,0 +1,1 @@
+"""The bridge: image sequences become labelled pairs, and pairs become databases for Data layers."""

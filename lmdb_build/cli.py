@@ -66,8 +66,10 @@ def _add_walk(parser: argparse.ArgumentParser) -> None:
 
 
 def _walk(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    if not 1 <= options.sequences <= 1000:
-        parser.error("--sequences must be 1 to 1000")
+    if options.seed < 0:
+        parser.error("--seed must be 0 or more")
+    if not 1 <= options.sequences <= 999:
+        parser.error("--sequences must be 1 to 999")
     for number in range(1, options.sequences + 1):
         walk = Walk(
             frames=options.frames,
@@ -118,10 +120,9 @@ def _add_pairs(parser: argparse.ArgumentParser) -> None:
     rule.add_argument("--negatives", choices=NEGATIVES, default="both", help="where negatives come from (both)")
     rule.add_argument("--clear-distance", type=float, metavar="M", help="negatives by pose only from so far apart")
     rule.add_argument("--clear-view-angle", type=float, metavar="DEG", help="or from viewing axes so far turned")
-    rule.add_argument(
-        "--same-scene", type=_names, action="append", default=[], metavar="A,B", help="they show one room"
-    )
-    rule.add_argument("--same-frame", type=_names, action="append", default=[], metavar="A,B", help="and share a frame")
+    sets = {"type": _names, "action": "append", "default": [], "metavar": "A,B"}
+    rule.add_argument("--same-scene", **sets, help="sequences of one room: no pair is made across them")
+    rule.add_argument("--same-frame", **sets, help="sequences whose poses share a frame: judged by pose across them")
     rule.add_argument("--different-scenes", action="store_true", help="all sequences else show different rooms")
     rule.add_argument("--max-difference", type=float, default=MAX_DIFFERENCE_S, help="image to pose, seconds (0.03)")
 

@@ -19,7 +19,7 @@ NEGATIVES = ("same_sequence", "cross_sequence", "both")
 
 NEIGHBOUR_S = 3.0  # images less than this apart are neighbours in time, hardly two visits of a place
 NEAR_FACTOR = 2.0  # a negative pair within this factor of the rule's limits shows much the same
-TOO_MANY = 0.1
+TOO_MANY = 0.2
 
 
 @dataclass(frozen=True)
