@@ -1,0 +1,208 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+from netspec.proto.schema import BlobProto, BlobShape, SolverState
+from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
+from netspec.solver.solver import Solver, load_solver
+from netspec.weights import load_weights
+
+GOLDEN = Path(__file__).parents[2] / "golden"
+STATES = sorted(path.relative_to(GOLDEN / "train") for path in GOLDEN.glob("train/*/*.solverstate"))
+
+
+@pytest.mark.parametrize("path", STATES, ids=lambda path: path.parent.name)
+def test_a_state_of_caffes_is_written_again_byte_for_byte(path: Path, tmp_path: Path):
+    write_state(tmp_path / "again.solverstate", read_state(GOLDEN / "train" / path))
+    assert (tmp_path / "again.solverstate").read_bytes() == (GOLDEN / "train" / path).read_bytes()
+
+
+def test_the_hdf5_form_has_caffes_structure(tmp_path: Path):
+    theirs = GOLDEN / "snapshot/h5_iter_10.solverstate.h5"
+    state = read_state(theirs)
+    assert (state.iteration, state.current_step) == (10, 0)
+    assert state.learned_net == "sgd_step/h5_iter_10.caffemodel.h5"
+    assert [array.shape for array in state.history][:3] == [(6, 1, 5, 5), (6,), (8, 6, 5, 5)]
+    write_state(tmp_path / "again.solverstate.h5", state)
+    assert _contents(tmp_path / "again.solverstate.h5") == _contents(theirs)
+
+
+def _contents(path: Path) -> dict[str, tuple]:
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(
+            lambda name, item: found.__setitem__(
+                name, (item.shape, item.dtype, item[()].tobytes()) if isinstance(item, h5py.Dataset) else ()
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize("ending", ["solverstate", "solverstate.h5"])
+def test_what_is_written_is_read(ending: str, tmp_path: Path):
+    history = [np.arange(6, dtype=np.float32).reshape(2, 3), np.float32([7, 8])]
+    write_state(tmp_path / f"x.{ending}", State(123, "somewhere/x.caffemodel", 4, history))
+    state = read_state(tmp_path / f"x.{ending}")
+    assert (state.iteration, state.learned_net, state.current_step) == (123, "somewhere/x.caffemodel", 4)
+    for read, written in zip(state.history, history, strict=True):
+        np.testing.assert_array_equal(read, written)
+
+
+def test_a_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "x.solverstate"
+    write_state(path, State(1, "", 0, []))
+    before = path.read_bytes()
+
+    def full(self: Path, data: bytes) -> int:
+        with self.open("wb") as file:
+            file.write(data[:3])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(SpecError, match=r"x\.solverstate: cannot be written: No space left on device"):
+        write_state(path, State(2, "", 0, []))
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_weights_are_looked_for_as_written_then_beside_the_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    Path("moved").mkdir()
+    state, path = State(1, "run/x.caffemodel", 0, []), Path("moved/x.solverstate")
+    with pytest.raises(SpecError, match=r"its weights are neither at run/x\.caffemodel nor at moved/x\.caffemodel"):
+        find_learned_net(state, path)
+    Path("moved/x.caffemodel").touch()
+    assert find_learned_net(state, path) == Path("moved/x.caffemodel")
+    Path("run").mkdir()
+    Path("run/x.caffemodel").touch()
+    assert find_learned_net(state, path) == Path("run/x.caffemodel")
+    assert find_learned_net(State(1, "", 0, []), path) is None
+
+
+def test_files_that_are_no_states(tmp_path: Path):
+    with pytest.raises(SpecError, match=r"nowhere\.solverstate: cannot be read"):
+        read_state(tmp_path / "nowhere.solverstate")
+    (tmp_path / "text.solverstate").write_text("a text, not a state\n" * 10)
+    with pytest.raises(SpecError, match="expected a binary SolverState"):
+        read_state(tmp_path / "text.solverstate")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file.create_dataset("iter", data=[1])
+    with pytest.raises(SpecError, match="the HDF5 file has no /current_step"):
+        read_state(tmp_path / "other.h5")
+    torn = SolverState(iter=1, history=[BlobProto(shape=BlobShape(dim=[2]), data=[1])])
+    (tmp_path / "torn.solverstate").write_bytes(torn.SerializeToString())
+    with pytest.raises(SpecError, match="history blob 0: found 1 numbers in data, expected 2"):
+        read_state(tmp_path / "torn.solverstate")
+
+
+# Caffe's own run with a snapshot at 40
+
+
+def _assert_weights(solver: Solver, path: str) -> None:
+    mine = {name: [blob.detach().clone() for blob in blobs] for name, blobs in solver.net.params.items()}
+    load_weights(solver.net, path)
+    for name, blobs in solver.net.params.items():
+        for found, expected in zip(mine[name], blobs, strict=True):
+            scale = expected.detach().abs().max().item()
+            torch.testing.assert_close(found, expected.detach(), rtol=0, atol=1e-3 * scale)
+
+
+def test_resume_from_caffes_state_ends_at_caffes_weights(work_in: Callable[..., Path]):
+    work_in("snapshot", "sgd_step")
+    solver = load_solver("sgd_step/solver.prototxt", snapshot="sgd_step/ref_iter_40.solverstate")
+    assert solver.iteration == 40
+    solver.step(20)
+    _assert_weights(solver, "sgd_step/resumed_from_40_iter_60.caffemodel")
+    theirs = read_state("sgd_step/resumed_from_40_iter_60.solverstate")
+    for mine, expected in zip(solver.history, theirs.history, strict=True):
+        torch.testing.assert_close(mine, torch.tensor(expected), rtol=0, atol=1e-2 * float(np.abs(expected).max()))
+    solver.close()
+
+
+def test_a_run_with_a_snapshot_is_caffes_run(work_in: Callable[..., Path]):
+    """Straight through to 60, with the snapshot at 40 on the way; then on from our snapshot as Caffe from its own."""
+    work_in("snapshot", "sgd_step")
+    state = read_state("sgd_step/ref_iter_40.solverstate")
+    solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel")
+    solver.step(60)
+    _assert_weights(solver, "sgd_step/straight_iter_60.caffemodel")
+    solver.restore("sgd_step/ref_iter_40.solverstate")
+    _assert_weights(solver, "sgd_step/ref_iter_40.caffemodel")
+    ours = read_state("sgd_step/ref_iter_40.solverstate")
+    assert (ours.iteration, ours.learned_net, ours.current_step) == (40, state.learned_net, state.current_step)
+    assert any(not np.array_equal(a, b) for a, b in zip(ours.history, state.history, strict=True)), (
+        "it was written anew"
+    )
+    solver.step(20)
+    _assert_weights(solver, "sgd_step/resumed_from_40_iter_60.caffemodel")
+    solver.close()
+
+
+def test_resume_from_caffes_hdf5_state(work_in: Callable[..., Path]):
+    work_in("snapshot", "sgd_step")
+    solver = load_solver("sgd_step/solver.prototxt", snapshot="sgd_step/h5_iter_10.solverstate.h5")
+    assert solver.iteration == 10
+    with h5py.File("sgd_step/h5_iter_10.caffemodel.h5") as file:
+        np.testing.assert_array_equal(solver.net.params["conv2_p"][0].detach().numpy(), file["data/conv2/0"][()])
+    np.testing.assert_array_equal(
+        solver.history[2].numpy(), read_state("sgd_step/h5_iter_10.solverstate.h5").history[2]
+    )
+    solver.close()
+
+
+@pytest.mark.parametrize("case", ["adam", "adadelta", "rmsprop"])
+@pytest.mark.parametrize("form", ["BINARYPROTO", "HDF5"])
+def test_a_solver_goes_on_from_its_own_snapshot_as_if_nothing_had_happened(
+    case: str, form: str, work_in: Callable[..., Path]
+):
+    """After 20 batches of 32 the 640 records begin again, in the run itself as in the resumed one."""
+    work_in(f"train/{case}")
+    with open(f"{case}/solver.prototxt", "a") as file:
+        file.write(f"snapshot_format: {form}\n")
+    solver = load_solver(f"{case}/solver.prototxt", weights=f"{case}/init.caffemodel")
+    solver.step(20)
+    _, state = solver.snapshot()
+    solver.step(5)
+    straight = [item.parameter.detach().clone() for item in solver.net.learnable]
+    solver.close()
+    again = load_solver(f"{case}/solver.prototxt", snapshot=state)
+    again.step(5)
+    for mine, item in zip(straight, again.net.learnable, strict=True):
+        assert torch.equal(mine, item.parameter)
+    again.close()
+
+
+def test_a_state_of_another_solver_type_or_net_is_refused_and_nothing_changes(work_in: Callable[..., Path]):
+    work_in("train/adam")
+    work_in("train/residual_bn_shared")
+    work_in("snapshot", "sgd_step")
+    solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel")
+    before = [item.parameter.detach().clone() for item in solver.net.learnable]
+    with pytest.raises(SpecError, match=r"found 16, expected 8 for this net and solver type SGD"):
+        solver.restore("adam/ref_iter_60.solverstate")
+    with pytest.raises(SpecError, match="incorrect length of history blobs"):
+        solver.restore("residual_bn_shared/ref_iter_60.solverstate")
+    state = read_state("sgd_step/ref_iter_40.solverstate")
+    state.history[4] = state.history[4].T
+    write_state("sgd_step/odd.solverstate", state)
+    with pytest.raises(SpecError, match=r"history blob 4 has shape \(128, 32\), expected \(32, 128\)"):
+        solver.restore("sgd_step/odd.solverstate")
+    assert solver.iteration == 0
+    for old, item in zip(before, solver.net.learnable, strict=True):
+        assert torch.equal(old, item.parameter)
+    solver.close()
+
+
+def test_old_four_axis_history_fits(work_in: Callable[..., Path]):
+    work_in("snapshot", "sgd_step")
+    state = read_state("sgd_step/ref_iter_40.solverstate")
+    old = [array.reshape((1,) * (4 - array.ndim) + array.shape) for array in state.history]
+    write_state("sgd_step/old.solverstate", State(40, state.learned_net, state.current_step, old))
+    solver = load_solver("sgd_step/solver.prototxt", snapshot="sgd_step/old.solverstate")
+    np.testing.assert_array_equal(solver.history[5].numpy(), state.history[5])
+    solver.close()
