@@ -1,6 +1,5 @@
 """Pairs that somebody listed: masks, folders, tables, single images."""
 
-import os
 from pathlib import Path
 
 import cv2
@@ -11,6 +10,7 @@ import scipy.io
 from lmdb_build.pair_sources import MaskSource, PlaceSource, folders_source, index_source, singles_source, table_source
 from lmdb_build.pairs import LEFT_OUT, NEGATIVE, POSITIVE, choose_pairs, split_by_group, split_by_time
 from loopclosure.errors import InputError
+from shared_data import shared
 
 
 def images(folder: Path, *names: str) -> Path:
@@ -24,13 +24,6 @@ def label(source: MaskSource | PlaceSource, first: str, second: str) -> int:
     a, b = (np.array([source.names.index(name)]) for name in (first, second))
     assert source.judge(a, b) == source.judge(b, a)
     return int(source.judge(a, b)[0])
-
-
-def shared(*parts: str) -> Path:
-    folder = Path(os.environ.get("NETSPEC_SHARED", Path(__file__).parents[3] / "shared")).joinpath("data", *parts)
-    if not folder.exists():
-        pytest.skip(f"{folder} is not here")
-    return folder
 
 
 class TestMask:
@@ -80,7 +73,7 @@ class TestMask:
         assert label(source, "run/2.png", "run/10.png") == POSITIVE
 
     def test_corridor_loop(self) -> None:
-        folder = shared("corridor_loop")
+        folder = shared("data", "corridor_loop")
         source = MaskSource(folder / "samples_GT.bmp", folder / "samples", folder)
         assert len(source.names) == 84
         assert len(source.positives()) == 228
@@ -196,10 +189,10 @@ class TestTables:
             table_source(table, tmp_path, "floor")
 
     def test_ie_tower_and_place_pairs(self) -> None:
-        folder = shared("ie_tower")
+        folder = shared("data", "ie_tower")
         source = table_source(folder / "positives.csv", folder, "floor", folder / "index.csv")
         assert (len(source.names), len(source.group_names), len(source.positives())) == (2877, 25, 656)
-        places = table_source(shared("place_pairs", "ESSEX3IN1", "pairs.csv"), shared("place_pairs"))
+        places = table_source(shared("data", "place_pairs", "ESSEX3IN1", "pairs.csv"), shared("data", "place_pairs"))
         assert (len(places.names), len(places.positives())) == (400, 200)
 
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import shared
 
 from loopclosure.baselines.methods import BagOfWordsMethod, FabMapMethod, ThumbnailMethod
 from loopclosure.baselines.word_model import WordModel
 from loopclosure.errors import InputError
 from loopclosure.methods import Setting, make_method, silent
+from shared_data import shared
 
 PLACES = 8
 WORDS = "words=200,lower_bound=0"

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 import scipy.io
-from conftest import shared
 from scipy.spatial.transform import Rotation
 
 from loopclosure.datasets import load_fabmap, load_folder, load_place_pairs, load_traverses, load_tum
 from loopclosure.errors import InputError
 from loopclosure.frames import Selection
 from loopclosure.truth import Exclusion
+from shared_data import shared
 
 
 def write_images(folder: Path, names, width=8, height=6):

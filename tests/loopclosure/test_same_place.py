@@ -1,8 +1,5 @@
 """The rule of the same place: its limits, and that one pair is judged as a whole matrix is."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,6 +13,7 @@ from loopclosure.same_place import (
     view_angles_deg,
 )
 from loopclosure.trajectory import Poses, read_tum_sequence
+from shared_data import shared
 
 ORIGIN = Poses(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
@@ -83,10 +81,7 @@ def test_the_rule_is_symmetric() -> None:
 
 
 def test_fr1_rpy_has_the_clear_negatives_its_readme_counts_and_xyz_none() -> None:
-    shared = Path(os.environ.get("NETSPEC_SHARED", Path(__file__).parents[3] / "shared"))
-    folder = shared / "data" / "tum_fr1"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is not here")
+    folder = shared("data", "tum_fr1")
     for name, clear in (("rpy", 20_101), ("xyz", 0)):
         poses = read_tum_sequence(folder / f"rgbd_dataset_freiburg1_{name}", 0.03).poses
         first, second = np.triu_indices(len(poses), 1)

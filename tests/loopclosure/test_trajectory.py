@@ -1,6 +1,5 @@
 """TUM RGB-D files: what they hold, and what a broken line says."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from loopclosure.trajectory import (
     write_groundtruth,
     write_rgb_list,
 )
+from shared_data import shared
 
 GOOD_POSE = "1.5 0.1 0.2 0.3 0 0 0 1"
 
@@ -135,10 +135,7 @@ def test_rotation_matrices_and_quaternions_agree() -> None:
 
 @pytest.mark.parametrize(("name", "posed", "listed"), [("xyz", 796, 798), ("rpy", 721, 723)])
 def test_tum_fr1_has_the_poses_its_readme_counts(name: str, posed: int, listed: int) -> None:
-    shared = Path(os.environ.get("NETSPEC_SHARED", Path(__file__).parents[3] / "shared"))
-    folder = shared / "data" / "tum_fr1" / f"rgbd_dataset_freiburg1_{name}"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is not here")
+    folder = shared("data", "tum_fr1", f"rgbd_dataset_freiburg1_{name}")
     sequence = read_tum_sequence(folder, max_difference=0.03)
     assert (len(sequence), len(sequence) + sequence.dropped) == (posed, listed)
     np.testing.assert_allclose(np.linalg.norm(sequence.quaternions, axis=1), 1, atol=1e-12)

@@ -4,39 +4,24 @@ import json
 from pathlib import Path
 
 import pytest
-from conftest import shared
 
 from netspec.check import as_json, check_file, is_solver
 from netspec.proto.text import parse_net, parse_solver
+from shared_data import SHARED
 
-ROOT = Path(__file__).parents[2]
-
-
-def corpus() -> Path:
-    return shared("corpus")
-
-
-def names(ending: str) -> list[str]:
-    try:
-        root = corpus()
-    except pytest.skip.Exception:
-        return ["absent"]
-    return sorted(
-        str(path.relative_to(root))
-        for path in root.rglob("*.prototxt")
-        if ("solver" in path.name) == (ending == "solver")
-    )
+CORPUS = SHARED / "corpus"
+FILES = sorted(str(path.relative_to(CORPUS)) for path in CORPUS.rglob("*.prototxt"))  # none where it is absent
+SOLVERS = [name for name in FILES if "solver" in Path(name).name]
 
 
-@pytest.mark.parametrize("name", names("net"))
+@pytest.mark.parametrize("name", [name for name in FILES if name not in SOLVERS])
 def test_net_builds_with_caffes_shapes(name: str) -> None:
-    root = corpus()
-    expected = json.loads((root / "shapes.json").read_text()).get(name)
-    assert not is_solver(root / name)
+    expected = json.loads((CORPUS / "shapes.json").read_text()).get(name)
+    assert not is_solver(CORPUS / name)
     if expected is None:
-        parse_net(root / name)
+        parse_net(CORPUS / name)
         return
-    (checked,) = check_file(root / name, phase=1)
+    (checked,) = check_file(CORPUS / name, phase=1)
     assert not checked.faults
     assert checked.net is not None
     found = as_json(checked.net)
@@ -44,7 +29,7 @@ def test_net_builds_with_caffes_shapes(name: str) -> None:
         assert found[part] == expected[part], part
 
 
-@pytest.mark.parametrize("name", names("solver"))
+@pytest.mark.parametrize("name", SOLVERS)
 def test_solver_parses(name: str) -> None:
-    assert is_solver(corpus() / name)
-    parse_solver(corpus() / name)
+    assert is_solver(CORPUS / name)
+    parse_solver(CORPUS / name)

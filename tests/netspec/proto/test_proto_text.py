@@ -1,7 +1,6 @@
 """Text is read as protobuf reads it, and written as Caffe prints it."""
 
 import itertools
-import os
 import random
 import re
 import string
@@ -24,9 +23,9 @@ from netspec.proto.schema import (
     fields_of,
 )
 from netspec.proto.text import parse_net, parse_net_text, parse_solver, read_net, read_solver, write_text
+from shared_data import SHARED
 
 GOLDEN = Path(__file__).parents[2] / "golden"
-SHARED = Path(os.environ.get("NETSPEC_SHARED", Path(__file__).parents[4] / "shared"))
 
 
 def read(text: str, message: Any = None) -> Any:
@@ -265,8 +264,7 @@ def test_damaged_text_is_refused_or_read_alike(seed: int) -> None:
 
 
 def prototxts() -> list[Path]:
-    public = sorted((SHARED / "corpus").rglob("*.prototxt")) if (SHARED / "corpus").is_dir() else []
-    return [*sorted(GOLDEN.rglob("*.prototxt")), *public]
+    return [*sorted(GOLDEN.rglob("*.prototxt")), *sorted((SHARED / "corpus").rglob("*.prototxt"))]
 
 
 @pytest.mark.parametrize("path", prototxts(), ids=lambda path: "/".join(path.parts[-3:]))
