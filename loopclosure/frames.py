@@ -104,9 +104,14 @@ def image_paths(source: str | Path) -> list[Path]:
 
 def read_image(path: str | Path) -> np.ndarray:
     """Read an image (H, W, 3) uint8, BGR; InputError where it cannot be read."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    # Read by Python, decoded by OpenCV: imread prints a warning of its own for a missing file.
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"no such image ({error.strerror})", path) from None
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if image is None:
-        raise InputError("is not an image that can be read" if Path(path).is_file() else "no such image", path)
+        raise InputError("is not an image that can be read", path)
     return image
 
 

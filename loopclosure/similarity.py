@@ -8,12 +8,15 @@ the norm in float32, which only concerns frames that are almost the same.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from loopclosure.errors import InputError
+from loopclosure.methods import Progress, silent
 from loopclosure.truth import Exclusion
 
 METRICS = ("euclidean", "cosine")
@@ -156,6 +159,40 @@ def top_k(
                 _mask_not_earlier(block, rows, columns, exclusion, stamps)
             _merge(indices[rows], scores[rows], block, left)
     return TopK(indices, scores)
+
+
+def write_similarity(
+    path: str | Path,
+    queries: np.ndarray,
+    references: np.ndarray | None = None,
+    metric: str = "euclidean",
+    progress: Progress = silent,
+) -> tuple[int, int]:
+    """Write all scores (Q, R) as an .npy of float32, block by block, whatever their number; return its shape."""
+    shape = (len(queries), len(queries) if references is None else len(references))
+    try:
+        matrix = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+    blocks = similarity_blocks(queries, references, metric)
+    for start, block in progress(blocks, "similarity", -(-shape[0] // BLOCK_ROWS)):
+        matrix[start : start + len(block)] = block
+    matrix.flush()
+    return shape
+
+
+def write_top_k(path: str | Path, found: TopK) -> None:
+    """Write the best references of each query as CSV: query, rank from 1, reference, score."""
+    try:
+        with Path(path).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["query", "rank", "reference", "score"])
+            for query, (indices, scores) in enumerate(zip(found.indices, found.scores, strict=True)):
+                for rank, (reference, score) in enumerate(zip(indices, scores, strict=True), start=1):
+                    if reference >= 0:
+                        writer.writerow([query, rank, reference, f"{score:.9g}"])
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
 
 
 def _pair(queries: np.ndarray, references: np.ndarray | None, metric: str) -> tuple[Descriptors, Descriptors]:
