@@ -24,6 +24,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         unfinished.replace(path)
     except OSError as fault:
-        raise SpecError(f"cannot be written: {fault.strerror or fault}", Where(str(path))) from None
+        reason = os.strerror(fault.errno) if fault.errno else fault  # h5py's own text is a paragraph
+        raise SpecError(f"cannot be written: {reason}", Where(str(path))) from None
     finally:
         unfinished.unlink(missing_ok=True)

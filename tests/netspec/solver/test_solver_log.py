@@ -40,7 +40,7 @@ def caffes_lines(name: str) -> list[str]:
 
 
 def masked(lines: list[str]) -> list[str]:
-    """Site and sentence, without what a clock says; without the lines of the command line and of Caffe's data threads."""
+    """Site and sentence, without what a clock says, nor the lines of the command line and of Caffe's data threads."""
     out = []
     for line in lines:
         match = PREFIX.fullmatch(line)
