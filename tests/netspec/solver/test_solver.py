@@ -1,0 +1,292 @@
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+from netspec.proto.schema import NetParameter
+from netspec.solver.snapshot import read_state
+from netspec.solver.solver import Solver, load_solver
+from netspec.weights import save_weights
+
+NET = """
+name: "tiny"
+layer { name: "data" type: "DummyData" top: "data" top: "label" dummy_data_param {
+  shape { dim: 4 dim: 3 } shape { dim: 4 dim: 2 } data_filler { type: "gaussian" std: 1 } data_filler { value: 1 } } }
+layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" param { lr_mult: 1 } param { lr_mult: 2 }
+  inner_product_param { num_output: 2 weight_filler { type: "gaussian" std: 1 } } }
+layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "label" top: "loss" }
+"""
+SETTINGS = 'net: "net.prototxt"\nbase_lr: 0.1\nlr_policy: "fixed"\nsolver_mode: CPU\nrandom_seed: 3\n'
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Solver]:
+    """Return a function that makes a solver of the tiny net, with more settings."""
+    monkeypatch.chdir(tmp_path)
+    Path("net.prototxt").write_text(NET)
+
+    def solver_of(more: str = "", settings: str = SETTINGS, net: str = NET, **arguments) -> Solver:
+        Path("net.prototxt").write_text(net)
+        Path("s.prototxt").write_text(settings + more)
+        return load_solver("s.prototxt", **arguments)
+
+    return solver_of
+
+
+def weights(solver: Solver) -> list[torch.Tensor]:
+    return [item.parameter.detach().clone() for item in solver.net.learnable]
+
+
+# When it tests
+
+
+def seen_tests(solver: Solver, run: Callable[[], None]) -> list[tuple[int, int]]:
+    """The (iteration, test net) of each test of a run."""
+    found: list[tuple[int, int]] = []
+    solver.on_test = lambda i: found.append((solver.iteration, i))
+    run()
+    return found
+
+
+def test_it_tests_before_the_update_and_once_more_at_the_end(make):
+    solver = make("test_iter: 1 test_iter: 1 test_interval: 2 max_iter: 4 snapshot_after_train: false")
+    assert seen_tests(solver, solver.solve) == [(0, 0), (0, 1), (2, 0), (2, 1), (4, 0), (4, 1)]
+
+
+def test_without_test_initialization_the_first_test_comes_later(make):
+    solver = make("test_iter: 1 test_interval: 2 max_iter: 3 test_initialization: false snapshot_after_train: false")
+    assert seen_tests(solver, solver.solve) == [(2, 0)]
+
+
+def test_a_test_is_the_mean_over_its_batches_with_the_present_weights(make):
+    solver = make("test_iter: 3 test_interval: 5", net=NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data"))
+    solver.step(1)
+    before = solver.scores
+    assert list(before[0]) == ["loss"]
+    solver.test_all()
+    with torch.no_grad():
+        assert solver.scores[0]["loss"] == pytest.approx([solver.net.forward_loss()[0].item()], rel=1e-5)
+    assert solver.scores[0]["loss"][0] < before[0]["loss"][0]
+
+
+def test_test_compute_loss_prints_the_mean_loss(make, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level(logging.INFO, "netspec"):
+        solver = make("test_iter: 2 test_interval: 5 test_compute_loss: true")
+        solver.test_all()
+    shown = [record.getMessage() for record in caplog.records if record.getMessage().startswith("Test loss: ")]
+    assert [float(line.split()[-1]) for line in shown] == pytest.approx(solver.scores[0]["loss"], rel=1e-4)
+
+
+# What the loss is
+
+
+def test_the_loss_is_a_mean_over_a_window_that_begins_anew_with_each_step(make):
+    solver = make("average_loss: 2", net=NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data"))
+    single = make("", net=NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data"))
+    raw, shown = [], []
+    single.on_iteration = lambda: raw.append(single.loss)
+    solver.on_iteration = lambda: shown.append(solver.loss)
+    single.step(5)
+    solver.step(3)
+    solver.step(2)
+    assert shown == pytest.approx([raw[0], (raw[0] + raw[1]) / 2, (raw[1] + raw[2]) / 2, raw[3], (raw[3] + raw[4]) / 2])
+
+
+def test_iter_size_takes_the_mean_of_its_passes(make):
+    fixed = NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data")
+    once, thrice = make("", net=fixed), make("iter_size: 3", net=fixed)
+    once.step(4)
+    thrice.step(4)
+    assert thrice.loss == pytest.approx(once.loss, rel=1e-5)
+    torch.testing.assert_close(weights(thrice), weights(once))
+
+
+# What moves
+
+
+def test_a_parameter_without_a_rate_stays_whatever_the_decay(make):
+    solver = make("weight_decay: 0.5 momentum: 0.9", net=NET.replace("lr_mult: 2", "lr_mult: 0 decay_mult: 1"))
+    solver.net.params["ip"][1].data.fill_(1)
+    before = weights(solver)
+    solver.step(3)
+    after = weights(solver)
+    assert not torch.equal(before[0], after[0])
+    assert torch.equal(before[1], after[1])
+
+
+def test_after_a_step_the_gradients_hold_what_was_subtracted(make):
+    solver = make("momentum: 0.9 snapshot_diff: true")
+    solver.step(1)
+    before = weights(solver)
+    solver.step(1)
+    for old, item in zip(before, solver.net.learnable, strict=True):
+        torch.testing.assert_close(old - item.parameter.detach(), item.parameter.grad)
+    model, _ = solver.snapshot()
+    layer = NetParameter.FromString(Path(model).read_bytes()).layer[1]
+    grad = solver.net.params["ip"][0].grad
+    assert grad is not None
+    np.testing.assert_array_equal(np.array(layer.blobs[0].diff, np.float32), grad.numpy().ravel())
+
+
+def test_the_seed_decides_everything(make):
+    first, second, third = make(), make(), make(settings=SETTINGS.replace("seed: 3", "seed: 4"))
+    for solver in (first, second, third):
+        solver.step(3)
+    assert torch.equal(weights(first)[0], weights(second)[0])
+    assert not torch.equal(weights(first)[0], weights(third)[0])
+
+
+def test_the_learning_rate_is_that_of_the_iteration_to_come(make):
+    settings = SETTINGS.replace('"fixed"', '"step" stepsize: 2 gamma: 0.5')
+    solver = make(settings=settings)
+    rates = []
+    for _ in range(4):
+        rates.append(solver.learning_rate)
+        solver.step(1)
+    assert rates == pytest.approx([0.1, 0.1, 0.05, 0.05])
+
+
+# Snapshots and requests
+
+
+def files() -> list[str]:
+    return sorted(path.name for path in Path().glob("*_iter_*"))
+
+
+def test_snapshots_come_at_their_interval_and_after_training(make):
+    solver = make("snapshot: 2 max_iter: 5")
+    solver.solve()
+    assert files() == [f"s_iter_{n}.{kind}" for n in (2, 4, 5) for kind in ("caffemodel", "solverstate")]
+    assert read_state("s_iter_4.solverstate").iteration == 4
+    assert read_state("s_iter_4.solverstate").learned_net == "s_iter_4.caffemodel"
+
+
+def test_the_last_iteration_has_one_snapshot(make, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level(logging.INFO, "netspec"):
+        make('snapshot: 2 max_iter: 4 snapshot_format: HDF5 snapshot_prefix: "p"').solve()
+    assert files() == [f"p_iter_{n}.{kind}.h5" for n in (2, 4) for kind in ("caffemodel", "solverstate")]
+    assert caplog.text.count("Snapshotting to HDF5 file p_iter_4.caffemodel.h5") == 1
+
+
+def test_snapshot_after_train_can_be_turned_off(make):
+    make("max_iter: 1 snapshot_after_train: false").solve()
+    assert files() == []
+
+
+def test_a_stop_is_obeyed_after_the_iteration_and_leaves_a_snapshot(make, caplog: pytest.LogCaptureFixture):
+    asked = iter([None, "snapshot", "stop"])
+    solver = make("max_iter: 9 test_iter: 1 test_interval: 100 test_initialization: false", action=lambda: next(asked))
+    with caplog.at_level(logging.INFO, "netspec"):
+        solver.solve()
+    assert solver.iteration == 3
+    assert solver.stopped
+    assert files() == [f"s_iter_{n}.{kind}" for n in (2, 3) for kind in ("caffemodel", "solverstate")]
+    assert "Optimization stopped early." in caplog.text
+    assert "Optimization Done." not in caplog.text
+
+
+def test_a_stop_is_obeyed_within_a_test(make, caplog: pytest.LogCaptureFixture):
+    asked = iter([None, "snapshot", "stop", None])
+    solver = make("max_iter: 9 test_iter: 5 test_interval: 3", action=lambda: next(asked))
+    with caplog.at_level(logging.INFO, "netspec"):
+        solver.step(9)
+    assert solver.iteration == 0
+    assert solver.stopped
+    assert files() == ["s_iter_0.caffemodel", "s_iter_0.solverstate"]
+    assert "Test interrupted." in caplog.text
+
+
+def test_after_a_stop_one_may_go_on(make):
+    asked = iter(["stop"])
+    solver = make("max_iter: 3 snapshot_after_train: false", action=lambda: next(asked, None))
+    solver.solve()
+    assert (solver.iteration, solver.stopped) == (1, True)
+    solver.solve()
+    assert (solver.iteration, solver.stopped) == (3, False)
+
+
+# Weights to start from
+
+
+def test_several_weights_are_loaded_one_after_the_other(make, caplog: pytest.LogCaptureFixture):
+    solver = make()
+    for name, value in (("a.caffemodel", 1.0), ("b.caffemodel", 2.0)):
+        for item in solver.net.learnable:
+            item.parameter.data.fill_(value)
+        save_weights(solver.net, name)
+    with caplog.at_level(logging.INFO, "netspec"):
+        again = make('weights: "a.caffemodel, b.caffemodel"')
+    assert "Finetuning from b.caffemodel" in caplog.text
+    assert set(weights(again)[0].flatten().tolist()) == {2.0}
+    given = make('weights: "b.caffemodel"', weights=["b.caffemodel", Path("a.caffemodel")])
+    assert set(weights(given)[0].flatten().tolist()) == {1.0}
+
+
+def test_weights_and_a_snapshot_exclude_each_other(make):
+    with pytest.raises(SpecError, match="not both"):
+        make(weights="a.caffemodel", snapshot="a.solverstate")
+
+
+# What is refused before the first iteration
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            'base_lr: 0.1\nlr_policy: "fixed"',
+            r"^s\.prototxt: the solver names no net to train, expected exactly one of net",
+        ),
+        (SETTINGS.replace('"fixed"', '"stp"'), r'^s\.prototxt:3:1: unknown lr_policy "stp"'),
+        (SETTINGS + 'type: "Adan"', r'^s\.prototxt:6:1: unknown solver type "Adan"'),
+        (
+            SETTINGS + 'regularization_type: "L3"',
+            r'^s\.prototxt:6:1: unknown regularization_type "L3", expected L2 or L1',
+        ),
+        (SETTINGS + "average_loss: 0", r"^s\.prototxt:6:1: found average_loss 0, expected at least 1"),
+        (SETTINGS + "iter_size: 0", r"^s\.prototxt:6:1: found iter_size 0, expected at least 1"),
+        (SETTINGS + "max_iter: -1", r"^s\.prototxt:6:1: found max_iter -1, expected at least 0"),
+        (SETTINGS + "test_iter: 1\ntest_iter: -1", r"^s\.prototxt:7:1: found test_iter -1, expected at least 0"),
+        (SETTINGS + 'snapshot: 1 snapshot_prefix: ""', r"snapshot is given but snapshot_prefix is not"),
+        (
+            SETTINGS + 'snapshot: 1\nsnapshot_prefix: "gone/p"',
+            r'^s\.prototxt:7:1: cannot write to snapshot prefix "gone/p"',
+        ),
+        (SETTINGS + 'weights: "gone.caffemodel"', r"^gone\.caffemodel: cannot be read: No such file"),
+    ],
+)
+def test_faults_are_found_before_the_first_iteration(settings: str, message: str, make):
+    with pytest.raises(SpecError, match=message):
+        make(settings=settings)
+
+
+def test_a_prefix_for_the_last_snapshot_is_tried_before_training(make):
+    solver = make('max_iter: 5 snapshot_prefix: "gone/p"')
+    with pytest.raises(SpecError, match=r'cannot write to snapshot prefix "gone/p": No such file or directory'):
+        solver.solve()
+    assert solver.iteration == 0
+
+
+def test_the_probe_leaves_nothing_behind(make):
+    make("snapshot: 1")
+    assert sorted(path.name for path in Path().iterdir()) == ["net.prototxt", "s.prototxt"]
+
+
+def test_gpu_mode_without_a_gpu_runs_on_the_cpu_and_warns_once(make, monkeypatch, caplog: pytest.LogCaptureFixture):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with caplog.at_level(logging.WARNING, "netspec"):
+        solver = make(settings=SETTINGS.replace("CPU", "GPU"))
+        solver.step(1)
+    assert solver.net.device.type == "cpu"
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert warnings == ["s.prototxt:4:1: solver_mode GPU, but torch finds no GPU here: running on the CPU"]
+
+
+def test_a_gpu_that_is_not_there_is_refused(make, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(SpecError, match=r"^s\.prototxt:6:1: found device_id 3, but torch finds 1 GPU\(s\) here"):
+        make("device_id: 3", settings=SETTINGS.replace("CPU", "GPU"))
