@@ -86,6 +86,7 @@ def evaluate(
 def judge(name: str, method: Method, data: DataSet, train_images: list[Path], progress: Progress = silent) -> Outcome:
     """Run one method and judge what it says."""
     result = method.score(data.query_images, data.reference_images, train_images, progress)
+    pairs = all_pairs(result.scores, data.truth)
     silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
     notes = list(result.notes)
     if silent_pairs:
@@ -94,7 +95,7 @@ def judge(name: str, method: Method, data: DataSet, train_images: list[Path], pr
     return Outcome(
         name=name,
         scores=result.scores,
-        pairs=all_pairs(result.scores, data.truth),
+        pairs=pairs,
         best=best_match(result.scores, data.truth),
         matches=best_matches(result.scores, data.truth),
         recall_at=recall_at_k(result.scores, data.truth, RECALL_AT),

@@ -142,8 +142,7 @@ def best_true_references(outcome: Outcome, truth: Truth, queries: np.ndarray) ->
 
 def _draw_matrix(axis: Axes, values: np.ndarray, colours: Colormap, low: float, high: float) -> None:
     rows, columns = values.shape
-    colours = colours.copy()
-    colours.set_bad(NOT_JUDGED)
+    colours = colours.with_extremes(bad=NOT_JUDGED)
     shown = _greatest_of_blocks(values, -(-max(rows, columns) // SHOWN_CELLS))
     axis.imshow(
         shown,
@@ -171,7 +170,8 @@ def _draw_curve(axis: Axes, curve: PrecisionRecall, name: str, number: int) -> N
     """Draw the steps whose area is the average precision, and a dot where precision leaves 1."""
     colour = COLOURS[number % len(COLOURS)]
     line = "-" if number < len(COLOURS) else "--"
-    recall, precision = np.insert(curve.recall, 0, 0.0), np.insert(curve.precision, 0, curve.precision[:1])
+    recall, precision = np.append(0.0, curve.recall), np.append(curve.precision[:1], curve.precision)
+    recall = recall[: len(precision)]  # a method that says nothing has no point
     area = f"{curve.average_precision:.3f}"
     axis.plot(recall, precision, line, color=colour, linewidth=1.3, label=f"{area}  {name}", drawstyle="steps-pre")
     if curve.recall_at_full_precision > 0:
