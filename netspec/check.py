@@ -66,11 +66,13 @@ def check_file(
     """Check a net for a phase, level and stages, or all nets of a solver."""
     given = shapes or {}
     if is_solver(path):
+        from netspec.solver.checks import check_settings
         from netspec.solver.nets import solver_nets, with_train_state
 
         solver, node = parse_solver(path)
         described = solver_nets(with_train_state(solver, level, stages), node)
         checked = [check_net(part.net, part.source, part.label, given, allow_python) for part in described]
+        check_settings(solver, node, checked[0].faults.append)
         if not any(part.faults for part in checked):
             checked[0].advice.extend(solver_advice(solver, node, [part.net for part in checked]))
         return checked
