@@ -29,10 +29,10 @@ from netspec.weights import load_weights, save_weights
 
 Scores = dict[str, list[float]]
 _CREATING = {
-    "net": "solver.cpp:102",
-    "net_param": "solver.cpp:97",
-    "train_net": "solver.cpp:92",
-    "train_net_param": "solver.cpp:88",
+    "net": ("solver.cpp:102", "Creating training net from {}"),
+    "net_param": ("solver.cpp:97", "Creating training net specified in {}."),
+    "train_net": ("solver.cpp:92", "Creating training net from {}"),
+    "train_net_param": ("solver.cpp:88", "Creating training net specified in {}."),
 }
 
 
@@ -132,13 +132,12 @@ class Solver:
         self._device = device or choose_device(param, node)
         self._allow_python = allow_python
 
-        train = nets.train_net(param, node)
-        field = train.origin.split()[0]
-        how = "from" if "file:" in train.origin else "specified in"
-        log.info(_CREATING[field], f"Creating training net {how} {train.origin}" + ("" if how == "from" else "."))
+        train, *tests = nets.solver_nets(param, node)
+        site, sentence = _CREATING[train.origin.split()[0]]
+        log.info(site, sentence.format(train.origin))
         self.net = self._build(train, 0)
         self.test_nets: list[Net] = []
-        for i, test in enumerate(nets.test_nets(param, node)):
+        for i, test in enumerate(tests):
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
             self.test_nets.append(self._build(test, 1 + i))
         log.info("solver.cpp:57", "Solver scaffolding done.")
