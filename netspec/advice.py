@@ -13,6 +13,21 @@ from netspec.proto.source_map import Node
 
 LMDB = 1  # caffe.proto: DataParameter.DB
 FAR = 0.1  # of the records may be missed, or met twice, by a test
+#: What of the settings of a rate policy, and of an update rule, each reads.
+POLICY_SETTINGS = {
+    "step": ("gamma", "stepsize"),
+    "exp": ("gamma",),
+    "inv": ("gamma", "power"),
+    "multistep": ("gamma", "stepvalue"),
+    "poly": ("power",),
+    "sigmoid": ("gamma", "stepsize"),
+}
+RULE_SETTINGS = {
+    "adagrad": ("delta",),
+    "rmsprop": ("delta", "rms_decay"),
+    "adadelta": ("delta",),
+    "adam": ("delta", "momentum2"),
+}
 
 
 def net_advice(net: Net) -> Iterator[str]:
@@ -29,8 +44,19 @@ def solver_advice(solver: Any, node: Node, nets: list[Net]) -> Iterator[str]:
         yield f"{node.find('snapshot')}: snapshot {solver.snapshot} never fires in max_iter {solver.max_iter}"
     elif not solver.snapshot and not solver.snapshot_after_train:
         yield f"{node.where}: no snapshot is ever taken; set snapshot, or snapshot_after_train: true"
+    for name in _settings_without_effect(solver):
+        yield f"{node.find(name)}: {name} has no effect with type {solver.type} and lr_policy {solver.lr_policy}"
     for k, net in enumerate(nets[1:]):
         yield from _test_size(solver.test_iter[k], node.find("test_iter", k), net)
+
+
+def _settings_without_effect(solver: Any) -> Iterator[str]:
+    for table, chosen in ((POLICY_SETTINGS, solver.lr_policy), (RULE_SETTINGS, solver.type.lower())):
+        used = table.get(chosen, ())
+        for name in dict.fromkeys(name for names in table.values() for name in names):
+            given = len(getattr(solver, name)) if name == "stepvalue" else solver.HasField(name)
+            if given and name not in used:
+                yield name
 
 
 def missing_data(net: Any, kept: Any, source: Any) -> Iterator[str]:

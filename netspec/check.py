@@ -19,10 +19,13 @@ from netspec.proto.text import parse_net, parse_solver
 
 @dataclass
 class Checked:
-    """One net of the file: ``label`` says which; ``advice`` is about what is legal but likely wrong."""
+    """One net of the file: ``label`` says which; ``advice`` is about what is legal but likely wrong.
+
+    A solver whose settings are faulty comes first, under its own path and without a net.
+    """
 
     label: str
-    net: Net
+    net: Net | None
     faults: list[SpecError] = field(default_factory=list)
     advice: list[str] = field(default_factory=list)
 
@@ -66,18 +69,32 @@ def check_file(
     """Check a net for a phase, level and stages, or all nets of a solver."""
     given = shapes or {}
     if is_solver(path):
-        from netspec.solver.checks import check_settings
-        from netspec.solver.nets import solver_nets, with_train_state
-
-        solver, node = parse_solver(path)
-        described = solver_nets(with_train_state(solver, level, stages), node)
-        checked = [check_net(part.net, part.source, part.label, given, allow_python) for part in described]
-        check_settings(solver, node, checked[0].faults.append)
-        if not any(part.faults for part in checked):
-            checked[0].advice.extend(solver_advice(solver, node, [part.net for part in checked]))
-        return checked
+        return _check_solver(path, level, stages, given, allow_python)
     net, source = parse_net(path)
     return [check_net(with_state(net, phase, level, stages), source, str(path), given, allow_python)]
+
+
+def _check_solver(
+    path: str | Path, level: int, stages: Iterable[str], shapes: Mapping[str, Shape], allow_python: bool
+) -> list[Checked]:
+    from netspec.solver.checks import check_settings
+    from netspec.solver.nets import solver_nets, with_train_state
+
+    solver, node = parse_solver(path)
+    faults: list[SpecError] = []
+    check_settings(solver, node, faults.append)
+    try:
+        described = solver_nets(with_train_state(solver, level, stages), node)
+    except SpecError as fault:
+        faults.append(fault)
+        described = []
+    checked = [check_net(part.net, part.source, part.label, shapes, allow_python) for part in described]
+    if faults:
+        return [Checked(str(path), None, faults), *checked]
+    nets = [part.net for part in checked if part.net is not None and not part.faults]
+    if len(nets) == len(checked):
+        checked[0].advice.extend(solver_advice(solver, node, nets))
+    return checked
 
 
 def as_json(net: Net) -> dict[str, Any]:

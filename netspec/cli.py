@@ -41,7 +41,7 @@ def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
     """Parse a command line, run the command's ``run``, and turn a fault of the user's files into one line."""
     arguments = parser.parse_args([_gflag(word) for word in words])
     try:
-        with _logging():
+        with _logging(arguments.warnings_only):
             return arguments.run(arguments) or 0
     except SpecError as fault:
         print(fault, file=sys.stderr)
@@ -49,6 +49,8 @@ def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
 
 
 def _gflag(word: str) -> str:
@@ -57,19 +59,43 @@ def _gflag(word: str) -> str:
 
 
 class _logging:
-    """Caffe's log on stderr, around the progress bar where there is one."""
+    """Caffe's log on stderr, around the progress bar where there is one; or of it the warnings, without its prefix.
+
+    A warning is shown once, though a solver's nets may each have it.
+    """
+
+    def __init__(self, warnings_only: bool) -> None:
+        self.level = logging.WARNING if warnings_only else logging.INFO
+        self.handler = logging.StreamHandler(_BarAware())
+        self.handler.setFormatter(logging.Formatter("warning: %(message)s") if warnings_only else log.GlogFormatter())
+        self.handler.addFilter(_WarnOnce())
 
     def __enter__(self) -> None:
-        self.handler = logging.StreamHandler(_BarAware())
-        self.handler.setFormatter(log.GlogFormatter())
         log.logger.addHandler(self.handler)
         self.before = log.logger.level, log.logger.propagate
-        log.logger.setLevel(logging.INFO)
+        log.logger.setLevel(self.level)
         log.logger.propagate = False
 
     def __exit__(self, *_: object) -> None:
         log.logger.removeHandler(self.handler)
-        log.logger.level, log.logger.propagate = self.before
+        level, log.logger.propagate = self.before
+        log.logger.setLevel(level)
+
+
+class _WarnOnce(logging.Filter):
+    """Lets each warning pass the first time only."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        message = record.getMessage()
+        if record.levelno != logging.WARNING:
+            return True
+        new = message not in self.seen
+        self.seen.add(message)
+        return new
 
 
 class _BarAware:
@@ -96,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
         name: str, function: Callable[[argparse.Namespace], int | None], summary: str
     ) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
-        added.set_defaults(run=function)
+        added.set_defaults(run=function, warnings_only=False)
         return added
 
     p = command("train", _train, "train or fine-tune a model (caffe train)")
@@ -126,6 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_python(p)
 
     p = command("check", _check, "build a net, or a solver's nets, without opening data; report every fault")
+    p.set_defaults(warnings_only=True)
     p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
     _add_state(p, phase="TEST")
     p.add_argument(
@@ -320,7 +347,6 @@ def _time(arguments: argparse.Namespace) -> None:
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.check import as_json, check_file, table
 
-    log.logger.setLevel(logging.WARNING)
     shapes = dict(arguments.shape)
     checked = check_file(
         arguments.file,
@@ -336,12 +362,13 @@ def _check(arguments: argparse.Namespace) -> int:
     if faults:
         print("\n".join(faults), file=sys.stderr)
         return 1
+    nets = [(part.label, part.net) for part in checked if part.net is not None]
     if arguments.json:
-        found = {part.label: as_json(part.net) for part in checked}
+        found = {label: as_json(net) for label, net in nets}
         print(json.dumps(next(iter(found.values())) if len(found) == 1 else found))
         return 0
-    for part in checked:
-        print(f"{part.label}: {part.net.name or 'a net without a name'}\n{table(part.net)}\n")
+    for label, net in nets:
+        print(f"{label}: {net.name or 'a net without a name'}\n{table(net)}\n")
     return 0
 
 

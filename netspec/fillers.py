@@ -91,6 +91,16 @@ _FILLERS: dict[str, Callable[[Any, Shape, torch.Generator], torch.Tensor]] = {
     "msra": _msra,
     "bilinear": _bilinear,
 }
+#: The fields of FillerParameter, besides ``type``, that mean something to each filler.
+READS: dict[str, tuple[str, ...]] = {
+    "constant": ("value",),
+    "uniform": ("min", "max"),
+    "gaussian": ("mean", "std", "sparse"),
+    "positive_unitball": (),
+    "xavier": ("variance_norm",),
+    "msra": ("variance_norm",),
+    "bilinear": (),
+}
 
 
 def _first_axis(filler: Any, shape: Shape) -> int:

@@ -28,6 +28,7 @@ from netspec.layers.base import Context, Layer, Random, Shape
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
+from netspec.unused import unused_fields
 
 Array = np.ndarray | torch.Tensor
 PHASES = {"TRAIN": 0, "TEST": 1}
@@ -92,7 +93,13 @@ def build_net(net: Any, source: SourceMap, options: BuildOptions | None = None) 
     if log.logger.isEnabledFor(logging.INFO):
         log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered))
     split, source = insert_splits(filtered, source, options.report)
-    return Net(make_plan(split, source, options.report), options)
+    built = Net(make_plan(split, source, options.report), options)
+    written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
+    if written.layer:  # weights in the prototxt itself
+        from netspec.weights import copy_weights
+
+        copy_weights(built, written, source.file)
+    return built
 
 
 class Net(torch.nn.Module):
@@ -240,6 +247,8 @@ class Net(torch.nn.Module):
         for name in self.plan.outputs:
             log.info("net.cpp:244", f"This network produces output {name}")
         log.info("net.cpp:257", "Network initialization done.")
+        for line in unused_fields(self.plan, layers):
+            log.warning("net.cpp:257", line)
 
     # Running
 

@@ -31,7 +31,18 @@ def load_weights(net: Net, path: str | Path) -> None:
     Raises SpecError for a file that cannot be read, and for blobs of other number or shape than the net's.
     """
     path = Path(path)
-    copies = _from_hdf5(net, path) if h5py.is_hdf5(path) else _from_binary(net, path)
+    if h5py.is_hdf5(path):
+        _copy(_from_hdf5(net, path))
+    else:
+        copy_weights(net, read_net_binary(path), path)
+
+
+def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
+    """Copy the weights in a message, read from ``path``, as :func:`load_weights` copies a file's."""
+    _copy(_from_message(net, message, Path(path)))
+
+
+def _copy(copies: Copies) -> None:
     with torch.no_grad():
         for blob, values in copies:
             blob.copy_(torch.tensor(values).view(blob.shape))
@@ -67,10 +78,10 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
 # Binary
 
 
-def _from_binary(net: Net, path: Path) -> Copies:
+def _from_message(net: Net, message: Any, path: Path) -> Copies:
     targets = _layers_by_name(net)
     copies: Copies = []
-    for source in read_net_binary(path).layer:
+    for source in message.layer:
         target = targets.get(source.name)
         if target is None:
             _ignore(source.name)

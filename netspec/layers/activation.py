@@ -23,7 +23,7 @@ class Activation(Layer):
         return bottom_shapes
 
 
-@register("ReLU")
+@register("ReLU", "relu_param")
 class ReLU(Activation):
     """max(x, 0) + negative_slope min(x, 0); the gradient at 0 is the negative side's.
 
@@ -46,7 +46,7 @@ class ReLU(Activation):
         return torch.where(bottom > 0, diff, diff * self.slope)
 
 
-@register("PReLU")
+@register("PReLU", "prelu_param")
 class PReLU(Activation):
     """max(x, 0) + slope min(x, 0), with one learned slope a channel, or one for all (channel_shared).
 
@@ -69,7 +69,7 @@ class PReLU(Activation):
         return F.prelu(x, self.blob(0).reshape(-1))
 
 
-@register("ELU")
+@register("ELU", "elu_param")
 class ELU(Activation):
     """Return x where x > 0, else alpha (exp(x) - 1); the gradient at 0 is alpha.
 
@@ -93,7 +93,7 @@ class ELU(Activation):
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
 
 
-@register("Sigmoid")
+@register("Sigmoid", "sigmoid_param")
 class Sigmoid(Activation):
     """1 / (1 + exp(-x)).
 
@@ -113,7 +113,7 @@ class Sigmoid(Activation):
         return diff * top * (1 - top)
 
 
-@register("TanH")
+@register("TanH", "tanh_param")
 class TanH(Activation):
     """Hyperbolic tangent.
 
@@ -147,7 +147,7 @@ class AbsVal(Activation):
         return x.abs()
 
 
-@register("Power")
+@register("Power", "power_param")
 class Power(Activation):
     """(shift + scale x) ^ power; the constant shift ^ power where scale or power is 0, whatever x is.
 
@@ -186,7 +186,7 @@ class Power(Activation):
         return diff * slope * (inner if self.power == 2 else top / inner)
 
 
-@register("Exp")
+@register("Exp", "exp_param")
 class Exp(Activation):
     """base ^ (shift + scale x); base -1, the default, stands for e.
 
@@ -215,7 +215,7 @@ class Exp(Activation):
         return diff * top * self.scale
 
 
-@register("Log")
+@register("Log", "log_param")
 class Log(Activation):
     """Logarithm of (shift + scale x) to a base; base -1, the default, stands for e.
 
@@ -266,7 +266,7 @@ class BNLL(Activation):
         return diff * torch.sigmoid(bottom)
 
 
-@register("Threshold")
+@register("Threshold", "threshold_param")
 class Threshold(Activation):
     """1 where x > threshold (strictly), else 0; no gradient.
 
@@ -284,7 +284,7 @@ class Threshold(Activation):
         return (x > self.threshold).to(x.dtype)
 
 
-@register("Clip")
+@register("Clip", "clip_param")
 class Clip(Activation):
     """max(min, min(x, max)); the gradient passes where min <= x <= max, both ends included.
 
@@ -313,7 +313,7 @@ class Clip(Activation):
         return diff * ((bottom >= self.low) & (bottom <= self.high))
 
 
-@register("Swish")
+@register("Swish", "swish_param")
 class Swish(Activation):
     """x sigmoid(beta x).
 

@@ -73,6 +73,8 @@ class Layer(torch.nn.Module):
     is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
     is_input: ClassVar[bool] = False  # its tops are given by the caller
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
+    reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
+    ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
     gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (the bottom's), "top": see netspec/in_place.py
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
 

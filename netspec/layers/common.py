@@ -12,7 +12,7 @@ from netspec.layers.base import TRAIN, Layer, Shape
 from netspec.layers.registry import register
 
 
-@register("InnerProduct")
+@register("InnerProduct", "inner_product_param")
 class InnerProduct(Layer):
     """Multiply each vector by a learned matrix; the axes from ``axis`` on are one vector of length K.
 
@@ -58,7 +58,7 @@ class InnerProduct(Layer):
         return math.prod(self.top_shapes[0]) * self.inputs
 
 
-@register("Dropout")
+@register("Dropout", "dropout_param")
 class Dropout(Layer):
     """In the training phase, zero each value with probability ``dropout_ratio`` p and scale the others by 1 / (1 - p).
 
@@ -86,7 +86,7 @@ class Dropout(Layer):
         return data * kept.mul_(1 / (1 - self.ratio))
 
 
-@register("Embed")
+@register("Embed", "embed_param")
 class Embed(Layer):
     """Replace each index by a learned row.
 

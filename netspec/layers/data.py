@@ -26,6 +26,7 @@ from netspec.layers.registry import register
 
 BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
 PHASES = ("TRAIN", "TEST")
+MOVED = ("scale", "mean_file", "crop_size", "mirror")  # to transform_param, so in a current layer they mean nothing
 Batch = tuple[tuple[torch.Tensor, ...], int]
 
 
@@ -171,7 +172,7 @@ def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:
     return tuple(top.pin_memory() if pinned else top for top in tops), source.cursor.wraps(iteration)
 
 
-@register("Data")
+@register("Data", "data_param", "transform_param")
 class Data(ReadingLayer):
     """Read the Datums of an LMDB or LevelDB, in the order of their keys, over and over.
 
@@ -181,6 +182,7 @@ class Data(ReadingLayer):
     """
 
     tops = (1, 2)
+    ignores = frozenset(f"data_param.{name}" for name in MOVED)
 
     def batch_size_of_param(self) -> int:
         """Return data_param.batch_size."""
@@ -211,7 +213,7 @@ class Data(ReadingLayer):
         log.info("data_layer.cpp:73", "Restarting data prefetching from start.")
 
 
-@register("ImageData")
+@register("ImageData", "image_data_param", "transform_param", "data_param.prefetch")
 class ImageData(ReadingLayer):
     """Read image files named in a list of ``name label`` lines, resized bilinearly where asked.
 
@@ -219,6 +221,8 @@ class ImageData(ReadingLayer):
     top[1]  labels (batch_size,)
     Caffe: src/caffe/layers/image_data_layer.cpp
     """
+
+    ignores = frozenset(f"image_data_param.{name}" for name in MOVED)
 
     def batch_size_of_param(self) -> int:
         """Return image_data_param.batch_size, and check that new_height and new_width come together."""
@@ -250,7 +254,7 @@ class ImageData(ReadingLayer):
         return (self.batch_size, 3 if p.is_color else 1, height, width) if height else None
 
 
-@register("HDF5Data")
+@register("HDF5Data", "hdf5_data_param", "transform_param", "data_param.prefetch")
 class HDF5Data(ReadingLayer):
     """Read the rows of HDF5 files, from the datasets named like the tops.
 
@@ -284,7 +288,7 @@ class HDF5Data(ReadingLayer):
         return [self.context.given_shapes[top] for top in self.param.top]
 
 
-@register("WindowData")
+@register("WindowData", "window_data_param", "transform_param", "data_param.prefetch")
 class WindowData(ReadingLayer):
     """Draw windows of images, some that show an object and some that show none, warped to one size.
 
@@ -292,6 +296,11 @@ class WindowData(ReadingLayer):
     top[1]  labels (batch_size,); 0 is background
     Caffe: src/caffe/layers/window_data_layer.cpp
     """
+
+    ignores = frozenset(
+        {f"window_data_param.{name}" for name in MOVED if name != "scale"}
+        | {f"transform_param.{name}" for name in ("scale", "force_color", "force_gray")}
+    )
 
     def batch_size_of_param(self) -> int:
         """Return window_data_param.batch_size, and check crop_size, crop_mode and context_pad."""
@@ -310,8 +319,6 @@ class WindowData(ReadingLayer):
         from netspec.data.windows import WindowSource
 
         p = self.param
-        if p.transform_param.HasField("scale"):
-            log.warning("window_data_layer.cpp:264", "WindowData ignores transform_param.scale, as Caffe does")
         self.named(p.window_data_param.source, "window_data_param", "source")
         return WindowSource(
             p.window_data_param, p.transform_param, self.context.at, self.context.random.seed, self.stream
@@ -323,7 +330,7 @@ class WindowData(ReadingLayer):
         return (self.batch_size, 3, crop, crop)
 
 
-@register("HDF5Output")
+@register("HDF5Output", "hdf5_output_param")
 class HDF5Output(Layer):
     """Append both bottoms to the datasets ``data`` and ``label`` of a new HDF5 file.
 

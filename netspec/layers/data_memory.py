@@ -16,7 +16,7 @@ from netspec.proto.schema import FillerParameter
 T = TypeVar("T")
 
 
-@register("Input")
+@register("Input", "input_param")
 class Input(Layer):
     """Name blobs that the caller fills: ``net(data=array)``.
 
@@ -47,7 +47,7 @@ class Input(Layer):
         return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
 
 
-@register("DummyData")
+@register("DummyData", "dummy_data_param")
 class DummyData(Layer):
     """Make blobs with fillers: constant ones once, random ones at each forward pass.
 
@@ -102,7 +102,7 @@ class DummyData(Layer):
         return values * self.num_tops if len(values) == 1 else values
 
 
-@register("MemoryData")
+@register("MemoryData", "memory_data_param", "transform_param")
 class MemoryData(Layer):
     """Hand out arrays that the program gives with ``set_input_arrays``, batch after batch, over and over.
 

@@ -55,7 +55,7 @@ class SoftmaxLoss(Loss, Classified):
         return loss, log_p.detach().exp().reshape(self.bottom_shapes[0])
 
 
-@register("SoftmaxWithLoss")
+@register("SoftmaxWithLoss", "loss_param", "softmax_param")
 class SoftmaxWithLoss(SoftmaxLoss):
     """-log(softmax(scores)[label]), summed and normalised.
 
@@ -88,7 +88,7 @@ class SoftmaxWithLoss(SoftmaxLoss):
         return self.sum_up(-Floor.apply(chosen, math.log(FLT_MIN)), valid, log_p)
 
 
-@register("InfogainLoss")
+@register("InfogainLoss", "infogain_loss_param", "loss_param")
 class InfogainLoss(SoftmaxLoss):
     """-sum over classes of H[label, class] log(softmax(scores)[class]), summed and normalised.
 
@@ -184,7 +184,7 @@ class MultinomialLogisticLoss(Loss, Classified):
         return -Floor.apply(chosen, LOG_THRESHOLD).log().sum() / self.outer
 
 
-@register("HingeLoss")
+@register("HingeLoss", "hinge_loss_param")
 class HingeLoss(Loss, Classified):
     """One against all: the sum of max(0, 1 - s x) / N, s being 1 at the label and -1 elsewhere.
 
@@ -216,7 +216,7 @@ class HingeLoss(Loss, Classified):
         return margins.sum() / self.outer
 
 
-@register("SigmoidCrossEntropyLoss")
+@register("SigmoidCrossEntropyLoss", "loss_param", "sigmoid_param")
 class SigmoidCrossEntropyLoss(Loss):
     """Cross entropy of sigmoid(x) and targets of any value, summed and normalised (default BATCH_SIZE).
 
@@ -306,7 +306,7 @@ class _Contrastive(torch.autograd.Function):
         return grad, -grad, None, None, None
 
 
-@register("ContrastiveLoss")
+@register("ContrastiveLoss", "contrastive_loss_param")
 class ContrastiveLoss(Loss):
     """The sum of d^2 over similar pairs and of max(margin - d, 0)^2 over the others, / (2 N); d = |a - b|.
 
@@ -342,7 +342,7 @@ class ContrastiveLoss(Loss):
         return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version)
 
 
-@register("Accuracy")
+@register("Accuracy", "accuracy_param")
 class Accuracy(Classified):
     """The share of predictions whose label is among the top_k scores; a tie with the label's score counts against it.
 

@@ -16,7 +16,7 @@ ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
 MAX_OFFSET = 8  # means, in standard deviations, up to which torch's CPU kernel is exact to 1e-6
 
 
-@register("BatchNorm")
+@register("BatchNorm", "batch_norm_param")
 class BatchNorm(Layer):
     """Subtract each channel's mean, divide by its standard deviation; of the batch in training, of the past in testing.
 
@@ -134,7 +134,7 @@ class _Affine(Layer):
         return axis
 
 
-@register("Scale")
+@register("Scale", "scale_param")
 class Scale(_Affine):
     """Multiply by a learned factor, or by a second bottom, and, with bias_term, add a learned bias.
 
@@ -172,7 +172,7 @@ class Scale(_Affine):
         return top if bias is None else top + _along(bias, self.axis, data)
 
 
-@register("Bias")
+@register("Bias", "bias_param")
 class Bias(_Affine):
     """Add a learned bias, or a second bottom.
 
@@ -199,7 +199,7 @@ class Bias(_Affine):
         return data + _along(self.blob(0) if bias is None else bias, self.axis, data)
 
 
-@register("LRN")
+@register("LRN", "lrn_param")
 class LRN(Layer):
     """Divide each value by a power of the squares around it: (k + alpha times their mean) ** beta.
 
@@ -216,6 +216,8 @@ class LRN(Layer):
         if self.param.lrn_param.local_size % 2 == 0:
             message = f"local_size must be odd, found {self.param.lrn_param.local_size}"
             raise self.error(message, "lrn_param", "local_size")
+        if self.param.lrn_param.norm_region != ACROSS_CHANNELS:
+            self.ignores = frozenset({"lrn_param.k"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape."""
@@ -239,7 +241,7 @@ class LRN(Layer):
         return data * base.pow(-param.beta)
 
 
-@register("MVN")
+@register("MVN", "mvn_param")
 class MVN(Layer):
     """Subtract the mean of each map and divide by its standard deviation plus ``eps``.
 

@@ -32,7 +32,7 @@ class _Call(torch.autograd.Function):
         return None, *ctx.layer.call_backward(grads, ctx.needs_input_grad[1:])
 
 
-@register("Python")
+@register("Python", "python_param")
 class Python(Layer):
     """Run the class python_param.layer of python_param.module, on numpy views of the blobs.
 

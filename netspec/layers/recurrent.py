@@ -28,6 +28,7 @@ class Recurrent(Layer):
     bottoms = (2, 5)
     tops = (1, 3)
     label_bottoms = frozenset({1})
+    ignores = frozenset({"recurrent_param.debug_info"})
     state_names: ClassVar[tuple[str, ...]]
     gates: ClassVar[int] = 1  # how many numbers a hidden unit takes in
 
@@ -118,7 +119,7 @@ class Recurrent(Layer):
         return (x.new_zeros(shape),) * len(self.state_names)
 
 
-@register("RNN")
+@register("RNN", "recurrent_param")
 class RNN(Recurrent):
     """h_t = tanh(W_hh (cont_t h_{t-1}) + W_xh x_t + b_h [+ W_xh_static x_static]), o_t = tanh(W_ho h_t + b_o).
 
@@ -159,7 +160,7 @@ def _lstm_unit(cell: torch.Tensor, gate_input: torch.Tensor, keep: torch.Tensor)
     return cell, torch.sigmoid(o) * torch.tanh(cell)
 
 
-@register("LSTM")
+@register("LSTM", "recurrent_param")
 class LSTM(Recurrent):
     """Long short-term memory; its gate order is input, forget, output, candidate (i, f, o, g).
 

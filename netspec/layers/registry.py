@@ -11,12 +11,17 @@ _LAYERS: dict[str, type[Layer]] = {}
 L = TypeVar("L", bound=type[Layer])
 
 
-def register(type_name: str) -> Callable[[L], L]:
-    """Class decorator: make a layer known under the type that prototxt files use."""
+def register(type_name: str, *reads: str) -> Callable[[L], L]:
+    """Class decorator: make a layer known under the type that prototxt files use.
+
+    ``reads`` are the fields of LayerParameter that are the layer's own, e.g. ``"pooling_param"``, and what a dialect
+    adds to them, e.g. ``"pooling_param.extra"``; a net warns of all others (see netspec/unused.py).
+    """
 
     def add(cls: L) -> L:
         assert type_name not in _LAYERS, f"layer type {type_name} registered twice"
         cls.type = type_name
+        cls.reads = frozenset(reads)
         _LAYERS[type_name] = cls
         return cls
 

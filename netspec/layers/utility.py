@@ -12,7 +12,7 @@ from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 
 
-@register("Eltwise")
+@register("Eltwise", "eltwise_param")
 class Eltwise(Layer):
     """Element by element: SUM (coeff_i bottom_i), PROD, or MAX.
 
@@ -38,6 +38,8 @@ class Eltwise(Layer):
             raise self.error(message, "eltwise_param", "coeff")
         if p.coeff and self.operation == self.PROD:
             raise self.error("found coeff in a product, expected it for SUM only", "eltwise_param", "coeff")
+        if self.operation == self.MAX:
+            self.ignores = frozenset({"eltwise_param.coeff"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottoms' shape."""
@@ -62,7 +64,7 @@ class Eltwise(Layer):
         return top
 
 
-@register("Reduction")
+@register("Reduction", "reduction_param")
 class Reduction(Layer):
     """Reduce the axes from axis (default 0) to the last: coeff times SUM, ASUM (of |x|), SUMSQ (of x^2) or MEAN.
 
@@ -91,7 +93,7 @@ class Reduction(Layer):
         return x.flatten(self.axis).sum(self.axis) * self.coeff
 
 
-@register("ArgMax")
+@register("ArgMax", "argmax_param")
 class ArgMax(Layer):
     """Find the top_k largest along an axis, or among all numbers of an item where no axis is given. No gradient.
 
@@ -131,7 +133,7 @@ class ArgMax(Layer):
         return top.reshape(self.top_shapes[0])
 
 
-@register("Softmax")
+@register("Softmax", "softmax_param")
 class Softmax(Layer):
     """exp(x) / the sum of exp(x) along an axis (default 1).
 
@@ -177,7 +179,7 @@ class Silence(Layer):
         return ()
 
 
-@register("Parameter")
+@register("Parameter", "parameter_param")
 class Parameter(Layer):
     """Show a learnable blob as a top.
 

@@ -22,7 +22,7 @@ def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
     return layer.canonical_axis(getattr(p, old_name), shape, param_name, old_name)
 
 
-@register("Flatten")
+@register("Flatten", "flatten_param")
 class Flatten(Layer):
     """Make one axis of the axes from axis (default 1) to end_axis (default the last).
 
@@ -46,7 +46,7 @@ class Flatten(Layer):
         return x.reshape(self.top_shapes[0])
 
 
-@register("Reshape")
+@register("Reshape", "reshape_param")
 class Reshape(Layer):
     """Replace num_axes axes (default all) from axis on by those of shape: 0 copies the bottom's axis, -1 is inferred.
 
@@ -95,7 +95,7 @@ class Reshape(Layer):
         return x.reshape(self.top_shapes[0])
 
 
-@register("Concat")
+@register("Concat", "concat_param")
 class Concat(Layer):
     """Join the bottoms along an axis (default 1; concat_dim is its older name).
 
@@ -122,7 +122,7 @@ class Concat(Layer):
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
 
 
-@register("Slice")
+@register("Slice", "slice_param")
 class Slice(Layer):
     """Cut the bottom along an axis (default 1; slice_dim is its older name): before each slice_point, or evenly.
 
@@ -180,7 +180,7 @@ class Split(Layer):
         return tuple(x.view_as(x) for _ in range(self.num_tops))
 
 
-@register("Tile")
+@register("Tile", "tile_param")
 class Tile(Layer):
     """Repeat the bottom along an axis (default 1), tiles times.
 

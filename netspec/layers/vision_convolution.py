@@ -103,7 +103,7 @@ class _SlidingFilter(Layer):
         return list(chain.from_iterable((0, n) for n in reversed(short)))
 
 
-@register("Convolution")
+@register("Convolution", "convolution_param")
 class Convolution(_SlidingFilter):
     """Cross-correlate each map with learned filters; any number of bottoms, one set of filters for all.
 
@@ -184,7 +184,7 @@ class Convolution(_SlidingFilter):
         return len(self.top_shapes) * pixels * math.prod(self.blob_shapes[0])
 
 
-@register("Deconvolution")
+@register("Deconvolution", "convolution_param")
 class Deconvolution(Convolution):
     """Spread each pixel by learned filters: a convolution's backward pass, run forward.
 
@@ -219,7 +219,7 @@ class Deconvolution(Convolution):
         return len(self.bottom_shapes) * pixels * math.prod(self.blob_shapes[0])
 
 
-@register("Im2col")
+@register("Im2col", "convolution_param")
 class Im2col(_SlidingFilter):
     """Lay the pixels under each position of a filter side by side, as channels.
 
@@ -227,6 +227,10 @@ class Im2col(_SlidingFilter):
     top[0]     (N, C kernel_h kernel_w, H', W'),  H' as Convolution's; zero where the filter leaves the map
     Caffe: src/caffe/layers/im2col_layer.cpp
     """
+
+    ignores = frozenset(
+        f"convolution_param.{name}" for name in ("num_output", "bias_term", "group", "weight_filler", "bias_filler")
+    )
 
     def setup(self) -> None:
         """Read the geometry."""
@@ -255,7 +259,7 @@ class Im2col(_SlidingFilter):
         return windows.permute(order).reshape(self.top_shapes[0])
 
 
-@register("Crop")
+@register("Crop", "crop_param")
 class Crop(Layer):
     """Cut a blob to the size of another, from ``axis`` on.
 

@@ -150,7 +150,7 @@ class _PoolingBase(Layer):
         return weighted_pool(maps, windows), None
 
 
-@register("Pooling")
+@register("Pooling", "pooling_param")
 class Pooling(_PoolingBase):
     """Reduce each window of a map to its maximum, its average, or a pixel drawn at random.
 
@@ -216,7 +216,7 @@ class Pooling(_PoolingBase):
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
 
 
-@register("SPP")
+@register("SPP", "spp_param")
 class SPP(_PoolingBase):
     """Pool a map into 1, then 2 x 2, then 4 x 4, ... windows: as many features whatever the map's size.
 
