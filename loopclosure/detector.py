@@ -157,8 +157,13 @@ class LoopDetector:
     ) -> LoopResult:
         """Add the next frame, (H, W, 3) uint8 BGR, and say whether it closes a loop.
 
-        ``stamp`` in seconds; ``pose`` tx ty tz qx qy qz qw, camera-to-world: only kept, for the export. It costs
-        ``describe`` and, beside some 0.1 ms, one pass over all earlier descriptors: 4 D bytes a frame.
+        ``stamp`` in seconds; ``pose`` tx ty tz qx qy qz qw, camera-to-world: only kept, for the export.
+
+        It costs ``describe`` and one pass over all earlier descriptors, 4 D bytes a frame. Measured on one 2020s server
+        core, without ``describe``: frame 1,000 takes 0.04 ms and frame 10,000 takes 0.2 ms with D = 128; 0.07 and
+        1.4 to 1.8 ms with D = 512, which no longer fit the cache. So frame 10,000 costs at most twice what frame 1,000
+        costs where ``describe`` takes 2 ms or more (1.7 times at 2 ms, 1.3 at 5 ms, D = 512), as nets and SIFT do; with
+        thumbnails of 768 pixels, described in 0.15 ms, it costs ten times as much: 2.2 ms.
         """
         if self.describe is None:
             raise InputError("this detector has no describe; give one, or use add_descriptor")

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from loopclosure.evaluate import Evaluation, Outcome
@@ -61,7 +62,7 @@ def matrices(evaluation: Evaluation) -> Figure:
         references = "earlier frame" if evaluation.data.reference_images is None else "reference"
         for axis in axes:
             axis.set_xlabel(references)
-            axis.set_ylabel("frame" if references == "earlier frame" else "query")
+        _label_left(axes, "frame" if references == "earlier frame" else "query")
         _state_truth(figure, evaluation)
         return figure
 
@@ -97,6 +98,7 @@ def matches(evaluation: Evaluation) -> Figure:
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_matches(axis, outcome, evaluation.data.truth)
             axis.set_title(outcome.name)
+        _label_left(axes, "query")
         _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
         return figure
@@ -191,7 +193,8 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
     ]
     for order, (queries, references, colour, width) in enumerate(lines, start=2):
         chords = np.stack([place[queries], place[references]], axis=1)
-        axis.add_collection(LineCollection(list(chords), colors=colour, linewidths=width, alpha=0.8, zorder=order))
+        thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords are one blot
+        axis.add_collection(LineCollection(list(chords), colors=colour, linewidths=width * thin, zorder=order))
         axis.plot(place[queries, 0], place[queries, 1], ".", color=colour, markersize=2.5, zorder=order)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel(f"{'xyz'[across]} [m]")
@@ -214,7 +217,6 @@ def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
     axis.set_xlim(-1, truth.hard.shape[1])
     axis.set_ylim(truth.hard.shape[0], -1)
     axis.set_xlabel("reference")
-    axis.set_ylabel("query")
 
 
 def _loop_legend(figure: Figure) -> None:
@@ -235,10 +237,18 @@ def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
     rows = -(-panels // COLUMNS)
     columns = -(-panels // rows)
     width = 2.75 if columns > 2 else 3.4
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(width * columns, width * ratio * rows + 0.35), layout="constrained", squeeze=False
-    )
+    size = (width * columns, width * ratio * rows + 0.35)
+    layout = ConstrainedLayoutEngine(h_pad=0.07)  # inches: a title stands clear of the panel above
+    figure, axes = plt.subplots(rows, columns, figsize=size, layout=layout, squeeze=False)
     flat = list(axes.flat)
     for axis in flat[panels:]:
         axis.remove()
     return figure, flat[:panels]
+
+
+def _label_left(axes: list[Axes], words: str) -> None:
+    """Label the vertical axis of the first panel of each row."""
+    for axis in axes:
+        place = axis.get_subplotspec()
+        if place is not None and place.is_first_col():
+            axis.set_ylabel(words)

@@ -121,14 +121,14 @@ def _rises(curve: PrecisionRecall) -> np.ndarray:
 def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> None:
     data, matches = evaluation.data, outcome.matches
     loops = data.truth.queries_with_a_loop
-    rows = [["query", "reference", "score", "verdict", "query has a loop", "query image", "reference image"]]
+    heads = ["query", "reference", "score", "verdict", "query has a loop", "query image", "reference image"]
+    rows = [[*heads, "truth and exclusion"]]
     for query in np.flatnonzero(matches.reference >= 0):
         reference = int(matches.reference[query])
         verdict = "right" if matches.right[query] else "ignored" if matches.ignored[query] else "wrong"
+        numbers = [str(query), str(reference), f"{matches.score[query]:.9g}", verdict, str(int(loops[query]))]
         images = [str(data.query_images[query]), str(data.references[reference])]
-        rows.append(
-            [str(query), str(reference), f"{matches.score[query]:.9g}", verdict, str(int(loops[query])), *images]
-        )
+        rows.append([*numbers, *images, data.truth.sentence])
     _write_csv(path, rows)
 
 
