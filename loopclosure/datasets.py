@@ -22,6 +22,7 @@ TUM_EXCLUSION = Exclusion(seconds=10.0)
 # New College's own mask has no loop nearer than 142 images (71 pairs of left and right).
 FABMAP_EXCLUSION = Exclusion(frames=50)
 FOLDER_EXCLUSION = Exclusion(frames=10)
+COMMON_NAMES = ("images", "image", "rgb", "samples", "query", "ref", "reference", "frames")
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ def load_folder(
     """
     queries = image_paths(images)
     hard, soft = read_truth_matrix(truth_file)
-    name = f"{Path(images).resolve().name}{_selection_words(selection)}"
+    name = f"{_folder_name(images)}{_selection_words(selection)}"
     rule = f"same place: as {Path(truth_file).name} says"
     if references is not None:
         reference_images = image_paths(references)
@@ -205,7 +206,7 @@ def load_traverses(
     rule = f"same place: at most {tolerance} frames apart" if tolerance else "same place: the frame of the same number"
     soft = None if soft_tolerance is None else apart <= soft_tolerance
     truth = traverse_truth(apart <= tolerance, rule, soft=soft)
-    name = f"{Path(queries).resolve().name} in {Path(references).resolve().name}{_selection_words(selection)}"
+    name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_words(selection)}"
     return DataSet(name, [query_images[i] for i in taken], [reference_images[i] for i in taken], truth)
 
 
@@ -289,6 +290,12 @@ def _only_file(folder: Path, patterns: SequenceOf[str], needed: str = "") -> Pat
     if needed:
         raise InputError(f"has no {' or '.join(patterns)}, {needed}; name the file", folder)
     return None
+
+
+def _folder_name(source: str | Path) -> str:
+    """Return a name that says which data: that of the folder, and its parent's where many sets have a folder so named."""
+    path = Path(source).resolve()
+    return f"{path.parent.name}/{path.name}" if path.name.lower() in COMMON_NAMES else path.name
 
 
 def _existing(images: list[Path]) -> list[Path]:

@@ -226,6 +226,7 @@ def test_corridor_loop():
     assert data.query_images[9].name == "10.jpg"
     assert data.truth.positives == 228
     assert int(data.truth.queries_with_a_loop.sum()) == 44
+    assert data.name == "corridor_loop/samples"
 
 
 def test_tum_fr1():
