@@ -293,7 +293,7 @@ def _only_file(folder: Path, patterns: SequenceOf[str], needed: str = "") -> Pat
 
 
 def _folder_name(source: str | Path) -> str:
-    """Return a name that says which data: that of the folder, and its parent's where many sets have a folder so named."""
+    """Return the name of a folder, with its parent where many sets have one of that name."""
     path = Path(source).resolve()
     return f"{path.parent.name}/{path.name}" if path.name.lower() in COMMON_NAMES else path.name
 
