@@ -1,4 +1,4 @@
-"""The command line: parses arguments, sets up the log, catches SpecError; computes nothing.
+"""The command line: its commands and their arguments; computes nothing.
 
 Options may be written as gflags let Caffe's users write them: ``-solver s``, ``--solver=s``, ``-gpu 0``.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import re
 import signal
 import sys
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from netspec import log
+from netspec.cli_run import WrongUsage, run, signals
 from netspec.errors import SpecError
 
 PHASES = {"TRAIN": 0, "TEST": 1}
@@ -35,81 +35,6 @@ def train(argv: Sequence[str] | None = None) -> int:
 def extract_features(argv: Sequence[str] | None = None) -> int:
     """Run ``netspec extract_features``: the door ``tools/extract_features``."""
     return main(["extract_features", *(sys.argv[1:] if argv is None else argv)])
-
-
-def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
-    """Parse a command line, run the command's ``run``, and turn a fault of the user's files into one line."""
-    arguments = parser.parse_args([_gflag(word) for word in words])
-    try:
-        with _logging(arguments.warnings_only):
-            return arguments.run(arguments) or 0
-    except SpecError as fault:
-        print(fault, file=sys.stderr)
-        return 1
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 1
-    except KeyboardInterrupt:
-        return 128 + signal.SIGINT
-
-
-def _gflag(word: str) -> str:
-    """Return ``-flag`` as ``--flag``; argparse knows one-letter options only with one dash."""
-    return "-" + word if re.match(r"-[A-Za-z_]\w", word) else word
-
-
-class _logging:
-    """Caffe's log on stderr, around the progress bar where there is one; or of it the warnings, without its prefix.
-
-    A warning is shown once, though a solver's nets may each have it.
-    """
-
-    def __init__(self, warnings_only: bool) -> None:
-        self.level = logging.WARNING if warnings_only else logging.INFO
-        self.handler = logging.StreamHandler(_BarAware())
-        self.handler.setFormatter(logging.Formatter("warning: %(message)s") if warnings_only else log.GlogFormatter())
-        self.handler.addFilter(_WarnOnce())
-
-    def __enter__(self) -> None:
-        log.logger.addHandler(self.handler)
-        self.before = log.logger.level, log.logger.propagate
-        log.logger.setLevel(self.level)
-        log.logger.propagate = False
-
-    def __exit__(self, *_: object) -> None:
-        log.logger.removeHandler(self.handler)
-        level, log.logger.propagate = self.before
-        log.logger.setLevel(level)
-
-
-class _WarnOnce(logging.Filter):
-    """Lets each warning pass the first time only."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        message = record.getMessage()
-        if record.levelno != logging.WARNING:
-            return True
-        new = message not in self.seen
-        self.seen.add(message)
-        return new
-
-
-class _BarAware:
-    """A stream that writes to stderr above a tqdm bar, if one is shown."""
-
-    def write(self, text: str) -> None:
-        tqdm = sys.modules.get("tqdm")
-        if tqdm is None or not sys.stderr.isatty():
-            sys.stderr.write(text)
-        elif text.rstrip("\n"):
-            tqdm.tqdm.write(text.rstrip("\n"), file=sys.stderr)
-
-    def flush(self) -> None:
-        sys.stderr.flush()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -256,11 +181,13 @@ def _device(gpu: str) -> Any:
 
     if not gpu:
         return torch.device("cpu")
-    if gpu == "all" or "," in gpu:
+    count = torch.cuda.device_count()
+    if "," in gpu or (gpu == "all" and count > 1):
         raise SpecError(f"--gpu {gpu}: several GPUs are not supported; give one number")
+    if gpu == "all":
+        gpu = "0"
     if not gpu.isdigit():
         raise SpecError(f"--gpu {gpu}: expected the number of a GPU")
-    count = torch.cuda.device_count()
     if int(gpu) >= count:
         raise SpecError(
             f"--gpu {gpu}: this machine has {count or 'no'} GPU(s) that torch can use; leave --gpu out for the CPU"
@@ -282,31 +209,27 @@ def _train(arguments: argparse.Namespace) -> None:
 
     path = arguments.solver or arguments.path
     if not path or (arguments.solver and arguments.path):
-        raise SpecError("train: need one solver definition; netspec train solver.prototxt")
+        raise WrongUsage("need one solver definition: netspec train solver.prototxt")
     if arguments.snapshot and arguments.weights:
-        raise SpecError("train: give a snapshot to resume training or weights to fine-tune, not both")
-    requested: list[str] = []
-    for number, effect in ((signal.SIGINT, arguments.sigint_effect), (signal.SIGHUP, arguments.sighup_effect)):
-        if effect != "none":
-            signal.signal(number, lambda *_, effect=effect: requested.append(effect))
-        else:
-            signal.signal(number, signal.SIG_IGN)
-    solver = load_solver(
-        path,
-        weights=arguments.weights,
-        snapshot=arguments.snapshot,
-        device=_device(arguments.gpu) if arguments.gpu else None,
-        level=arguments.level,
-        stages=tuple(arguments.stage.split(",")),
-        allow_python=arguments.allow_python_layers,
-        action=lambda: requested.pop(0) if requested else None,
-    )
-    log.info("caffe.cpp:239", "Starting Optimization")
-    total = solver.param.max_iter
-    with tqdm(total=total, initial=solver.iteration, unit="it", disable=not sys.stderr.isatty(), leave=False) as bar:
-        solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
-        solver.solve()
-    solver.close()
+        raise WrongUsage("give a snapshot to resume training or weights to fine-tune, not both")
+    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGHUP: arguments.sighup_effect}
+    with signals(effects) as action:
+        solver = load_solver(
+            path,
+            weights=arguments.weights,
+            snapshot=arguments.snapshot,
+            device=_device(arguments.gpu) if arguments.gpu else None,
+            level=arguments.level,
+            stages=tuple(arguments.stage.split(",")),
+            allow_python=arguments.allow_python_layers,
+            action=action,
+        )
+        log.info("caffe.cpp:239", "Starting Optimization")
+        total, first, hidden = solver.param.max_iter, solver.iteration, not sys.stderr.isatty()
+        with tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False) as bar:
+            solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
+            solver.solve()
+        solver.close()
     log.info("caffe.cpp:250", "Optimization Done.")
 
 
@@ -389,10 +312,10 @@ def _extract(arguments: argparse.Namespace) -> None:
         log.warning("extract_features.cpp:62", "no --weights: the net has random ones")
     if arguments.images:
         if len(arguments.blob) != 1:
-            raise SpecError(f"--images takes one --blob, found {len(arguments.blob)}")
+            raise WrongUsage(f"--images takes one --blob, found {len(arguments.blob)}")
         (blob,) = arguments.blob
         if arguments.shape and arguments.shape[0] != arguments.input:
-            raise SpecError(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
+            raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
         images = read_image_list(Path(arguments.images))
         shape = arguments.shape[1] if arguments.shape else None
         net, scaling = image_net(arguments.model, blob, arguments.input, shape, device)

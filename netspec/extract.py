@@ -18,7 +18,7 @@ import torch
 
 from netspec import log
 from netspec.data.transformer import read_mean
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
 from netspec.layers.base import TEST, Shape
@@ -74,6 +74,10 @@ def extract_records(
     readers = [layer for layer in net.layers if getattr(layer, "num_records", 0)]
     if not readers:
         raise SpecError("no layer of this net reads records; give image files instead", Where(net.plan.source.file))
+    for name in blobs:
+        if name not in net.shapes:
+            known = f"{did_you_mean(name, list(net.shapes)) or ';'} it has: {', '.join(net.shapes)}"
+            raise SpecError(f'no blob "{name}" in this net{known}', Where(net.plan.source.file))
     reader = readers[0]
     batch = reader.top_shapes[0][0]
     records, first = reader.num_records, reader.iteration
