@@ -48,6 +48,8 @@ def _parser() -> argparse.ArgumentParser:
     ) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
         added.set_defaults(run=function, warnings_only=False)
+        plugin = "a dialect: a fork's layers, by the name they come under or by a file of one's own; may be repeated"
+        added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=plugin)
         return added
 
     p = command("train", _train, "train or fine-tune a model (caffe train)")
@@ -233,16 +235,19 @@ def _train(arguments: argparse.Namespace) -> None:
     log.info("caffe.cpp:250", "Optimization Done.")
 
 
-def _load(arguments: argparse.Namespace, phase: str) -> Any:
+def _load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str) -> Any:
     from netspec.net import load_net
 
     device = _device(arguments.gpu)
-    log.info("caffe.cpp:275", "Use CPU." if device.type == "cpu" else f"Use GPU with device ID {device.index}")
+    if device.type == "cpu":
+        log.info(cpu_site, "Use CPU.")
+    else:
+        log.info(gpu_site, f"Use GPU with device ID {device.index}")
     return load_net(
         arguments.model,
         phase,
         level=arguments.level,
-        stages=_stages(arguments),
+        stages=arguments.stage.split(","),  # without --stage an empty one, as in Caffe
         device=device,
         allow_python=arguments.allow_python_layers,
     )
@@ -252,7 +257,7 @@ def _test(arguments: argparse.Namespace) -> None:
     from netspec.runs import test_net
     from netspec.weights import load_weights
 
-    net = _load(arguments, "TEST")
+    net = _load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
     for path in arguments.weights.split(","):
         load_weights(net, path)
     test_net(net, arguments.iterations)
@@ -262,7 +267,7 @@ def _test(arguments: argparse.Namespace) -> None:
 def _time(arguments: argparse.Namespace) -> None:
     from netspec.runs import time_net
 
-    net = _load(arguments, arguments.phase)
+    net = _load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343")
     time_net(net, arguments.iterations)
     net.close()
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,13 @@ from netspec import log
 from netspec.errors import SpecError, did_you_mean
 from netspec.graph import Report, raise_fault
 from netspec.graph.filter import filter_net, with_state
-from netspec.graph.plan import Param, Plan, make_plan, plan_backward
+from netspec.graph.plan import Node, Param, Plan, make_plan, plan_backward
 from netspec.graph.splits import insert_splits
 from netspec.in_place import Memory, is_overwritten, run_overwritten
 from netspec.layers import layer_class, layer_types
 from netspec.layers.base import Context, Layer, Random, Shape
+from netspec.proto.dialect import advice_for_type
+from netspec.proto.dialect_files import announce_known
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
@@ -91,7 +93,7 @@ def build_net(net: Any, source: SourceMap, options: BuildOptions | None = None) 
     options = options or BuildOptions()
     filtered, source = filter_net(net, source, options.report)
     if log.logger.isEnabledFor(logging.INFO):
-        log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered))
+        log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source, options.report)
     built = Net(make_plan(split, source, options.report), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
@@ -146,7 +148,7 @@ class Net(torch.nn.Module):
             if not param.HasField("phase"):
                 param.phase = self.phase
             at = partial(self.plan.source.at, i, layer=node.name, type=node.type)
-            self._log_wiring(node)
+            log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
             cls = layer_class(node.type)
             if cls is None:
                 options.report(SpecError(_unknown_type(node.type), at("type")))
@@ -161,15 +163,15 @@ class Net(torch.nn.Module):
                 open_data=options.open_data,
                 given_shapes=options.given_shapes or {},
                 allow_python=options.allow_python,
+                created=partial(self._log_wiring, node),
             )
             try:
                 layer = cls(param, [shapes[v] for v in node.bottoms], context)
                 weights = _loss_weights(layer)
-                layers[i] = layer
-                self._adopt_params(layers, i, layer)
             except SpecError as fault:
                 options.report(fault)
                 continue
+            layers[i] = layer
             self.loss_weights.append(weights)
             for v, shape in zip(node.tops, layer.top_shapes, strict=False):
                 shapes[v] = shape
@@ -182,12 +184,15 @@ class Net(torch.nn.Module):
                 if weight:
                     log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
             log.info("net.cpp:139", f"Memory required for data: {memory}")
+            try:
+                self._adopt_params(layers, i, layer)
+            except SpecError as fault:
+                options.report(fault)
         if len(layers) == len(self.plan.nodes):
             self._finish(list(layers.values()))
         return torch.nn.ModuleList(layers.values())
 
     def _log_wiring(self, node: Any) -> None:
-        log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
         log.info("net.cpp:86", f"Creating Layer {node.name}")
         for v in node.bottoms:
             log.info("net.cpp:408", f"{node.name} <- {self.plan.blobs[v]}")
@@ -204,8 +209,7 @@ class Net(torch.nn.Module):
             message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one a learnable blob"
             raise layer.error(message, "param", len(layer.blobs))
         for j in range(len(layer.blobs)):
-            default = Param("", layer.default_param_lr, 1.0, False, None)
-            spec = node.params[j] if j < len(node.params) else default
+            spec = _spec(node, layer, j)
             if spec.owner is None:
                 parameter = layer.blobs[j]
                 parameter.requires_grad_(spec.lr_mult != 0 or self.param.force_backward)
@@ -234,9 +238,7 @@ class Net(torch.nn.Module):
         """Log what needs backward computation, as Caffe decides it, and what is put out."""
         learns = []
         for node, layer in zip(self.plan.nodes, layers, strict=True):
-            rates = [p.lr_mult for p in node.params]
-            rates += [layer.default_param_lr] * (len(layer.blobs) - len(rates))
-            learns.append(any(rates))
+            learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
         has_loss = [[bool(w) for w in weights] for weights in self.loss_weights]
         self.backward_plan = plan_backward(self.plan, learns, has_loss, [layer.label_bottoms for layer in layers])
         for node, needs in zip(reversed(self.plan.nodes), reversed(self.backward_plan.layers), strict=True):
@@ -372,6 +374,12 @@ def _tops(plan: Plan, node: Any) -> list[str]:
     return [plan.blobs[v] for v in node.tops]
 
 
+def _spec(node: Node, layer: Layer, j: int) -> Param:
+    """Return what the prototxt, or the layer, says of learnable blob ``j``."""
+    spec = node.params[j] if j < len(node.params) else Param("", layer.default_param_lr, 1.0, False, None)
+    return replace(spec, lr_mult=0.0, decay_mult=0.0) if j in layer.not_learned else spec
+
+
 def _last_uses(plan: Plan) -> list[list[int]]:
     """Return, by node, the values that nobody needs once it has run."""
     last: dict[int, int] = {}
@@ -396,8 +404,10 @@ def _loss_weights(layer: Layer) -> list[float]:
 
 
 def _unknown_type(name: str) -> str:
-    known = layer_types()
-    return f'unknown layer type "{name}"{did_you_mean(name, known) or "; `netspec layers` lists the known ones"}'
+    announce_known()
+    fork = advice_for_type(name)
+    advice = f"; {fork}" if fork else did_you_mean(name, layer_types()) or "; `netspec layers` lists the known ones"
+    return f'unknown layer type "{name}"{advice}'
 
 
 def _count(shape: Shape) -> int:

@@ -86,7 +86,7 @@ def _pass(net: Net, forward: list[float], backward: list[float]) -> float:
         forward[i] += time.perf_counter() - start
         made.append(([leaves[v] for v in node.bottoms], tops))
         values.update(zip(node.tops, tops, strict=False))
-        loss += sum(w * float(top.sum()) for top, w in zip(tops, net.loss_weights[i], strict=True) if w)
+        loss += sum(w * top.detach().sum().item() for top, w in zip(tops, net.loss_weights[i], strict=True) if w)
     gradients: dict[int, torch.Tensor] = {}
     for i in reversed(range(len(made))):
         node = net.plan.nodes[i]

@@ -54,6 +54,7 @@ class Context:
     open_data: bool = True
     given_shapes: Mapping[str, Shape] = field(default_factory=dict)
     allow_python: bool = False
+    created: Callable[[], None] = lambda: None  # called when ``construct`` has run: Caffe's log goes by it
 
 
 class Layer(torch.nn.Module):
@@ -77,6 +78,7 @@ class Layer(torch.nn.Module):
     ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
     gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (the bottom's), "top": see netspec/in_place.py
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
+    not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
         super().__init__()
@@ -87,9 +89,14 @@ class Layer(torch.nn.Module):
         self.num_tops: int = max(len(param.top), self.tops[0] if self.is_loss else 0)
         self.blobs = torch.nn.ParameterList()
         self.blob_shapes: list[Shape] = []
+        self.construct()
+        self.context.created()
         self._check_counts()
         self.setup()
         self.top_shapes: list[Shape] = [tuple(s) for s in self.reshape(self.bottom_shapes)]
+
+    def construct(self) -> None:
+        """Do what Caffe does in the layer's constructor, where that shows in the log."""
 
     def setup(self) -> None:
         """Read the parameters and add the learnable blobs."""

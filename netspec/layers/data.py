@@ -188,16 +188,22 @@ class Data(ReadingLayer):
         """Return data_param.batch_size."""
         return self.positive(self.param.data_param.batch_size, "data_param", "batch_size")
 
+    def construct(self) -> None:
+        """Open the database; a setting that is missing is said first."""
+        if self.context.open_data:
+            self.batch_size_of_param()
+            p, at = self.param.data_param, self.context.at("data_param", "source")
+            self._reader = open_reader(self.named(p.source, "data_param", "source"), BACKENDS[p.backend], at)
+
     def open(self) -> Source:
-        """Open the database; its first record sets the shape."""
-        p = self.param.data_param
-        at = self.context.at("data_param", "source")
-        reader = open_reader(self.named(p.source, "data_param", "source"), BACKENDS[p.backend], at)
+        """Read the first record, which sets the shape."""
+        p, reader = self.param.data_param, self._reader
         transformer = self.transformer()
         if p.force_encoded_color:
             transformer.color = True
         skip = self.skip(p.rand_skip, len(reader), "data_param", "rand_skip")
-        source = DatabaseSource(reader, Cursor(len(reader), self.batch_size, skip), transformer, at)
+        cursor = Cursor(len(reader), self.batch_size, skip)
+        source = DatabaseSource(reader, cursor, transformer, self.context.at("data_param", "source"))
         self.log_size(source, "data_layer.cpp:45")
         return source
 

@@ -1,13 +1,32 @@
-"""How tests build a net from text, and keep what it warns of."""
+"""How tests build a net from text, keep what it warns of, and get a folder to train in."""
 
 import logging
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from netspec.graph.filter import with_state
 from netspec.net import BuildOptions, Net, build_net
 from netspec.proto.text import parse_net_text
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+
+
+@pytest.fixture
+def work_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Return a function that copies a golden folder into the working directory, under a name of choice.
+
+    ``pairs/`` is there beside it, as the paths in the golden files want it.
+    """
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pairs").symlink_to(GOLDEN / "pairs")
+
+    def copy(source: str, name: str = "") -> Path:
+        return Path(shutil.copytree(GOLDEN / source, name or Path(source).name))
+
+    return copy
 
 
 @pytest.fixture

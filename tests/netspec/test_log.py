@@ -1,0 +1,155 @@
+"""The log is Caffe's, line by line: what it printed for the same runs, and what people's log parsers make of it."""
+
+import re
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from netspec import log
+from netspec.cli import main
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+TRAIN = ["train", "--solver=sgd_step/solver.prototxt", "--weights=sgd_step/init.caffemodel"]
+RESUME = ["train", "--solver=sgd_step/solver.prototxt", "--snapshot=sgd_step/ref_iter_40.solverstate"]
+TEST = ["test", "--model=sgd_step/train_val.prototxt", "--weights=sgd_step/init.caffemodel", "--iterations=4"]
+TIME = ["time", "--model=sgd_step/train_val.prototxt", "--iterations=5"]
+
+#: A clock's, or of the threads that read ahead: where in the log they come is chance.
+OF_THE_MOMENT = ("Restarting data prefetching from start.", "blocking_queue.cpp:49] Waiting for data")
+    "data_layer.cpp:73] Restarting data prefetching from start.",
+    "blocking_queue.cpp:49] Waiting for data",
+)
+
+
+@pytest.fixture
+def run(work_in: Callable[..., Path], capfd: pytest.CaptureFixture[str]) -> Callable[[list[str]], list[str]]:
+    """``run(arguments)``: what a command prints to stderr, line by line, beside the golden snapshots."""
+    work_in("snapshot", "sgd_step")
+
+    def run_command(arguments: list[str]) -> list[str]:
+        capfd.readouterr()
+        assert main(arguments) == 0
+        return capfd.readouterr().err.splitlines()
+
+    return run_command
+
+
+def sentences(lines: list[str]) -> list[str]:
+    """Return the lines without what differs from run to run: glog's prefix, seconds, the lines of other threads."""
+    plain = [re.sub(r"^([IWE])\d{4,8} \S+ +\d+ ", r"\1 ", line) for line in lines]
+    plain = [line for line in plain if not line.endswith(OF_THE_MOMENT)]
+    plain = [re.sub(r"\(\S+ iter/s, \S+s/10 iters\)", "(_ iter/s, _s/10 iters)", line) for line in plain]
+    return [re.sub(r"[\d.e+-]+ ms\.$", "_ ms.", line) for line in plain]
+
+
+def split_loss(line: str) -> tuple[str, list[float]]:
+    """Return the words of a line, and the values of the losses in it."""
+    if not re.search(r"[Ll]oss[:=]? ", line) or " with loss weight " in line:
+        return line, []
+    number = r"(?<=[ =])\d+\.\d+(?:e-\d+)?"
+    return re.sub(number, "_", line), [float(found) for found in re.findall(number, line)]
+
+
+def losses(lines: list[tuple[str, list[float]]]) -> list[float]:
+    return [value for _, values in lines for value in values]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "golden"),
+    [(TRAIN, "caffe_train.log"), (RESUME, "caffe_resume.log"), (TEST, "caffe_test.log")],
+    ids=["train", "resume", "test"],
+)
+def test_a_run_logs_what_caffes_did(run: Callable[[list[str]], list[str]], arguments: list[str], golden: str) -> None:
+    found = [split_loss(line) for line in sentences(run(arguments))]
+    expected = [split_loss(line) for line in sentences((GOLDEN / "log" / golden).read_text().splitlines())]
+    assert [words for words, _ in found] == [words for words, _ in expected]
+    np.testing.assert_allclose(losses(found), losses(expected), rtol=1e-4)
+
+
+def test_a_timing_logs_what_caffes_did(run: Callable[[list[str]], list[str]]) -> None:
+    found = [split_loss(line)[0] for line in sentences(run(TIME))]
+    expected = (GOLDEN / "log" / "caffe_time.log").read_text().splitlines()
+    assert found == [split_loss(line)[0] for line in sentences(expected)]
+
+
+@pytest.mark.parametrize("arguments", [TRAIN, TEST, TIME], ids=lambda arguments: arguments[0])
+def test_every_line_has_exactly_the_four_fields_of_the_glog_of_caffes_time(
+    run: Callable[[list[str]], list[str]], arguments: list[str]
+) -> None:
+    inside_proto = False
+    lines = run(arguments)
+    assert len(lines) > 100
+    for line in lines:
+        match = re.match(r"[IWEF]\d{4} \d\d:\d\d:\d\d\.\d{6} +\d+ \w+\.[ch]pp:\d+\] ", line)
+        if match:
+            assert len(match[0].split()) == 4
+            inside_proto = line.endswith("from parameters: ")
+        else:
+            assert inside_proto, line
+
+
+def test_the_end_of_the_data_is_logged_each_time_it_is_met(run: Callable[[list[str]], list[str]]) -> None:
+    """60 batches of 32 end the 640 records three times, and each test's four of 50 the 200 records once."""
+    ends = [line for line in run(TRAIN) if line.endswith("Restarting data prefetching from start.")]
+    assert len(ends) == 3 + 3
+
+
+# What the tools that people have for Caffe's logs read, each rule as they apply it.
+
+
+@pytest.fixture
+def training_log(run: Callable[[list[str]], list[str]]) -> list[str]:
+    return run(TRAIN)
+
+
+def test_log_parsers_find_rates_losses_and_scores_by_iteration(training_log: list[str]) -> None:
+    iteration = -1
+    rates: dict[int, float] = {}
+    scores: dict[str, dict[int, float]] = {"Train": {}, "Test": {}}
+    for line in training_log:
+        if match := re.search(r"Iteration (\d+)", line):
+            iteration = int(match[1])
+        if match := re.search(r"lr = ([-+]?[0-9]*\.?[0-9]+([eE]?[-+]?[0-9]+)?)", line):
+            rates[iteration] = float(match[1])
+        if match := re.search(r"(Train|Test) net output #(\d+): (\S+) = ([\.\deE+-]+)", line):
+            assert (match[2], match[3]) == ("0", "loss")
+            scores[match[1]][iteration] = float(match[4])
+    assert rates == {0: 0.05, 10: 0.05, 20: 0.005, 30: 0.005, 40: 0.0005, 50: 0.0005}
+    assert scores["Train"] == pytest.approx(
+        {0: 0.153106, 10: 0.0442083, 20: 0.0583595, 30: 0.0435475, 40: 0.0523755, 50: 0.0370414}, rel=1e-4
+    )
+    assert list(scores["Test"]) == [0, 25, 50]
+    assert scores["Test"][25] == pytest.approx(0.0510559, rel=1e-4)
+
+
+def test_log_parsers_find_the_moment_of_the_start_and_of_each_line(training_log: list[str]) -> None:
+    start = next(line for line in training_log if "Solving" in line)
+    moments = []
+    for line in training_log[training_log.index(start) :]:
+        day, clock = line.split()[:2]
+        moments.append(datetime.strptime(f"{time.localtime().tm_year}{day[1:]} {clock}", "%Y%m%d %H:%M:%S.%f"))
+    assert moments == sorted(moments)
+    assert abs((datetime.now() - moments[-1]).total_seconds()) < 3600
+
+
+def test_log_parsers_find_values_by_their_field(training_log: list[str]) -> None:
+    """Shell scripts count blanks: of a rate's line they take the ninth field, of a test score's the eleventh."""
+    rates = [line.split()[8] for line in training_log if ", lr = " in line]
+    assert rates == ["0.05", "0.05", "0.005", "0.005", "0.0005", "0.0005"]
+    scores = [float(line.split()[10]) for line in training_log if "Test net output #0" in line]
+    assert scores[1] == pytest.approx(0.0510559, rel=1e-4)
+
+
+# Numbers
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.153106, "0.153106"), (1.0, "1"), (1e-5, "1e-05"), (123456.7, "123457"), (1234567.0, "1.23457e+06"), (0.0, "0")],
+)
+def test_numbers_are_printed_as_streams_of_c_plus_plus_print_them(value: float, text: str) -> None:
+    assert log.number(value) == text
