@@ -20,9 +20,6 @@ TIME = ["time", "--model=sgd_step/train_val.prototxt", "--iterations=5"]
 
 #: A clock's, or of the threads that read ahead: where in the log they come is chance.
 OF_THE_MOMENT = ("Restarting data prefetching from start.", "blocking_queue.cpp:49] Waiting for data")
-    "data_layer.cpp:73] Restarting data prefetching from start.",
-    "blocking_queue.cpp:49] Waiting for data",
-)
 
 
 @pytest.fixture
