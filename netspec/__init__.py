@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 from netspec.errors import SpecError
 
 if TYPE_CHECKING:
+    from netspec.dialects import use_dialect
     from netspec.net import Net, load_net
     from netspec.solver.solver import Solver, load_solver
     from netspec.weights import load_weights, save_weights
 
 _HOMES = {
+    "use_dialect": "netspec.dialects",
     "Net": "netspec.net",
     "load_net": "netspec.net",
     "Solver": "netspec.solver.solver",
@@ -24,7 +26,7 @@ _HOMES = {
     "save_weights": "netspec.weights",
 }
 
-__all__ = ["Net", "Solver", "SpecError", "load_net", "load_solver", "load_weights", "save_weights"]
+__all__ = ["Net", "Solver", "SpecError", "load_net", "load_solver", "load_weights", "save_weights", "use_dialect"]
 
 
 def __getattr__(name: str) -> Any:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from netspec import log
+from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 
 
@@ -26,6 +27,8 @@ def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
         return int(end.code or 0)
     try:
         with _logging(arguments.warnings_only):
+            for name in arguments.plugin:
+                use_dialect(name)
             return arguments.run(arguments) or 0
     except SpecError as fault:
         print(fault, file=sys.stderr)

@@ -11,15 +11,16 @@ _LAYERS: dict[str, type[Layer]] = {}
 L = TypeVar("L", bound=type[Layer])
 
 
-def register(type_name: str, *reads: str) -> Callable[[L], L]:
+def register(type_name: str, *reads: str, replaces: type[Layer] | None = None) -> Callable[[L], L]:
     """Class decorator: make a layer known under the type that prototxt files use.
 
     ``reads`` are the fields of LayerParameter that are the layer's own, e.g. ``"pooling_param"``, and what a dialect
-    adds to them, e.g. ``"pooling_param.extra"``; a net warns of all others (see netspec/unused.py).
+    adds to them, e.g. ``"pooling_param.extra"``; a net warns of all others (see netspec/unused.py). With ``replaces``
+    a dialect's subclass takes the place of the class that has the type, to honour such an addition.
     """
 
     def add(cls: L) -> L:
-        assert type_name not in _LAYERS, f"layer type {type_name} registered twice"
+        assert _LAYERS.get(type_name) is replaces, f"layer type {type_name} registered twice"
         cls.type = type_name
         cls.reads = frozenset(reads)
         _LAYERS[type_name] = cls

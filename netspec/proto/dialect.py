@@ -31,17 +31,21 @@ from netspec.proto.schema import PACKAGE, add_file, added_fields, as_field, fiel
 
 @dataclass(frozen=True)
 class Dialect:
-    """What a fork adds. ``advice`` says to a user how to switch it on, e.g. ``"add --plugin ssd"``."""
+    """What a fork adds. ``advice`` says to a user how to switch it on, e.g. ``"add --plugin ssd"``.
+
+    ``file`` is where the source stands, for errors.
+    """
 
     name: str
     source: str = ""
     layer_types: tuple[str, ...] = ()
     advice: str = ""
+    file: str = ""
 
     @cached_property
     def declarations(self) -> FileDescriptorProto:
         """The additions as a descriptor, in a package of their own, so that forks may use the same names."""
-        file = read_declarations(self.source, f"{self.name}.proto", f"{PACKAGE}.{self.name}")
+        file = read_declarations(self.source, self.file or f"{self.name}.proto", f"{PACKAGE}.{self.name}")
         if "caffe.proto" not in file.dependency:
             file.dependency.append("caffe.proto")
         return file
@@ -71,9 +75,13 @@ def announce(dialect: Dialect) -> None:
 def activate(dialect: Dialect) -> None:
     """Announce a dialect and add its fields and messages to the schema. Does nothing if it is active.
 
-    Raises SpecError as :func:`announce`, and where Caffe or another active dialect has a field or a number of it.
+    Raises SpecError as :func:`announce`, and where Caffe or another active dialect has a field or a number of it, or
+    its name.
     """
     if dialect.name in _active:
+        if _active[dialect.name] != dialect:
+            message = f'another dialect "{dialect.name}" is active, from {_active[dialect.name].declarations.name}'
+            raise SpecError(message, Where(dialect.declarations.name))
         return
     announce(dialect)
     file = dialect.declarations

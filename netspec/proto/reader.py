@@ -14,6 +14,7 @@ from google.protobuf.message import Message
 
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto import dialect
+from netspec.proto.dialect_files import announce_known
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
 from netspec.proto.schema import Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Node
@@ -289,6 +290,7 @@ class _Reader:
         """Say that a field is unknown, and as well as can be guessed what was meant."""
         descriptor = message.DESCRIPTOR
         fault = f'{descriptor.name} has no field "{name}"'
+        announce_known()
         fork = dialect.advice_for_field(descriptor.full_name, name)
         if fork:
             return f"{fault}; {fork}"

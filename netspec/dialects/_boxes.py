@@ -1,0 +1,149 @@
+"""Boxes as SSD's layers handle them: what overlaps, what is encoded, matched and suppressed.
+
+A box is (xmin, ymin, xmax, ymax) in parts of the image, so 0 to 1 within it. Arrays are float32, as the fork's boxes.
+Fork: weiliu89/caffe (ssd), src/caffe/util/bbox_util.cpp
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from netspec.layers.base import Layer, Shape
+
+Array = np.ndarray
+
+CORNER, CENTER_SIZE, CORNER_SIZE = 1, 2, 3  # ssd.py: enum PriorBoxParameter.CodeType
+NO_MATCH, LEFT_OUT = -1, -2  # instead of the index of a matched box
+LEAST_OVERLAP = 1e-6  # less is none
+LEAST_SIZE = 1e-5  # smaller boxes do not take part in suppress_all
+
+
+def as_array(tensor: torch.Tensor) -> Array:
+    """Return the values of a tensor."""
+    return tensor.detach().cpu().float().numpy()
+
+
+def check_predictions(layer: Layer, bottom_shapes: Sequence[Shape], kinds: int, classes: int) -> int:
+    """Return how many priors there are; refuse boxes of so many kinds, or confidences, that do not suit them.
+
+    The bottoms are boxes, confidences and priors.
+    """
+    loc, conf, prior = bottom_shapes[:3]
+    if prior[:2] != (1, 2) or math.prod(prior) % 8:
+        raise layer.error(f"found priors of shape {prior}, expected (1, 2, 4 P)", "bottom", 2)
+    priors = math.prod(prior) // 8
+    for i, (shape, each, what) in enumerate(((loc, 4 * kinds, "numbers of boxes"), (conf, classes, "confidences"))):
+        if math.prod(shape[1:]) != priors * each or shape[:1] != loc[:1]:
+            message = f"found {what} of shape {shape}, expected ({loc[0]}, {priors * each}) for {priors} priors"
+            raise layer.error(message, "bottom", i)
+    return priors
+
+
+def sizes(boxes: Array) -> Array:
+    """Return the areas of boxes (..., 4): (...); 0 where a box is turned inside out."""
+    width, height = boxes[..., 2] - boxes[..., 0], boxes[..., 3] - boxes[..., 1]
+    return np.where((width < 0) | (height < 0), np.float32(0), width * height)
+
+
+def overlaps(first: Array, second: Array) -> Array:
+    """Return intersection over union of each pair of boxes (..., 4), broadcast against each other."""
+    low = np.maximum(first[..., :2], second[..., :2])
+    high = np.minimum(first[..., 2:], second[..., 2:])
+    width, height = high[..., 0] - low[..., 0], high[..., 1] - low[..., 1]
+    shared = np.where((width > 0) & (height > 0), width * height, np.float32(0))
+    union = sizes(first) + sizes(second) - shared
+    return np.divide(shared, union, out=np.zeros_like(shared), where=shared > 0)
+
+
+def encode(boxes: Array, priors: Array, variances: Array | None, code: int) -> Array:
+    """Return boxes (n, 4) relative to their priors (n, 4), divided by the variances (n, 4) unless None."""
+    (low, high), (extent, centre) = _corners(priors), _centres(priors)
+    box_low, box_high = _corners(boxes)
+    if code == CENTER_SIZE:
+        box_extent, box_centre = _centres(boxes)
+        codes = np.concatenate([(box_centre - centre) / extent, np.log(box_extent / extent)], axis=1)
+    else:
+        scale = extent if code == CORNER_SIZE else np.float32(1)
+        codes = np.concatenate([(box_low - low) / scale, (box_high - high) / scale], axis=1)
+    return codes if variances is None else codes / variances
+
+
+def decode(codes: Array, priors: Array, variances: Array | None, code: int) -> Array:
+    """Return the boxes (n, 4) of which :func:`encode` makes ``codes``."""
+    (low, high), (extent, centre) = _corners(priors), _centres(priors)
+    if variances is not None:
+        codes = codes * variances
+    first, second = _corners(codes)
+    if code == CENTER_SIZE:
+        box_centre, half = first * extent + centre, np.exp(second) * extent / np.float32(2)
+        return np.concatenate([box_centre - half, box_centre + half], axis=1)
+    scale = extent if code == CORNER_SIZE else np.float32(1)
+    return np.concatenate([low + first * scale, high + second * scale], axis=1)
+
+
+def _corners(boxes: Array) -> tuple[Array, Array]:
+    return boxes[:, :2], boxes[:, 2:]
+
+
+def _centres(boxes: Array) -> tuple[Array, Array]:
+    low, high = _corners(boxes)
+    return high - low, (low + high) / np.float32(2)
+
+
+def outside(boxes: Array) -> Array:
+    """Return which coordinates of boxes (..., 4) lie outside the image."""
+    return (boxes < 0) | (boxes > 1)
+
+
+def match(boxes: Array, truth: Array, threshold: float | None, leave_out: Array) -> tuple[Array, Array]:
+    """Match boxes (p, 4) with true ones (g, 4): the index of the true box, or NO_MATCH or LEFT_OUT; the overlap.
+
+    First the pairs of the largest overlap, each box and each true box once; then, with a threshold, every box left
+    that overlaps one by at least that, with the one it overlaps most. An unmatched box's overlap is its largest.
+    ``leave_out`` (p,) says which boxes take no part.
+    """
+    found = np.where(leave_out, LEFT_OUT, NO_MATCH)
+    table = overlaps(boxes[:, None], truth[None])
+    table = np.where((table > LEAST_OVERLAP) & ~leave_out[:, None], table, np.float32(0))
+    best = table.max(axis=1, initial=0)
+    free = table.copy()
+    for _ in range(len(truth)):
+        box, true = np.unravel_index(free.argmax(), free.shape)
+        if free[box, true] == 0:
+            break
+        found[box], best[box] = true, free[box, true]
+        free[box], free[:, true] = 0, 0
+    if threshold is not None and len(truth):
+        extra = (found == NO_MATCH) & (best >= threshold) & (best > 0)
+        found[extra] = table[extra].argmax(axis=1)
+    return found, best
+
+
+def suppress(boxes: Array, threshold: float, eta: float = 1.0) -> list[int]:
+    """Return which boxes (n, 4), in this order, overlap none kept before by more than the threshold.
+
+    Where ``eta`` is below 1, the threshold is multiplied by it after each box kept, as long as it is above 0.5.
+    """
+    limit = np.float32(threshold)
+    kept: list[int] = []
+    most = np.zeros(len(boxes), np.float32)
+    for i in range(len(boxes)):
+        if most[i] > limit:
+            continue
+        kept.append(i)
+        most = np.maximum(most, overlaps(boxes[i], boxes))
+        if eta < 1 and limit > 0.5:
+            limit *= np.float32(eta)
+    return kept
+
+
+def suppress_all(boxes: Array, scores: Array, threshold: float, top_k: int) -> Array:
+    """Return the indices of the boxes that :func:`suppress` keeps among the ``top_k`` (-1: all) of highest score."""
+    order = np.argsort(-scores, kind="stable")
+    order = order[: top_k if top_k > -1 else None]
+    order = order[sizes(boxes[order]) >= LEAST_SIZE]
+    return order[suppress(boxes[order], threshold)]

@@ -1,0 +1,396 @@
+"""Building blocks that many forks added, for classification and segmentation: SENet, PSPNet, SegNet, MobileNet, ...
+
+Where two forks have different layers of one name (BN, Upsample), the fields that are given say which is meant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from netspec.layers import Layer, register
+from netspec.layers.activation import Activation
+from netspec.layers.base import TRAIN, Shape
+from netspec.layers.vision_convolution import Convolution
+from netspec.proto.schema import value
+
+DECLARATIONS = """
+message InterpParameter {
+  optional int32 height = 1 [default = 0];
+  optional int32 width = 2 [default = 0];
+  optional int32 zoom_factor = 3 [default = 1];
+  optional int32 shrink_factor = 4 [default = 1];
+  optional int32 pad_beg = 5 [default = 0];
+  optional int32 pad_end = 6 [default = 0];
+}
+message BNParameter {
+  enum Engine { DEFAULT = 0; CAFFE = 1; CUDNN = 2; }
+  enum BNMode { LEARN = 0; INFERENCE = 1; }
+  // PSPNet
+  optional FillerParameter slope_filler = 1;
+  optional FillerParameter bias_filler = 2;
+  optional float momentum = 3 [default = 0.9];
+  optional float eps = 4 [default = 1e-5];
+  optional bool frozen = 5 [default = false];
+  optional Engine engine = 6 [default = DEFAULT];
+  // SegNet
+  optional FillerParameter scale_filler = 11;
+  optional FillerParameter shift_filler = 12;
+  optional BNMode bn_mode = 13 [default = LEARN];
+}
+message UpsampleParameter {
+  optional uint32 scale = 1;
+  optional uint32 scale_h = 2;
+  optional uint32 scale_w = 3;
+  optional bool pad_out_h = 4 [default = false];
+  optional bool pad_out_w = 5 [default = false];
+  optional uint32 upsample_h = 6;
+  optional uint32 upsample_w = 7;
+}
+message ReLU6Parameter {
+  optional float negative_slope = 1 [default = 0];
+}
+message ShuffleChannelParameter {
+  optional uint32 group = 1 [default = 1];
+}
+extend LayerParameter {
+  optional UpsampleParameter upsample_param = 160;
+  optional InterpParameter interp_param = 163;
+  optional ShuffleChannelParameter shuffle_channel_param = 164;
+  optional BNParameter bn_param = 1137;
+  optional ReLU6Parameter relu6_param = 100000;
+}
+"""
+
+INFERENCE = 1  # BNParameter.BNMode
+SEGNET_EPS = 1e-9  # added to the variance by SegNet's BN
+
+
+@register("Axpy")
+class Axpy(Layer):
+    """a x + y with one a a channel of each image: a squeeze-and-excitation block's end.
+
+    bottom[0]  a (N, C) or (N, C, 1, 1)
+    bottom[1]  x (N, C, ...)
+    bottom[2]  y, the shape of x
+    top[0]     the shape of x
+    Fork: hujie-frank/SENet, src/caffe/layers/axpy_layer.cpp
+    """
+
+    bottoms = (3, 3)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of x."""
+        a, x, y = bottom_shapes
+        if len(a) < 2 or a[:2] != x[:2] or any(size != 1 for size in a[2:]) or x != y:
+            message = f"found shapes {a}, {x} and {y}, expected (N, C, 1, 1) and twice (N, C, ...)"
+            raise self.error(message, "bottom")
+        return [x]
+
+    def forward(self, a: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Return the sums."""
+        return torch.addcmul(y, a.reshape(*a.shape[:2], *(1,) * (x.dim() - 2)), x)
+
+
+@register("ReLU6", "relu6_param")
+class ReLU6(Activation):
+    """min(max(x, 0) + negative_slope min(x, 0), 6); the gradient at 0 is the negative side's, at 6 none.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: chuanqi305/ssd and others, src/caffe/layers/relu6_layer.cpp
+    """
+
+    gradient_reads = frozenset({"bottom"})
+
+    def setup(self) -> None:
+        """Read the slope of the negative side."""
+        self.slope: float = value(self.param, "relu6_param").negative_slope
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the rectified bottom."""
+        return torch.where(x >= 6, 6, F.leaky_relu(x, self.slope) if self.slope else F.relu(x))
+
+    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.gradient_in_place`."""
+        return torch.where(bottom > 0, diff, diff * self.slope).where(bottom < 6, 0)
+
+
+@register("DepthwiseConvolution", "convolution_param")
+class DepthwiseConvolution(Convolution):
+    """A convolution of each channel for itself: group must be the number of channels.
+
+    bottom[i]  (N, C, H, W)
+    top[i]     (N, num_output, H', W') as Convolution's
+    blobs[0]   filters (num_output, 1, kernel_h, kernel_w)
+    blobs[1]   bias    (num_output,)                                   unless bias_term: false
+    Fork: yonghenglh6/DepthwiseConvolution
+    """
+
+    def setup(self) -> None:
+        """Set up as Convolution; refuse filters over more than one channel."""
+        super().setup()
+        if self.group != self.channels:
+            message = f"group must be the number of channels, {self.channels}, found {self.group}"
+            raise self.error(message, "convolution_param", "group")
+
+
+@register("ConvolutionDepthwise", "convolution_param")
+class ConvolutionDepthwise(Convolution):
+    """A convolution of each channel for itself; num_output and group are not needed and not read.
+
+    bottom[0]  (N, C, H, W)
+    top[0]     (N, C, H', W') as Convolution's
+    blobs[0]   filters (C, 1, kernel_h, kernel_w)
+    blobs[1]   bias    (C,)                                            unless bias_term: false
+    Fork: BVLC/caffe#5665, farmingyard/ShuffleNet, src/caffe/layers/conv_dw_layer.cpp
+    """
+
+    bottoms = (1, 1)
+    tops = (1, 1)
+    ignores = frozenset({"convolution_param.group"})
+
+    def setup(self) -> None:
+        """Read the geometry, add the filters and the bias."""
+        self.read_geometry()
+        if self.spatial_axes != 2:
+            raise self.error(f"found a bottom of shape {self.bottom_shapes[0]}, expected (N, C, H, W)", "bottom")
+        param = self.param.convolution_param
+        self.channels = self.num_output = self.group = self.bottom_shapes[0][self.channel_axis]
+        if param.num_output != self.channels:
+            self.ignores = self.ignores | {"convolution_param.num_output"}
+        self.add_blob(self.filter_shape(), param.weight_filler)
+        if param.bias_term:
+            self.add_blob((self.num_output,), param.bias_filler)
+
+
+@register("ShuffleChannel", "shuffle_channel_param")
+class ShuffleChannel(Layer):
+    """Deal the channels of ``group`` groups out in turn: the first of each group, then the second of each.
+
+    bottom[0]  (N, C, ...), C a multiple of group
+    top[0]     the same shape
+    Fork: farmingyard/ShuffleNet, shuffle_channel_layer.cpp
+    """
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the bottom's shape."""
+        shape, self.group = bottom_shapes[0], value(self.param, "shuffle_channel_param").group
+        if len(shape) < 2 or self.group < 1 or shape[1] % self.group:
+            message = f"found a bottom of shape {shape}, expected channels that are a multiple of group, {self.group}"
+            raise self.error(message, "shuffle_channel_param", "group")
+        return [shape]
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the shuffled channels."""
+        return data.unflatten(1, (self.group, -1)).transpose(1, 2).flatten(1, 2)
+
+
+@register("Interp", "interp_param")
+class Interp(Layer):
+    """Resize each map bilinearly, corner pixels on corner pixels, after cutting off a border.
+
+    The new size is height and width, or the second bottom's, or follows from shrink_factor s and zoom_factor z (where
+    both are given, one after the other): (H - 1) // s + 1 and H + (H - 1) (z - 1).
+
+    bottom[0]  (N, C, H, W)
+    bottom[1]  optional: a blob of the new height and width; gets no gradient
+    top[0]     (N, C, H', W')
+    Fork: DeepLab, hszhao/PSPNet, src/caffe/layers/interp_layer.cpp, src/caffe/util/interp.cpp
+    """
+
+    bottoms = (1, 2)
+    label_bottoms = frozenset({1})
+
+    def setup(self) -> None:
+        """Check that the new size is given in one way."""
+        param: Any = value(self.param, "interp_param")
+        factors = [name for name in ("shrink_factor", "zoom_factor") if param.HasField(name)]
+        explicit = [name for name in ("height", "width") if param.HasField(name)]
+        ways = [bool(factors), bool(explicit), len(self.bottom_shapes) == 2]
+        if sum(ways) != 1 or len(explicit) == 1:
+            found = ", ".join([*factors, *explicit, *["a second bottom"][: ways[2]]]) or "none of them"
+            message = f"expected zoom_factor or shrink_factor, or height and width, or a second bottom; found {found}"
+            raise self.error(message, "interp_param")
+        for name in factors + explicit:
+            if getattr(param, name) < 1:
+                raise self.error(f"{name} must be at least 1, found {getattr(param, name)}", "interp_param", name)
+        for name in ("pad_beg", "pad_end"):
+            if getattr(param, name) > 0:
+                message = f"{name} must be 0, or negative to cut off pixels, found {getattr(param, name)}"
+                raise self.error(message, "interp_param", name)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of the resized maps."""
+        param, shape = value(self.param, "interp_param"), bottom_shapes[0]
+        if any(len(each) != 4 for each in bottom_shapes):
+            raise self.error(f"found bottoms of shapes {bottom_shapes}, expected 4 axes (N, C, H, W)", "bottom")
+        inner = [size + param.pad_beg + param.pad_end for size in shape[2:]]
+        if min(inner) < 1:
+            raise self.error(f"pad_beg and pad_end leave nothing of a map of {shape[2]} x {shape[3]}", "interp_param")
+        if len(bottom_shapes) == 2:
+            size = bottom_shapes[1][2:]
+        elif param.HasField("height"):
+            size = (param.height, param.width)
+        else:
+            shrunk = [(length - 1) // param.shrink_factor + 1 for length in inner]
+            size = tuple(length + (length - 1) * (param.zoom_factor - 1) for length in shrunk)
+        return [(*shape[:2], *size)]
+
+    def forward(self, data: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        """Return the resized maps."""
+        param = value(self.param, "interp_param")
+        cut = [param.pad_beg, param.pad_end] * 2
+        inner = F.pad(data, cut) if any(cut) else data
+        return F.interpolate(inner, self.top_shapes[0][2:], mode="bilinear", align_corners=True)
+
+
+class _Unpool(torch.autograd.Function):
+    """Bring each value to the pixel that its mask names; the last one stays, every one gets the pixel's gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, mask: torch.Tensor, pixels: int) -> torch.Tensor:
+        ctx.save_for_backward(mask)
+        order = torch.arange(mask.shape[2], device=mask.device).expand_as(mask)
+        nobody = torch.full((*mask.shape[:2], pixels), -1, device=mask.device)
+        last = nobody.scatter_reduce(2, mask, order, "amax")
+        return values.gather(2, last.clamp(min=0)).where(last >= 0, 0)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        (mask,) = ctx.saved_tensors
+        return grads[0].gather(2, mask), None, None
+
+
+@register("Upsample", "upsample_param")
+class Upsample(Layer):
+    """Enlarge maps: by a pooling's mask, each value to where it came from (SegNet), or by repeating each pixel (YOLO).
+
+    With a mask the new size is upsample_h and upsample_w, or ``scale`` times the map's (scale_h and scale_w, 2 unless
+    given), less 1 with pad_out_h and pad_out_w. Of several values for one pixel the last stays; the others' gradient is
+    the pixel's all the same.
+
+    bottom[0]  (N, C, H, W)
+    bottom[1]  optional: the mask, a Pooling layer's second top, of the same shape; gets no gradient
+    top[0]     (N, C, H', W'); without a mask H' = scale H (1 unless given)
+    Fork: alexgkendall/caffe-segnet and eric612/MobileNet-YOLO, src/caffe/layers/upsample_layer.cpp
+    """
+
+    bottoms = (1, 2)
+    label_bottoms = frozenset({1})
+
+    def setup(self) -> None:
+        """Check that the new size is given in one way."""
+        param = value(self.param, "upsample_param")
+        given = {field.name for field, _ in param.ListFields()}
+        masked = len(self.bottom_shapes) == 2
+        if not masked and given - {"scale"}:
+            extra = min(given - {"scale"})
+            raise self.error("without a mask as second bottom there is only scale", "upsample_param", extra)
+        for pair in ("upsample_h", "upsample_w"), ("scale_h", "scale_w"):
+            alone = [name for name in pair if name in given]
+            if len(alone) == 1:
+                raise self.error(f"found {alone[0]} alone, expected {' and '.join(pair)}", "upsample_param", alone[0])
+        scale = param.scale if "scale" in given else 2 if masked else 1
+        self.scale_h, self.scale_w = (param.scale_h, param.scale_w) if "scale_h" in given else (scale, scale)
+        for name, along in (("pad_out_h", self.scale_h), ("pad_out_w", self.scale_w)):
+            if getattr(param, name) and along != 2:
+                raise self.error(f"{name} needs a scale of 2, found {along}", "upsample_param", name)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of the enlarged maps."""
+        param, shape = value(self.param, "upsample_param"), bottom_shapes[0]
+        if len(shape) != 4 or any(other != shape for other in bottom_shapes):
+            message = f"found bottoms of shapes {bottom_shapes}, expected (N, C, H, W), and the mask's the same"
+            raise self.error(message, "bottom")
+        size = (param.upsample_h, param.upsample_w)
+        if not param.HasField("upsample_h"):
+            size = (shape[2] * self.scale_h - param.pad_out_h, shape[3] * self.scale_w - param.pad_out_w)
+        if min(size) < 1:
+            raise self.error(f"the top would have no pixel, {size[0]} x {size[1]}", "upsample_param")
+        return [(*shape[:2], *size)]
+
+    def forward(self, data: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Return the enlarged maps; raise SpecError for a mask of another size."""
+        if mask is None:
+            return F.interpolate(data, self.top_shapes[0][2:], mode="nearest")
+        height, width = self.top_shapes[0][2:]
+        index = mask.detach().long()
+        if index.numel() and not 0 <= int(index.amin()) <= int(index.amax()) < height * width:
+            message = f"the mask names pixel {int(index.amax())}, the top has {height} x {width}; check the scale"
+            raise self.error(message, "bottom", 1)
+        top: torch.Tensor = _Unpool.apply(data.flatten(2), index.flatten(2), height * width)
+        return top.reshape(self.top_shapes[0])
+
+
+@register("BN", "bn_param")
+class BN(Layer):
+    """Batch normalisation and a learned slope and bias in one; PSPNet's, or SegNet's where its fields are given.
+
+    PSPNet's subtracts the batch's mean and divides by sqrt(variance + eps) in training, and by moving averages in
+    testing or where ``frozen``; these move by 1 - momentum towards the batch's mean and biased variance. SegNet's
+    (scale_filler, shift_filler, bn_mode) does so by the batch in both phases; with bn_mode INFERENCE, for which its
+    weights were changed, it has only slope and bias.
+
+    bottom[0]  (N, C, H, W); up to four axes
+    top[0]     the same shape
+    blobs[0]   slopes (1, C, 1, 1), 0 unless a filler is given
+    blobs[1]   biases (1, C, 1, 1)
+    blobs[2]   moving mean     (1, C, 1, 1)                            PSPNet's only; not learned
+    blobs[3]   moving variance (1, C, 1, 1)                            PSPNet's only; not learned
+    Fork: hszhao/PSPNet and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
+    """
+
+    def setup(self) -> None:
+        """Add slopes, biases and moving averages."""
+        param, shape = value(self.param, "bn_param"), self.bottom_shapes[0]
+        if not 2 <= len(shape) <= 4:
+            raise self.error(f"found a bottom of shape {shape}, expected (N, C, H, W), 2 to 4 axes", "bottom")
+        given = {field.name for field, _ in param.ListFields()}
+        segnet = given & {"scale_filler", "shift_filler", "bn_mode"}
+        if segnet and given - segnet - {"engine"}:
+            other = min(given - segnet - {"engine"})
+            raise self.error(
+                f"{other} is PSPNet's and {min(segnet)} SegNet's; they do not go together", "bn_param", other
+            )
+        self.channels = shape[1]
+        size = (1, self.channels, 1, 1)
+        self.add_blob(size, param.scale_filler if segnet else param.slope_filler)
+        self.add_blob(size, param.shift_filler if segnet else param.bias_filler)
+        self.by_batch = param.bn_mode != INFERENCE if segnet else self.phase == TRAIN and not param.frozen
+        self.moving = not segnet
+        self.eps: float = SEGNET_EPS if segnet else param.eps
+        if self.moving:
+            self.add_blob(size)
+            self.add_blob(size, value=float(param.frozen))
+            self.not_learned = frozenset(range(4) if param.frozen else (2, 3))
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the bottom's shape; its channels must stay as many."""
+        shape = bottom_shapes[0]
+        if len(shape) < 2 or shape[1] != self.channels:
+            raise self.error(f"bottom of shape {shape} has not the {self.channels} channels seen first", "bottom")
+        return [shape]
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the normalised values; in training also move the averages."""
+        slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (0, 1))
+        if not self.by_batch and not self.moving:
+            return data * slope + bias
+        if self.by_batch:
+            axes = (0, *range(2, data.dim()))
+            variance, mean = torch.var_mean(data, axes, correction=0, keepdim=True)
+            if self.moving:
+                self._move(mean, variance)
+        else:
+            mean, variance = (self.blob(i).detach().reshape_as(slope) for i in (2, 3))
+        return (data - mean) / (variance + self.eps).sqrt() * slope + bias
+
+    def _move(self, mean: torch.Tensor, variance: torch.Tensor) -> None:
+        momentum = value(self.param, "bn_param").momentum
+        with torch.no_grad():
+            for i, batch in ((2, mean), (3, variance)):
+                self.blob(i).mul_(momentum).add_(batch.reshape(self.blob_shapes[i]), alpha=1 - momentum)

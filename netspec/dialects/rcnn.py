@@ -1,0 +1,250 @@
+"""Fast and Faster R-CNN and R-FCN: rbgirshick/caffe-fast-rcnn, daijifeng001/caffe-rfcn.
+
+Their proposals, anchors and targets are Python layers of py-faster-rcnn, which run with ``--allow-python-layers``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+
+from netspec.layers import Layer, common, register
+from netspec.layers.base import Shape
+from netspec.layers.loss_base import Loss
+from netspec.proto.schema import value
+
+DECLARATIONS = """
+message ROIPoolingParameter {
+  optional uint32 pooled_h = 1 [default = 0];
+  optional uint32 pooled_w = 2 [default = 0];
+  optional float spatial_scale = 3 [default = 1];
+}
+message SmoothL1LossParameter {
+  optional float sigma = 1 [default = 1];
+}
+message PSROIPoolingParameter {
+  required float spatial_scale = 1;
+  required int32 output_dim = 2;
+  required int32 group_size = 3;
+}
+extend LayerParameter {
+  optional PSROIPoolingParameter psroi_pooling_param = 10001;
+  optional ROIPoolingParameter roi_pooling_param = 8266711;
+  optional SmoothL1LossParameter smooth_l1_loss_param = 8266712;
+}
+extend DropoutParameter {
+  optional bool scale_train = 2 [default = true];
+}
+"""
+
+
+@register("Dropout", "dropout_param", "dropout_param.scale_train", replaces=common.Dropout)
+class Dropout(common.Dropout):
+    """As Caffe's; with scale_train: false it does not scale in training but, by 1 - p, in testing.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/dropout_layer.cpp
+    """
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the values that are kept, scaled in the one phase or the other."""
+        top = super().forward(data)
+        return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)
+
+
+class _RegionPooling(Layer):
+    """Base of the layers that pool the part of a map that a region of the image covers."""
+
+    bottoms = (2, 2)
+
+    def check_regions(self, bottom_shapes: Sequence[Shape]) -> int:
+        """Return how many regions there are; refuse bottoms that are no map and regions."""
+        maps, regions = bottom_shapes
+        if len(maps) != 4:
+            raise self.error(f"found a map of shape {maps}, expected 4 axes (N, C, H, W)", "bottom", 0)
+        if regions[1:] not in ((5,), (5, 1, 1)):
+            raise self.error(f"found regions of shape {regions}, expected (R, 5): image, x1, y1, x2, y2", "bottom", 1)
+        return regions[0]
+
+    def images_of(self, regions: torch.Tensor, images: int) -> torch.Tensor:
+        """Return the image that each region (R, 5) is in; raise SpecError for one that is not in the batch."""
+        image = regions[:, 0].long()
+        wrong = image[(image < 0) | (image >= images)]
+        if len(wrong):
+            raise self.error(f"found a region in image {wrong[0]}, expected 0 to {images - 1}", "bottom", 1)
+        return image
+
+
+def _rounded(x: torch.Tensor) -> torch.Tensor:
+    """Return the nearest whole numbers; halves away from zero, as C's round does."""
+    whole = x.trunc()
+    return whole + x.sign() * ((x - whole).abs() >= 0.5)
+
+
+@register("ROIPooling", "roi_pooling_param")
+class ROIPooling(_RegionPooling):
+    """Divide each region of a map into pooled_h x pooled_w bins and return the maximum of each.
+
+    A region's corners are scaled by spatial_scale and rounded to pixels, both included. The first of equal pixels gets
+    the gradient; a bin without a pixel is 0.
+
+    bottom[0]  the map (N, C, H, W)
+    bottom[1]  regions (R, 5): image, x1, y1, x2, y2; gets no gradient
+    top[0]     (R, C, pooled_h, pooled_w)
+    Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/roi_pooling_layer.cpp
+    """
+
+    def setup(self) -> None:
+        """Check the number of bins."""
+        param = value(self.param, "roi_pooling_param")
+        for name in ("pooled_h", "pooled_w"):
+            if getattr(param, name) < 1:
+                raise self.error(f"{name} must be at least 1", "roi_pooling_param", name)
+        self.bins = (param.pooled_h, param.pooled_w)
+        self.scale: float = param.spatial_scale
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of all regions' bins."""
+        return [(self.check_regions(bottom_shapes), bottom_shapes[0][1], *self.bins)]
+
+    def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
+        """Return the maxima."""
+        with torch.no_grad():
+            regions = regions.reshape(-1, 5)
+            image = self.images_of(regions, maps.shape[0])
+            corners = _rounded(regions[:, 1:] * self.scale)
+            columns = self._bins(corners[:, 0], corners[:, 2], self.bins[1], maps.shape[3])
+            rows = self._bins(corners[:, 1], corners[:, 3], self.bins[0], maps.shape[2])
+            indices = torch.full(self.top_shapes[0], -1, dtype=torch.long, device=maps.device)
+            for r, of_image in enumerate(image.tolist()):
+                indices[r] = _first_maxima(maps[of_image], rows[r], columns[r])
+            planes = image[:, None] * maps.shape[1] + torch.arange(maps.shape[1], device=maps.device)
+            flat = planes[:, :, None, None] * (maps.shape[2] * maps.shape[3]) + indices.clamp(min=0)
+        return maps.reshape(-1)[flat].where(indices >= 0, 0)
+
+    @staticmethod
+    def _bins(first: torch.Tensor, last: torch.Tensor, count: int, size: int) -> list[list[list[int]]]:
+        """Return where each bin of each region begins and ends, in pixels of the map: (R, count, 2)."""
+        length = (last - first + 1).clamp(min=1)
+        steps = torch.arange(count + 1, dtype=first.dtype, device=first.device) * (length / count)[:, None]
+        ends = torch.stack([steps[:, :-1].floor(), steps[:, 1:].ceil()], dim=2) + first[:, None, None]
+        return ends.clamp(0, size).long().tolist()
+
+
+def _first_maxima(maps: torch.Tensor, rows: list[list[int]], columns: list[list[int]]) -> torch.Tensor:
+    """Return where, as row * width + column, the first maximum of each bin of maps (C, H, W) is; -1 in an empty bin."""
+    indices = torch.full((maps.shape[0], len(rows), len(columns)), -1, dtype=torch.long, device=maps.device)
+    for j, (left, right) in enumerate(columns):
+        if left >= right:
+            continue
+        values, column = maps[:, :, left:right].max(dim=2)
+        for i, (upper, lower) in enumerate(rows):
+            if upper < lower:
+                row = values[:, upper:lower].argmax(dim=1) + upper
+                indices[:, i, j] = row * maps.shape[2] + column.gather(1, row[:, None]).squeeze(1) + left
+    return indices
+
+
+@register("PSROIPooling", "psroi_pooling_param")
+class PSROIPooling(_RegionPooling):
+    """Divide each region of a map into g x g bins and return the mean of each, from a channel of its own.
+
+    Channel d of the top, row i and column j of the bins, is read from channel (d g + i) g + j of the map, g being
+    group_size. A region's corners are rounded to pixels of the image, both included, then scaled by spatial_scale; a
+    bin is made of all pixels that it touches, and is 0 where there are none.
+
+    bottom[0]  the map (N, output_dim g g, H, W)
+    bottom[1]  regions (R, 5): image, x1, y1, x2, y2; gets no gradient
+    top[0]     (R, output_dim, g, g)
+    Fork: daijifeng001/caffe-rfcn, src/caffe/layers/psroi_pooling_layer.cpp
+    """
+
+    def setup(self) -> None:
+        """Check the sizes."""
+        param = value(self.param, "psroi_pooling_param")
+        for name in ("output_dim", "group_size"):
+            if getattr(param, name) < 1:
+                raise self.error(f"{name} must be given and be at least 1", "psroi_pooling_param", name)
+        self.channels, self.bins, self.scale = param.output_dim, param.group_size, param.spatial_scale
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of all regions' bins; the map must have a channel for each."""
+        regions = self.check_regions(bottom_shapes)
+        expected = self.channels * self.bins * self.bins
+        if bottom_shapes[0][1] != expected:
+            message = f"found {bottom_shapes[0][1]} channels, expected output_dim group_size^2 = {expected}"
+            raise self.error(message, "bottom", 0)
+        return [(regions, self.channels, self.bins, self.bins)]
+
+    def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
+        """Return the means."""
+        with torch.no_grad():
+            regions = regions.reshape(-1, 5)
+            image = self.images_of(regions, maps.shape[0])
+            corners = _rounded(regions[:, 1:])
+            columns = self._inside(corners[:, 0], corners[:, 2], maps.shape[3])
+            rows = self._inside(corners[:, 1], corners[:, 3], maps.shape[2])
+            areas = rows.sum(2)[:, :, None] * columns.sum(2)[:, None, :]
+            rows, columns = rows.to(maps), columns.to(maps)
+        grouped = maps.unflatten(1, (self.channels, self.bins, self.bins))
+        sums = maps.new_zeros(self.top_shapes[0])
+        for i in image.unique().tolist():
+            own = image == i
+            by_row = torch.einsum("rqw,cpqhw->rcpqh", columns[own], grouped[i])
+            sums = sums.index_put((own,), torch.einsum("rph,rcpqh->rcpq", rows[own], by_row))
+        return sums / areas.clamp(min=1)[:, None]
+
+    def _inside(self, first: torch.Tensor, last: torch.Tensor, size: int) -> torch.Tensor:
+        """Return 1 for each pixel of the map that a bin touches along one axis, else 0: (R, bins, size)."""
+        start = first * self.scale
+        length = ((last + 1) * self.scale - start).clamp(min=0.1)
+        steps = torch.arange(self.bins + 1, dtype=first.dtype, device=first.device) * (length / self.bins)[:, None]
+        ends = steps + start[:, None]
+        pixels = torch.arange(size, dtype=first.dtype, device=first.device)
+        return ((pixels >= ends[:, :-1, None].floor()) & (pixels < ends[:, 1:, None].ceil())).to(first.dtype)
+
+
+@register("SmoothL1Loss", "smooth_l1_loss_param")
+class SmoothL1Loss(Loss):
+    """Sum of outside weight x smooth(inside weight x (prediction - target)), divided by the number of items N.
+
+    smooth(d) = 0.5 (sigma d)^2 where |d| < 1 / sigma^2, else |d| - 0.5 / sigma^2
+
+    bottom[0]  predictions (N, ...)
+    bottom[1]  targets, the same shape
+    bottom[2]  optional: inside weights, the same shape; gets no gradient
+    bottom[3]  optional: outside weights, the same shape; gets no gradient
+    top[0]     the loss, ()
+    Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/smooth_L1_loss_layer.cu
+    """
+
+    bottoms = (2, 4)
+    label_bottoms = frozenset({2, 3})
+
+    def setup(self) -> None:
+        """Read sigma."""
+        sigma = value(self.param, "smooth_l1_loss_param").sigma
+        if sigma <= 0:
+            raise self.error(f"sigma must be above 0, found {sigma:g}", "smooth_l1_loss_param", "sigma")
+        self.knee = 1 / (sigma * sigma)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the scalar top's shape; the bottoms must be of one shape, but for ones at its end."""
+        full = [(*shape, 1, 1, 1)[: max(4, len(shape))] for shape in bottom_shapes]
+        for i, shape in enumerate(full):
+            if shape != full[0]:
+                message = f"found bottoms of shapes {bottom_shapes[0]} and {bottom_shapes[i]}, expected one shape"
+                raise self.error(message, "bottom", i)
+        return super().reshape(bottom_shapes)
+
+    def forward(self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
+        """Return the loss."""
+        inside, outside = (*(weight.detach().reshape_as(predictions) for weight in weights), None, None)[:2]
+        difference = predictions - targets.reshape_as(predictions)
+        if inside is not None:
+            difference = difference * inside
+        losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=self.knee)
+        return (losses if outside is None else losses * outside).sum() / len(predictions)

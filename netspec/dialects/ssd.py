@@ -1,0 +1,361 @@
+"""SSD, the single shot detector: weiliu89/caffe, branch ssd.
+
+Not here are its AnnotatedData (databases of images with boxes, and their augmentation), DetectionEvaluate and the
+solver's ``eval_type``. To train, bring images and boxes by other layers: MultiBoxLoss says which rows it takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from netspec.dialects._boxes import Array, as_array, check_predictions, decode, suppress
+from netspec.dialects._multibox import MultiBoxLoss
+from netspec.layers import Layer, register
+from netspec.layers.base import Shape
+from netspec.proto.schema import value
+
+DECLARATIONS = """
+message PermuteParameter {
+  repeated uint32 order = 1;
+}
+message NormalizeParameter {
+  optional bool across_spatial = 1 [default = true];
+  optional FillerParameter scale_filler = 2;
+  optional bool channel_shared = 3 [default = true];
+  optional float eps = 4 [default = 1e-10];
+}
+message PriorBoxParameter {
+  enum CodeType { CORNER = 1; CENTER_SIZE = 2; CORNER_SIZE = 3; }
+  repeated float min_size = 1;
+  repeated float max_size = 2;
+  repeated float aspect_ratio = 3;
+  optional bool flip = 4 [default = true];
+  optional bool clip = 5 [default = false];
+  repeated float variance = 6;
+  optional uint32 img_size = 7;
+  optional uint32 img_h = 8;
+  optional uint32 img_w = 9;
+  optional float step = 10;
+  optional float step_h = 11;
+  optional float step_w = 12;
+  optional float offset = 13 [default = 0.5];
+}
+message NonMaximumSuppressionParameter {
+  optional float nms_threshold = 1 [default = 0.3];
+  optional int32 top_k = 2;
+  optional float eta = 3 [default = 1.0];
+}
+message ResizeParameter {
+  enum Resize_mode { WARP = 1; FIT_SMALL_SIZE = 2; FIT_LARGE_SIZE_AND_PAD = 3; }
+  enum Pad_mode { CONSTANT = 1; MIRRORED = 2; REPEAT_NEAREST = 3; }
+  enum Interp_mode { LINEAR = 1; AREA = 2; NEAREST = 3; CUBIC = 4; LANCZOS4 = 5; }
+  optional float prob = 1 [default = 1];
+  optional Resize_mode resize_mode = 2 [default = WARP];
+  optional uint32 height = 3 [default = 0];
+  optional uint32 width = 4 [default = 0];
+  optional Pad_mode pad_mode = 5 [default = CONSTANT];
+  repeated float pad_value = 6;
+  repeated Interp_mode interp_mode = 7;
+  optional uint32 height_scale = 8 [default = 0];
+  optional uint32 width_scale = 9 [default = 0];
+}
+message SaveOutputParameter {
+  optional string output_directory = 1;
+  optional string output_name_prefix = 2;
+  optional string output_format = 3;
+  optional string label_map_file = 4;
+  optional string name_size_file = 5;
+  optional uint32 num_test_image = 6;
+  optional ResizeParameter resize_param = 7;
+}
+message DetectionOutputParameter {
+  optional uint32 num_classes = 1;
+  optional bool share_location = 2 [default = true];
+  optional int32 background_label_id = 3 [default = 0];
+  optional NonMaximumSuppressionParameter nms_param = 4;
+  optional SaveOutputParameter save_output_param = 5;
+  optional PriorBoxParameter.CodeType code_type = 6 [default = CORNER];
+  optional int32 keep_top_k = 7 [default = -1];
+  optional bool variance_encoded_in_target = 8 [default = false];
+  optional float confidence_threshold = 9;
+  optional bool visualize = 10 [default = false];
+  optional float visualize_threshold = 11;
+  optional string save_file = 12;
+}
+message MultiBoxLossParameter {
+  enum LocLossType { L2 = 0; SMOOTH_L1 = 1; }
+  enum ConfLossType { SOFTMAX = 0; LOGISTIC = 1; }
+  enum MatchType { BIPARTITE = 0; PER_PREDICTION = 1; }
+  enum MiningType { NONE = 0; MAX_NEGATIVE = 1; HARD_EXAMPLE = 2; }
+  optional LocLossType loc_loss_type = 1 [default = SMOOTH_L1];
+  optional ConfLossType conf_loss_type = 2 [default = SOFTMAX];
+  optional float loc_weight = 3 [default = 1.0];
+  optional uint32 num_classes = 4;
+  optional bool share_location = 5 [default = true];
+  optional MatchType match_type = 6 [default = PER_PREDICTION];
+  optional float overlap_threshold = 7 [default = 0.5];
+  optional bool use_prior_for_matching = 8 [default = true];
+  optional uint32 background_label_id = 9 [default = 0];
+  optional bool use_difficult_gt = 10 [default = true];
+  optional bool do_neg_mining = 11;
+  optional float neg_pos_ratio = 12 [default = 3.0];
+  optional float neg_overlap = 13 [default = 0.5];
+  optional PriorBoxParameter.CodeType code_type = 14 [default = CORNER];
+  optional bool encode_variance_in_target = 16 [default = false];
+  optional bool map_object_to_agnostic = 17 [default = false];
+  optional bool ignore_cross_boundary_bbox = 18 [default = false];
+  optional bool bp_inside = 19 [default = false];
+  optional MiningType mining_type = 20 [default = MAX_NEGATIVE];
+  optional NonMaximumSuppressionParameter nms_param = 21;
+  optional int32 sample_size = 22 [default = 64];
+  optional bool use_prior_for_nms = 23 [default = false];
+}
+extend LayerParameter {
+  optional MultiBoxLossParameter multibox_loss_param = 201;
+  optional PermuteParameter permute_param = 202;
+  optional PriorBoxParameter prior_box_param = 203;
+  optional DetectionOutputParameter detection_output_param = 204;
+  optional NormalizeParameter norm_param = 206;
+}
+"""
+
+register("MultiBoxLoss", "multibox_loss_param", "loss_param")(MultiBoxLoss)
+
+
+@register("Permute", "permute_param")
+class Permute(Layer):
+    """Bring the axes into another order: axis i of the top is axis ``order``[i] of the bottom; the others follow.
+
+    bottom[0]  any shape
+    top[0]     its axes in the new order
+    Fork: src/caffe/layers/permute_layer.cpp
+    """
+
+    def setup(self) -> None:
+        """Read the order."""
+        given = list(value(self.param, "permute_param").order)
+        axes = len(self.bottom_shapes[0])
+        for i, axis in enumerate(given):
+            if axis >= axes or axis in given[:i]:
+                message = f"found axis {axis}, expected each of 0 to {axes - 1} at most once"
+                raise self.error(message, "permute_param", "order", i)
+        self.order = given + [axis for axis in range(axes) if axis not in given]
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the permuted shape."""
+        if len(bottom_shapes[0]) != len(self.order):
+            message = f"found a bottom of shape {bottom_shapes[0]}, expected {len(self.order)} axes as before"
+            raise self.error(message, "bottom")
+        return [tuple(bottom_shapes[0][axis] for axis in self.order)]
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the permuted bottom."""
+        return data.permute(self.order).contiguous()
+
+
+@register("Normalize", "norm_param")
+class Normalize(Layer):
+    """Divide by the length over the channels, or with across_spatial over the whole image; multiply by learned scales.
+
+    y = scale x / sqrt(sum of squares + eps)
+
+    bottom[0]  (N, C, ...)
+    top[0]     the same shape
+    blobs[0]   scales (), or (C,) where channel_shared is false; 1 unless scale_filler is given
+    Fork: src/caffe/layers/normalize_layer.cpp
+    """
+
+    def setup(self) -> None:
+        """Add the scales."""
+        param, shape = value(self.param, "norm_param"), self.bottom_shapes[0]
+        if len(shape) < 2:
+            raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
+        filler = param.scale_filler if param.HasField("scale_filler") else None
+        self.add_blob(() if param.channel_shared else shape[1:2], filler, value=1.0)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the bottom's shape; there must be a scale for each channel."""
+        shape = bottom_shapes[0]
+        if len(shape) < 2 or self.blob_shapes[0] not in ((), shape[1:2]):
+            raise self.error(f"bottom of shape {shape} does not have the {self.blob_shapes[0][0]} channels", "bottom")
+        return [shape]
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the normalised values, scaled."""
+        param = value(self.param, "norm_param")
+        axes = tuple(range(1, data.dim())) if param.across_spatial else (1,)
+        length = (data.square().sum(axes, keepdim=True) + param.eps).sqrt()
+        scale = self.blob(0)
+        return data / length * (scale if scale.dim() == 0 else scale.reshape(-1, *(1,) * (data.dim() - 2)))
+
+
+@register("PriorBox", "prior_box_param")
+class PriorBox(Layer):
+    """Lay boxes of some sizes and aspect ratios around the centre of every pixel of a map.
+
+    For each min_size: a square of it; with max_sizes a square of sqrt(min_size max_size); then for each aspect_ratio
+    r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centres are at
+    (index + offset) step; where they are not given, the step is image / map and the image is bottom[1].
+
+    bottom[0]  the map (N, C, H, W)
+    bottom[1]  the image (N, C', H', W'); not needed where img_size, or img_h and img_w, are given
+    top[0]     (1, 2, 4 H W K), K boxes a pixel: [0, 0] (xmin, ymin, xmax, ymax) in parts of the image, [0, 1] variances
+    Fork: src/caffe/layers/prior_box_layer.cpp
+    """
+
+    bottoms = (1, 2)
+    label_bottoms = frozenset({0, 1})
+
+    def setup(self) -> None:
+        """Read sizes, ratios, variances, image and step."""
+        param = value(self.param, "prior_box_param")
+        if not param.min_size or min(param.min_size) < 1:
+            raise self.error("min_size must be given and be at least 1", "prior_box_param", "min_size")
+        if param.max_size and len(param.max_size) != len(param.min_size):
+            message = f"found {len(param.max_size)} max_size, expected none or {len(param.min_size)}, one a min_size"
+            raise self.error(message, "prior_box_param", "max_size")
+        for i, (small, large) in enumerate(zip(param.min_size, param.max_size, strict=False)):
+            if large <= small:
+                message = f"max_size {large:g} must be greater than its min_size {small:g}"
+                raise self.error(message, "prior_box_param", "max_size", i)
+        if len(param.variance) not in (0, 1, 4) or any(v <= 0 for v in param.variance):
+            raise self.error("variance must be one number or four, each above 0", "prior_box_param", "variance")
+        self.variances = np.array(list(param.variance) or [0.1], np.float32) * np.ones(4, np.float32)
+        self.sizes = self._sizes(param)
+        self.image = self._pair(param, "img_size", "img_h", "img_w")
+        self.step = self._pair(param, "step", "step_h", "step_w")
+        if self.image is None and len(self.bottom_shapes) < 2:
+            message = "the image is missing: give it as a second bottom, or img_size, or img_h and img_w"
+            raise self.error(message, "bottom")
+
+    def _sizes(self, param: Any) -> Array:
+        """Return width and height of the boxes of one pixel (K, 2)."""
+        ratios = [1.0]
+        for ratio in param.aspect_ratio:
+            if ratio <= 0:
+                raise self.error(f"aspect_ratio must be above 0, found {ratio:g}", "prior_box_param", "aspect_ratio")
+            if all(abs(ratio - known) >= 1e-6 for known in ratios):
+                ratios += [ratio, 1 / ratio] if param.flip else [ratio]
+        sizes = []
+        for i, small in enumerate(int(size) for size in param.min_size):
+            sizes.append((small, small))
+            if param.max_size:
+                sizes.append((math.sqrt(small * int(param.max_size[i])),) * 2)
+            sizes += [(small * math.sqrt(ratio), small / math.sqrt(ratio)) for ratio in ratios[1:]]
+        return np.array(sizes, np.float32)
+
+    def _pair(self, param: Any, both: str, height: str, width: str) -> tuple[float, float] | None:
+        """Return (vertical, horizontal) of a setting given as one number or as two; None where it is not given."""
+        given = [name for name in (both, height, width) if param.HasField(name)]
+        if not given:
+            return None
+        if given not in ([both], [height, width]) or any(getattr(param, name) <= 0 for name in given):
+            message = f"expected {both}, or both {height} and {width}, above 0; found {' and '.join(given)}"
+            raise self.error(message, "prior_box_param", given[0])
+        return getattr(param, given[0]), getattr(param, given[-1])
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of the boxes; lay them."""
+        if any(len(shape) != 4 for shape in bottom_shapes):
+            raise self.error(f"found bottoms of shapes {bottom_shapes}, expected 4 axes (N, C, H, W)", "bottom")
+        height, width = bottom_shapes[0][2:]
+        image = self.image or bottom_shapes[1][2:]
+        step = self.step or (image[0] / height, image[1] / width)
+        param = value(self.param, "prior_box_param")
+        offset = np.float32(param.offset)
+        y = (np.arange(height, dtype=np.float32) + offset) * np.float32(step[0])
+        x = (np.arange(width, dtype=np.float32) + offset) * np.float32(step[1])
+        centre = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)[:, :, None].astype(float)
+        half = self.sizes / 2.0
+        extent = np.array(image[::-1], float)
+        boxes = np.concatenate([(centre - half) / extent, (centre + half) / extent], axis=-1).astype(np.float32)
+        boxes = boxes.clip(0, 1) if param.clip else boxes
+        self.boxes = np.stack([boxes.reshape(-1), np.tile(self.variances, boxes.size // 4)])[None]
+        return [self.boxes.shape]
+
+    def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
+        """Return the boxes and their variances."""
+        return torch.from_numpy(self.boxes).to(bottoms[0])
+
+
+@register("DetectionOutput", "detection_output_param")
+class DetectionOutput(Layer):
+    """Decode the predicted boxes, and of each class keep those of high confidence that overlap none of a higher one.
+
+    bottom[0]  predicted boxes (N, 4 P) for P priors; (N, 4 P num_classes) where share_location is false
+    bottom[1]  confidences (N, P num_classes)
+    bottom[2]  priors and variances (1, 2, 4 P)
+    bottom[3]  optional, not used: the images, which the fork draws the boxes into
+    top[0]     (1, 1, D, 7): image, label, confidence, xmin, ymin, xmax, ymax of D detections; D is 1 before the first
+               pass. Where nothing is found, a row (image, -1, -1, ...) for each image. Brings no gradient.
+    Fork: src/caffe/layers/detection_output_layer.cpp
+    """
+
+    bottoms = (3, 4)
+    label_bottoms = frozenset({0, 1, 2, 3})
+    ignores = frozenset(
+        f"detection_output_param.{name}"
+        for name in ("save_output_param", "visualize", "visualize_threshold", "save_file")
+    )
+
+    def setup(self) -> None:
+        """Check the number of classes and what suppression needs."""
+        param = value(self.param, "detection_output_param")
+        if param.num_classes < 1:
+            raise self.error("num_classes must be given", "detection_output_param", "num_classes")
+        if param.nms_param.nms_threshold < 0:
+            message = "nms_threshold must not be negative"
+            raise self.error(message, "detection_output_param", "nms_param", "nms_threshold")
+        if not 0 < param.nms_param.eta <= 1:
+            raise self.error("eta must be above 0, at most 1", "detection_output_param", "nms_param", "eta")
+        self.kinds = 1 if param.share_location else param.num_classes
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of one detection; the predictions must suit the priors."""
+        param = value(self.param, "detection_output_param")
+        self.priors = check_predictions(self, bottom_shapes, self.kinds, param.num_classes)
+        return [(1, 1, 1, 7)]
+
+    def forward(self, loc: torch.Tensor, conf: torch.Tensor, prior: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        """Return the detections."""
+        param = value(self.param, "detection_output_param")
+        priors, variances = as_array(prior).reshape(2, self.priors, 4)
+        codes = as_array(loc).reshape(-1, self.priors, self.kinds, 4)
+        scores = as_array(conf).reshape(-1, self.priors, param.num_classes)
+        scale = None if param.variance_encoded_in_target else variances
+        rows = []
+        for i in range(len(codes)):
+            boxes = [decode(codes[i, :, kind], priors, scale, param.code_type) for kind in range(self.kinds)]
+            rows.append(self._detect(i, boxes, scores[i]))
+        found = np.concatenate(rows)
+        if not len(found):
+            found = np.full((len(codes), 7), -1, np.float32)
+            found[:, 0] = np.arange(len(codes))
+        return torch.from_numpy(found[None, None]).to(loc)
+
+    def _detect(self, image: int, boxes: list[Array], scores: Array) -> Array:
+        """Return the detections of one image, by label, the most confident first: (d, 7)."""
+        param = value(self.param, "detection_output_param")
+        nms, rows = param.nms_param, [np.zeros((0, 7), np.float32)]
+        for label in range(param.num_classes):
+            if label == param.background_label_id:
+                continue
+            own, score = boxes[0 if param.share_location else label], scores[:, label]
+            order = np.argsort(-score, kind="stable")
+            if param.HasField("confidence_threshold"):
+                order = order[score[order] > param.confidence_threshold]
+            if nms.HasField("top_k") and nms.top_k > -1:
+                order = order[: nms.top_k]
+            kept = order[suppress(own[order], nms.nms_threshold, nms.eta)]
+            head = np.stack([np.full(len(kept), image), np.full(len(kept), label), score[kept]], axis=1)
+            rows.append(np.concatenate([head.astype(np.float32), own[kept]], axis=1))
+        found = np.concatenate(rows)
+        if -1 < param.keep_top_k < len(found):
+            best = np.argsort(-found[:, 2], kind="stable")[: param.keep_top_k]
+            found = found[np.sort(best)]
+        return found

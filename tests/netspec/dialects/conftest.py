@@ -1,0 +1,63 @@
+"""Dialects for one test: registry and schema are afterwards as they were before."""
+
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import pytest
+import torch
+
+from netspec.dialects import use_dialect
+from netspec.layers import Context, Layer, Random, layer_class, registry
+from netspec.layers.base import TEST
+from netspec.proto import dialect, dialect_files
+from netspec.proto.text import parse_net_text
+
+
+@pytest.fixture(autouse=True)
+def _leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    assert dialect.active() == []
+    torch.manual_seed(0)
+    monkeypatch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
+    yield
+    for name in dialect.active():
+        dialect.deactivate(name)
+    own = [file.module for file in dialect_files.known_files().values()]
+    for name in [name for name in sys.modules if name in own or name.startswith("netspec_dialect_")]:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def build() -> Callable[..., Layer]:
+    """``build(dialect, text, *bottom_shapes, phase=TEST, tops=1)``: a layer from the text of a LayerParameter.
+
+    Its faults have the places of that text, the file being "f".
+    """
+
+    def build_layer(name: str, text: str, *shapes: tuple[int, ...], phase: int = TEST, tops: int = 1) -> Layer:
+        use_dialect(name)
+        net, source = parse_net_text(f"layer {{ {text} }}", "f")
+        param = net.layer[0]
+        param.bottom.extend(f"bottom{i}" for i in range(len(shapes)))
+        param.top.extend(f"top{i}" for i in range(tops))
+        cls = layer_class(param.type)
+        assert cls is not None, param.type
+        return cls(param, shapes, Context(phase=phase, random=Random(0), at=partial(source.at, 0)))
+
+    return build_layer
+
+
+@pytest.fixture
+def gradcheck() -> Callable[..., None]:
+    """``gradcheck(layer, *bottoms, fixed=...)``: in double, gradients of bottoms and blobs are the function's.
+
+    ``fixed`` are bottoms that get no gradient; layers whose blobs are statistics learn those not in ``not_learned``.
+    """
+
+    def check(layer: Layer, *bottoms: torch.Tensor, fixed: tuple[int, ...] = ()) -> None:
+        layer.double()
+        inputs = [bottom.double().requires_grad_(i not in fixed) for i, bottom in enumerate(bottoms)]
+        learned = [blob for j, blob in enumerate(layer.blobs) if j not in layer.not_learned]
+        torch.autograd.gradcheck(lambda *args: layer.run(*args[: len(inputs)])[0], (*inputs, *learned))
+
+    return check
