@@ -174,13 +174,13 @@ def extract_images(
     The seconds are the whole way from file to feature: reading, resizing, the net.
     """
     (name,) = net.inputs
-    _, channels, height, width = net.shapes[name]
+    shape = net.shapes[name][1:]
     net.keep = [blob]
     parts = []
     begin = time.perf_counter()
     with torch.no_grad():
         for start in progress(range(0, len(images.paths), batch)):
-            stack = [_read(path, channels, height, width) for path in images.paths[start : start + batch]]
+            stack = [_read(path, shape) for path in images.paths[start : start + batch]]
             net(**{name: (np.stack(stack) - scaling.mean) * scaling.scale})
             parts.append(net.blobs[blob].reshape(len(stack), -1).cpu().numpy())
     seconds = (time.perf_counter() - begin) / len(images.paths)
@@ -215,11 +215,21 @@ def _scaling(layer: Any, shape: Shape, file: str) -> Scaling:
     return Scaling(values[:channels, None, None], param.scale)
 
 
-def _read(path: Path, channels: int, height: int, width: int) -> np.ndarray:
-    """Return an image as (C, H, W) uint8, BGR, resized (bilinear) to the blob's size."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR if channels == 3 else cv2.IMREAD_GRAYSCALE)
+def _read(path: Path, shape: Shape) -> np.ndarray:
+    """Return an image file as :func:`planar` does."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR if shape[0] == 3 else cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise SpecError("cannot read this image", Where(str(path)))
+    return planar(image, shape)
+
+
+def planar(image: np.ndarray, shape: Shape) -> np.ndarray:
+    """Return an image (H, W, 3) BGR or (H, W), uint8, as ``shape`` (C, H, W): resized (bilinear), in colour or grey."""
+    channels, height, width = shape
+    if channels == 3 and image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    elif channels == 1 and image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     if image.shape[:2] != (height, width):
         image = cv2.resize(image, (width, height))
     return np.ascontiguousarray(image.reshape(height, width, channels).transpose(2, 0, 1))
