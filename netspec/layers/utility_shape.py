@@ -144,9 +144,8 @@ class Slice(Layer):
                 raise self.error(message, "slice_param", "slice_point")
             self.sizes = [end - start for start, end in zip([0, *points], [*points, size], strict=True)]
             if min(self.sizes) <= 0:
-                message = (
-                    f"found slice_point {points}, expected rising ones from 1 to {size - 1} (axis {axis} of {shape})"
-                )
+                expected = f"rising ones above 0 and below {size}, the size of axis {axis}"
+                message = f"found slice_point {points} for a bottom of shape {shape}, expected {expected}"
                 raise self.error(message, "slice_param", "slice_point")
         elif size % self.num_tops:
             message = f"axis {axis} of the bottom, shape {shape}, cannot be cut evenly into {self.num_tops} tops"

@@ -1,12 +1,14 @@
-"""How tests build a net from text, keep what it warns of, and get a folder to train in."""
+"""How tests build a net from text, keep what it warns of, get a folder to train in, and run commands there."""
 
 import logging
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from netspec.cli import main
 from netspec.graph.filter import with_state
 from netspec.net import BuildOptions, Net, build_net
 from netspec.proto.text import parse_net_text
@@ -44,3 +46,55 @@ def net_of() -> Callable[..., Net]:
 def warnings(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
     """``warnings()``: the messages of the warnings so far."""
     return lambda: [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+
+
+@dataclass(frozen=True)
+class Result:
+    status: int
+    out: str
+    err: str
+
+    @property
+    def fault(self) -> str:
+        """The line, after what the log may have said, that says what is wrong."""
+        assert self.status == 1, self.err
+        assert "Traceback" not in self.err
+        return self.err.splitlines()[-1]
+
+    @property
+    def messages(self) -> list[str]:
+        """The sentences of the log, without glog's prefix."""
+        return [line.partition("] ")[2] for line in self.err.splitlines() if _is_log(line)]
+
+
+def _is_log(line: str) -> bool:
+    return line[:1] in "IWE" and line[1:5].isdigit()
+
+
+@pytest.fixture
+def run(work_in: Callable[..., Path], capfd: pytest.CaptureFixture[str]) -> Callable[..., Result]:
+    """``run(*words)``: one command, in a folder with a golden training and its pairs."""
+    work_in("train/sgd_step")
+
+    def run_command(*words: object, command: Callable[[list[str]], int] = main) -> Result:
+        capfd.readouterr()
+        status = command([str(word) for word in words])
+        return Result(status, *capfd.readouterr())
+
+    return run_command
+
+
+@pytest.fixture
+def edited(run: Callable[..., Result]) -> Callable[..., str]:
+    """``edited(path, old, new, ...)``: the path of a copy of a prototxt in which texts are replaced."""
+
+    def edit(path: str, *changes: str) -> str:
+        text = Path(path).read_text()
+        for old, new in zip(changes[::2], changes[1::2], strict=True):
+            assert old in text
+            text = text.replace(old, new, 1)
+        copy = Path("edited.prototxt")
+        copy.write_text(text)
+        return str(copy)
+
+    return edit

@@ -406,13 +406,15 @@ def test_concat_moves_gradients(build, gradcheck) -> None:
             'type: "Slice" slice_param { slice_point: 3 slice_point: 3 }',
             [(2, 5)],
             3,
-            "slice_param.slice_point: found slice_point [3, 3], expected rising ones from 1 to 4 (axis 1 of (2, 5))",
+            "slice_param.slice_point: found slice_point [3, 3] for a bottom of shape (2, 5), "
+            "expected rising ones above 0 and below 5, the size of axis 1",
         ),
         (
             'type: "Slice" slice_param { slice_point: 5 }',
             [(2, 5)],
             2,
-            "slice_param.slice_point: found slice_point [5], expected rising ones from 1 to 4 (axis 1 of (2, 5))",
+            "slice_param.slice_point: found slice_point [5] for a bottom of shape (2, 5), "
+            "expected rising ones above 0 and below 5, the size of axis 1",
         ),
         ('type: "Tile"', [(2, 3)], 1, "tile_param.tiles: found tiles 0, expected a positive number"),
         ('type: "BatchReindex"', [(2, 3), (2, 1)], 1, "bottom.1: found indices of shape (2, 1), expected one axis"),

@@ -1,0 +1,116 @@
+"""The command ``check``: what a file builds, all that is wrong with it, and what is likely wrong."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+NET = "sgd_step/train_val.prototxt"
+SOLVER = "sgd_step/solver.prototxt"
+PAIR_SHAPE = ("--shape", "pair_data=4,2,28,28")
+Run = Callable[..., Any]  # the fixtures of conftest.py
+Edit = Callable[..., str]
+
+
+def test_check_prints_a_net_as_json(run: Run) -> None:
+    result = run("check", NET, "--phase", "TRAIN", *PAIR_SHAPE, "--json")
+    assert (result.status, result.err) == (0, "")
+    found = json.loads(result.out)
+    assert sorted(found) == ["blobs", "inputs", "outputs", "params"]
+    assert found["blobs"]["data_p"] == [4, 1, 28, 28]
+    assert found["blobs"]["feat"] == [4, 8]
+    assert found["blobs"]["loss"] == []
+    assert found["params"]["conv1_p"] == [[6, 1, 5, 5], [6]]
+    assert (found["inputs"], found["outputs"]) == ([], ["loss"])
+
+
+def test_check_prints_a_table(run: Run) -> None:
+    result = run("check", NET, *PAIR_SHAPE)
+    rows = {line.split()[0]: line for line in result.out.splitlines() if line}
+    assert rows["conv2"].split() == ["conv2", "Convolution", "4x8x8x8", "1,208", "0.01", "307,200"]
+    assert rows["conv2_p"].split()[3] == "shared"
+    assert rows["total"].split() == ["total", "5,756", "0.20", "1,340,416"]
+
+
+def test_check_builds_all_nets_of_a_solver(run: Run, edited: Edit) -> None:
+    solver = edited(SOLVER, "snapshot_after_train: false", "")
+    result = run("check", solver, *PAIR_SHAPE, "--json")
+    assert (result.status, result.err) == (0, "")
+    assert sorted(json.loads(result.out)) == ["test net #0", "train net"]
+    assert run("check", solver, *PAIR_SHAPE).out.count("conv2_p") == 2
+
+
+def test_check_opens_no_data(run: Run) -> None:
+    Path("pairs").unlink()
+    assert run("check", NET, *PAIR_SHAPE).status == 0
+    wanted = f'{NET}:14:3: layer "pair_data" (Data): the shape of "pair_data" is known by its data only; '
+    assert run("check", NET).fault == wanted + "say --shape pair_data=50,C,H,W"
+
+
+def test_check_filters_by_phase_level_and_stage(run: Run) -> None:
+    kinds = ("phase: TRAIN", "phase: TEST", "min_level: 2", 'stage: "a" stage: "b"', 'not_stage: "a"')
+    layers = [f'layer {{ name: "l{i}" type: "DummyData" top: "b{i}" dummy_data_param {{ shape {{ dim: 1 }} }} '
+              f"include {{ {kind} }} }}" for i, kind in enumerate(kinds)]  # fmt: skip
+    Path("net.prototxt").write_text("\n".join(layers))
+
+    def left(*words: str) -> list[str]:
+        return json.loads(run("check", "net.prototxt", "--json", *words).out)["outputs"]
+
+    assert left() == ["b1", "b4"]
+    assert left("--phase", "TRAIN") == ["b0", "b4"]
+    assert left("-phase=train", "-level=2") == ["b0", "b2", "b4"]
+    assert left("--stage", "a") == ["b1"]
+    assert left("--stage", "b,a", "--level", "3") == ["b1", "b2", "b3"]
+
+
+def test_check_reports_every_fault_of_a_net_at_once(run: Run, edited: Edit) -> None:
+    net = edited(
+        NET,
+        'bottom: "pool1"', 'bottom: "pol1"',
+        'type: "ReLU"', 'type: "Relu"',
+        "num_output: 8 kernel_size: 5", "num_output: 8",
+        'type: "ContrastiveLoss"', 'type: "ContrastiveLos"',
+    )  # fmt: skip
+    result = run("check", net, *PAIR_SHAPE)
+    assert result.status == 1
+    assert result.out == ""
+    lines = result.err.splitlines()
+    for part in (
+        'layer "conv2" (Convolution): unknown bottom blob "pol1"; did you mean "pool1"? available: ',
+        'layer "relu1" (Relu): unknown layer type "Relu"; did you mean "ReLU"?',
+        'layer "loss" (ContrastiveLos): unknown layer type "ContrastiveLos"; did you mean "ContrastiveLoss"?',
+    ):
+        (line,) = [line for line in lines if part in line]
+        assert line.split(":")[0] == net
+        assert all(number.isdigit() for number in line.split(":")[1:3])
+
+
+def test_check_reports_faults_of_a_solver_and_of_its_nets_at_once(run: Run, edited: Edit) -> None:
+    Path("net.prototxt").write_text(Path(edited(NET, 'type: "ReLU"', 'type: "Relu"')).read_text())
+    solver = edited(
+        SOLVER, NET, "net.prototxt", 'lr_policy: "step"', 'lr_policy: "stepp"', "momentum: 0.9", "iter_size: 0"
+    )
+    result = run("check", solver, *PAIR_SHAPE)
+    assert result.status == 1
+    lines = result.err.splitlines()
+    assert len(lines) == 3
+    assert 'unknown lr_policy "stepp"' in lines[0]
+    assert "found iter_size 0, expected at least 1" in lines[1]
+    assert 'unknown layer type "Relu"' in lines[2]
+
+
+def test_check_warns_and_succeeds(run: Run) -> None:
+    result = run("check", SOLVER, *PAIR_SHAPE)
+    assert result.status == 0
+    assert result.err == (
+        f"warning: {SOLVER}: no snapshot is ever taken; set snapshot, or snapshot_after_train: true\n"
+    )
+
+
+def test_a_warning_of_both_nets_of_a_solver_is_shown_once(run: Run, edited: Edit) -> None:
+    net = edited(NET, "pooling_param { pool: MAX", "relu_param { negative_slope: 1 } pooling_param { pool: MAX")
+    Path("net.prototxt").write_text(Path(net).read_text())
+    for words in (["check", *PAIR_SHAPE], ["train"]):
+        result = run(*words, edited(SOLVER, NET, "net.prototxt", "max_iter: 60", "max_iter: 0"))
+        assert result.status == 0
+        assert result.err.count("relu_param has no effect: a layer of type Pooling does not read it") == 1
