@@ -52,7 +52,12 @@ class Dialect:
 
     def fields(self) -> set[tuple[str, str]]:
         """The fields that it adds: full name of Caffe's message and name of the field."""
-        return {(f"{PACKAGE}.{f.extendee.removeprefix(f'{PACKAGE}.')}", f.name) for f in self.declarations.extension}
+        return {(full_name, field) for (full_name, _), field in self.numbers().items()}
+
+    def numbers(self) -> dict[tuple[str, int], str]:
+        """The names of the fields that it adds, by full name of Caffe's message and number of the field."""
+        added = self.declarations.extension
+        return {(f"{PACKAGE}.{f.extendee.removeprefix(f'{PACKAGE}.')}", f.number): f.name for f in added}
 
 
 _known: dict[str, Dialect] = {}
@@ -88,6 +93,7 @@ def activate(dialect: Dialect) -> None:
     for full_name, field in dialect.fields():
         if field in fields_of(pool.FindMessageTypeByName(full_name)):
             raise SpecError(f'{full_name} has a field "{field}" already', Where(file.name))
+    _check_numbers(dialect)
     try:
         pool.FindFileByName(file.name)
     except KeyError:
@@ -97,6 +103,14 @@ def activate(dialect: Dialect) -> None:
         fields = added_fields.setdefault(descriptor.containing_type.full_name, {})
         fields[declared.name] = as_field(declared, descriptor)
     _active[dialect.name] = dialect
+
+
+def _check_numbers(dialect: Dialect) -> None:
+    numbers = dialect.numbers()
+    for other in _active.values():
+        for key in numbers.keys() & other.numbers().keys():
+            message = f'number {key[1]} of {key[0]} is taken, by "{other.numbers()[key]}" of dialect "{other.name}"'
+            raise SpecError(f'{message}; give "{numbers[key]}" another one', Where(dialect.declarations.name))
 
 
 def _add(file: FileDescriptorProto) -> None:
