@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import re
 import signal
 import sys
@@ -47,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
         name: str, function: Callable[[argparse.Namespace], int | None], summary: str
     ) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
-        added.set_defaults(run=function, warnings_only=False)
+        added.set_defaults(run=function, log_level=logging.INFO, log_form=log.GlogFormatter())
         plugin = "a dialect: a fork's layers, by the name they come under or by a file of one's own; may be repeated"
         added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=plugin)
         return added
@@ -79,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_python(p)
 
     p = command("check", _check, "build a net, or a solver's nets, without opening data; report every fault")
-    p.set_defaults(warnings_only=True)
+    p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
     p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
     _add_state(p, phase="TEST")
     p.add_argument(
@@ -110,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_python(p)
 
     p = command("extract_features", _extract_features, "write blobs to databases of float Datums (extract_features)")
+    p.set_defaults(log_level=logging.WARNING)  # Caffe's tool does not tell how it builds the net
     p.add_argument("weights", help="the trained weights")
     p.add_argument("model", help="the net's prototxt, with a data layer")
     p.add_argument("blobs", help="blob names, separated by commas")

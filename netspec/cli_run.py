@@ -26,7 +26,7 @@ def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
     except SystemExit as end:  # argparse has said what is wrong, or printed its help
         return int(end.code or 0)
     try:
-        with _logging(arguments.warnings_only):
+        with _logging(arguments.log_level, arguments.log_form):
             for name in arguments.plugin:
                 use_dialect(name)
             return arguments.run(arguments) or 0
@@ -49,17 +49,17 @@ def _gflag(word: str) -> str:
 
 
 @contextmanager
-def _logging(warnings_only: bool) -> Iterator[None]:
-    """Show Caffe's log on stderr, around the progress bar where there is one; or only its warnings, without prefix.
+def _logging(level: int, form: logging.Formatter) -> Iterator[None]:
+    """Show Caffe's log on stderr, around the progress bar where there is one.
 
     A warning is shown once, though a solver's nets may each have it.
     """
     handler = logging.StreamHandler(_BarAware())
-    handler.setFormatter(logging.Formatter("warning: %(message)s") if warnings_only else log.GlogFormatter())
+    handler.setFormatter(form)
     handler.addFilter(_WarnOnce())
     before = log.logger.level, log.logger.propagate
     log.logger.addHandler(handler)
-    log.logger.setLevel(logging.WARNING if warnings_only else logging.INFO)
+    log.logger.setLevel(level)
     log.logger.propagate = False
     try:
         yield

@@ -173,8 +173,8 @@ def test_extract_features_writes_what_caffes_did(run: Run) -> None:
     result = run(INIT, NET, "feat,sim", "feat_lmdb,sim_lmdb", 4, "lmdb", "CPU", command=extract_features)
     assert result.status == 0
     golden = (GOLDEN / "log" / "extract_features.log").read_text().splitlines()
-    told = [line.partition("] ")[2] for line in result.err.splitlines() if line.startswith("E")]
-    assert [line for line in told if "blob sim" not in line] == [line.partition("] ")[2] for line in golden]
+    told = [line for line in result.messages if "blob sim" not in line]
+    assert told == [line.partition("] ")[2] for line in golden]
     ours, caffes = open_reader("feat_lmdb"), open_reader(str(GOLDEN / "features" / "feat_lmdb"))
     assert len(ours) == len(caffes) == 200
     for i in range(200):
