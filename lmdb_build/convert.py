@@ -13,7 +13,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lmdb_build.writer import Entry, Options, image_key, pair_key, read_pair_list, read_single_list, write_databases
+from lmdb_build.writer import Entry, Options, image_key, pair_key, read_pairs, read_single_list, write_databases
+from loopclosure.errors import InputError
 from netspec import log
 from netspec.data.database import BACKENDS, open_reader
 from netspec.data.draws import permutation
@@ -49,7 +50,7 @@ def _convert_pairs(arguments: Sequence[str]) -> None:
     name = args.DB_NAME.rstrip("/")
     options = _options(args)
     paths = [name] if options.encoding is None else [f"{name}_a", f"{name}_b"]
-    _convert(args, read_pair_list(args.LISTFILE), paths, options, pair_key)
+    _convert(args, read_pairs(args.LISTFILE), paths, options, pair_key)
 
 
 def _convert_images(arguments: Sequence[str]) -> None:
@@ -154,7 +155,7 @@ def _run(command: Callable[[Sequence[str]], None], arguments: Sequence[str] | No
     log.logger.setLevel(logging.INFO)
     try:
         command(sys.argv[1:] if arguments is None else arguments)
-    except SpecError as fault:
+    except (SpecError, InputError) as fault:
         print(fault, file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -1,8 +1,12 @@
-"""The list file of pairs: ``first second label`` a line, its settings in comment lines before them."""
+"""The list file of pairs: ``first second label`` a line, its settings in comment lines before them.
+
+A name that holds blanks, or begins with ``#``, stands in double quotes.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +16,9 @@ import numpy as np
 from loopclosure.errors import InputError
 
 ROOT_FOLDER = "root folder"  # the setting that says what a list's images are relative to, seen from the list's folder
+
+
+_WORD = re.compile(r'"([^"]*)"|(\S+)')
 
 
 @dataclass(frozen=True)
@@ -32,10 +39,7 @@ def write_pair_list(path: Path, pairs: Iterable[tuple[str, str, int]], settings:
     lines = ["# first second label; 1: the same place, 0: other places"]
     lines += [f"# {name}: {value}" for name, value in settings.items()]
     for first, second, label in pairs:
-        for name in (first, second):
-            if name.split() != [name] or name.startswith("#"):
-                raise InputError(f'cannot list the image "{name}": a name has no blanks and no # at its beginning')
-        lines.append(f"{first} {second} {label}")
+        lines.append(f"{_quoted(first)} {_quoted(second)} {label}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -49,10 +53,14 @@ def read_pair_list(path: Path) -> list[ListedPair]:
     for number, line in enumerate(_read_lines(path), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        fields = line.split()
+        fields = [quoted or bare for quoted, bare in _WORD.findall(line)]
         if len(fields) != 3:
             raise InputError(
-                f'expected two images and a label, "a.png b.png 1", found "{line.strip()}"', path, number, 1
+                f"found {line.strip()!r}, expected two images and a label: a.png b.png 1; "
+                "names with blanks go into double quotes",
+                path,
+                number,
+                1,
             )
         if fields[2] not in ("0", "1"):
             column = line.rindex(fields[2]) + 1
@@ -73,6 +81,12 @@ def read_settings(path: Path) -> dict[str, str]:
         if colon:
             settings[name.strip()] = value.strip()
     return settings
+
+
+def _quoted(name: str) -> str:
+    if '"' in name or "\n" in name:
+        raise InputError(f"cannot list the image {name!r}: a name has no quotes and no line breaks")
+    return f'"{name}"' if name.split() != [name] or name.startswith("#") else name
 
 
 def root_of(path: Path) -> Path:

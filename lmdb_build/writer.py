@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import re
 import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -27,15 +26,15 @@ import numpy as np
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from lmdb_build.pair_list import read_pair_list
 from netspec import log
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum, decode_image, encoded_datum, times
-from netspec.data.images import list_lines, read_image, read_image_list
+from netspec.data.images import read_image, read_image_list
 from netspec.errors import SpecError, Where
 
 S = TypeVar("S")
 T = TypeVar("T")
-_WORD = re.compile(r'"([^"]*)"|(\S+)')
 _AHEAD = 8  # entries in hand for each worker
 
 
@@ -61,21 +60,11 @@ class Options:
     encoding: str | None = None
 
 
-def read_pair_list(path: str) -> list[Entry]:
-    """Read lines of ``a.png b.png 1``: names in double quotes where they hold blanks, label 1 (same place) or 0.
-
-    Blank lines and those that begin with ``#`` are passed over. Raises SpecError with the line of the first fault.
-    """
-    entries = []
-    for line, place in list_lines(path):
-        words = [quoted or bare for quoted, bare in _WORD.findall(line)]
-        if len(words) != 3 or words[2] not in ("0", "1"):
-            hint = "names with blanks go into double quotes"
-            raise SpecError(f"found {line!r}, expected two image names and a label, 0 or 1 ({hint})", place)
-        entries.append(Entry((words[0], words[1]), int(words[2]), place))
-    if not entries:
-        raise SpecError("the list is empty: it holds no pair", Where(path))
-    return entries
+def read_pairs(path: str) -> list[Entry]:
+    """Return the entries of a list of pairs; see lmdb_build/pair_list.py. Raises InputError for a line that is none."""
+    return [
+        Entry((pair.first, pair.second), pair.label, Where(path, pair.line, 1)) for pair in read_pair_list(Path(path))
+    ]
 
 
 def read_single_list(path: str) -> list[Entry]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lmdb_build.convert import compute_image_mean, convert_imageset, convert_pairs_lmdb
-from lmdb_build.writer import read_pair_list
+from lmdb_build.writer import read_pairs
 from netspec.data.datum import datum_to_array, parse_datum
 
 ROOT = Path(__file__).parents[2]
@@ -148,7 +148,7 @@ def test_grey_encoded_images_are_grey(tmp_path: Path) -> None:  # Caffe stores t
 
 def test_quoted_names_may_hold_blanks(tmp_path: Path) -> None:
     (tmp_path / "l").write_text('"a place.png" b.png 1\nc.png "d e.png" 0\n')
-    assert [entry.images for entry in read_pair_list(f"{tmp_path}/l")] == [
+    assert [entry.images for entry in read_pairs(f"{tmp_path}/l")] == [
         ("a place.png", "b.png"),
         ("c.png", "d e.png"),
     ]
@@ -179,7 +179,7 @@ def test_a_missing_image_is_named_with_its_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
 ) -> None:
     (tmp_path / "l").write_text("# pairs\n0.png 1.png 1\n2.png nix.png 0\n")
-    message = f'{tmp_path}/l:3:1: image "{PNG}nix.png" cannot be read: No such file or directory'
+    message = f'{tmp_path}/l:3:1: image "{PNG}nix.png" cannot be read (No such file or directory'
     check_refused(tmp_path, capsys, convert_pairs_lmdb, ["-workers", workers, PNG, f"{tmp_path}/l"], message)
 
 
@@ -196,10 +196,10 @@ def test_a_missing_image_is_named_with_its_line(
         ),
         ("0.png 0 1", ["-encoded"], 'l:1:1: image "{root}/0" has no ending that tells its format; give -encode_type'),
         ("0.png 0.png 1", ["-encode_type=abc"], 'cannot be encoded as "abc"'),
-        ("0.png 1.png", [], "l:1:1: found '0.png 1.png', expected two image names and a label"),
-        ("0.png 1.png 2", [], "expected two image names and a label, 0 or 1"),
+        ("0.png 1.png", [], "l:1:1: found '0.png 1.png', expected two images and a label"),
+        ("0.png 1.png 2", [], "a label is 1 (same place) or 0 (other places)"),
         ("a b.png c.png 1", [], "names with blanks go into double quotes"),
-        ("# none", [], "the list is empty"),
+        ("# none", [], "lists no pair"),
     ],
 )
 def test_what_cannot_be_converted_is_refused(
@@ -224,7 +224,7 @@ def test_a_label_that_is_no_number_is_refused(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_a_missing_list_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, f"{tmp_path}/nix"], "cannot be read: No such file")
+    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, f"{tmp_path}/nix"], "cannot be read (No such file")
 
 
 def test_an_existing_database_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str], pair_list: str) -> None:
