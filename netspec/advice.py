@@ -40,7 +40,7 @@ def net_advice(net: Net) -> Iterator[str]:
 
 def solver_advice(solver: Any, node: Node, nets: list[Net]) -> Iterator[str]:
     """Yield a line for each thing in a solver, with its built nets (training net first), that is likely wrong."""
-    if solver.snapshot > solver.max_iter and not solver.snapshot_after_train:
+    if solver.snapshot > solver.max_iter:
         yield f"{node.find('snapshot')}: snapshot {solver.snapshot} never fires in max_iter {solver.max_iter}"
     elif not solver.snapshot and not solver.snapshot_after_train:
         yield f"{node.where}: no snapshot is ever taken; set snapshot, or snapshot_after_train: true"
