@@ -8,7 +8,8 @@ import pytest
 from netspec.check import check_file
 
 GOLDEN = Path(__file__).parents[1] / "golden"
-DATA = """layer { name: "d" type: "Data" top: "pair" top: "sim" data_param { source: "%s" batch_size: 10 backend: LMDB }}
+DATA = """layer { name: "d" type: "Data" top: "pair" top: "sim"
+  data_param { source: "%s" batch_size: 10 backend: LMDB } }
 layer { name: "cut" type: "Slice" bottom: "pair" top: "a" top: "b" }
 """
 TOWER = """layer { name: "ip%(k)s" type: "InnerProduct" bottom: "%(in)s" top: "f%(k)s" %(param)s
@@ -46,7 +47,7 @@ def test_nothing_is_said_of_a_sound_net(advice: Callable[..., list[str]]) -> Non
 
 def test_towers_that_share_only_some_of_their_parameters(advice: Callable[..., list[str]]) -> None:
     assert advice(siamese(('param { name: "w" }', 'param { name: "w" }'))) == [
-        'net.prototxt:5:1: layer "ip2" (InnerProduct): 1 of its 2 parameter blobs are not shared with the other tower '
+        'net.prototxt:6:1: layer "ip2" (InnerProduct): 1 of its 2 parameter blobs are not shared with the other tower '
         'of "loss"; give them the same param { name }'
     ]
 
@@ -54,14 +55,14 @@ def test_towers_that_share_only_some_of_their_parameters(advice: Callable[..., l
 def test_a_loss_that_nothing_reaches(advice: Callable[..., list[str]]) -> None:
     fixed = 'param { name: "w" lr_mult: 0 } param { name: "b" lr_mult: 0 }'
     assert advice(siamese((fixed, fixed))) == [
-        'net.prototxt:7:1: layer "loss" (ContrastiveLoss): nothing that learns reaches this loss'
+        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): nothing that learns reaches this loss'
     ]
     assert advice(siamese((fixed, fixed)), phase=1) == []
 
 
 def test_a_blob_used_by_nothing(advice: Callable[..., list[str]]) -> None:
     spare = 'layer { name: "spare" type: "ReLU" bottom: "f1" top: "spare" }\n'
-    assert advice(siamese(extra=spare)) == ['net.prototxt:8:1: layer "spare" (ReLU): blob "spare" is used by nothing']
+    assert advice(siamese(extra=spare)) == ['net.prototxt:9:1: layer "spare" (ReLU): blob "spare" is used by nothing']
     score = 'layer { name: "score" type: "Accuracy" bottom: "f1" bottom: "sim" top: "score" }\n'
     assert advice(siamese(extra=score)) == []
     silent = 'layer { name: "hush" type: "Silence" bottom: "spare" }\n'
@@ -87,7 +88,7 @@ def test_a_phase_without_its_data_layer(advice: Callable[..., list[str]], tmp_pa
     Path("net.prototxt").write_text(net)
     (checked,) = check_file("net.prototxt", 1)
     assert [str(fault) for fault in checked.faults] == [
-        'net.prototxt:2:35: layer "cut" (Slice): unknown bottom blob "pair"; available: none'
+        'net.prototxt:3:35: layer "cut" (Slice): unknown bottom blob "pair"; available: none'
     ]
     assert checked.advice == [
         'net.prototxt:1:1: layer "d" (Data): no data layer is left in this phase; add one with include { phase: ... }'
