@@ -179,7 +179,7 @@ def test_a_missing_image_is_named_with_its_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
 ) -> None:
     (tmp_path / "l").write_text("# pairs\n0.png 1.png 1\n2.png nix.png 0\n")
-    message = f'{tmp_path}/l:3:1: image "{PNG}nix.png" cannot be read (No such file or directory'
+    message = f'{tmp_path}/l:3:1: image "{PNG}nix.png" cannot be read: No such file or directory'
     check_refused(tmp_path, capsys, convert_pairs_lmdb, ["-workers", workers, PNG, f"{tmp_path}/l"], message)
 
 

@@ -1,0 +1,120 @@
+"""The paper's nets: towers and variants agree, deploy files fit, and the full files train one iteration as they are."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netspec
+from netspec.check import check_file
+from netspec.data.database import Writer
+from netspec.data.datum import array_to_datum
+from netspec.net import load_net
+from netspec.proto.text import parse_net_text, read_net, read_solver
+from netspec.weights import load_weights, save_weights
+
+ROOT = Path(__file__).parents[1]
+NETS = ("siamese_8", "siamese_128", "siamese_resnet27_256", "siamese_resnet27_512")
+FOLDERS = [ROOT / "prototxt" / part / name for part in ("", "small") for name in NETS]
+SIDES = {"small": 64}
+
+
+def side(folder: Path) -> int:
+    return SIDES.get(folder.parent.name, 224)
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}-{path.name}")
+def test_the_second_tower_is_the_first_under_other_names(folder: Path) -> None:
+    net = read_net(folder / "train_val.prototxt")
+    second = [layer for layer in net.layer if layer.name.endswith("_p")]
+    first = [layer for layer in net.layer if layer.type not in ("Data", "Slice", "ContrastiveLoss")][: len(second)]
+    assert len(first) == len(second) > 5
+    for mine, twin in zip(first, second, strict=True):
+        assert [p.name for p in mine.param] == [p.name for p in twin.param]
+        assert all(p.name for p in mine.param)
+        for field in ("bottom", "top"):
+            assert [f"{blob}_p" for blob in getattr(mine, field)] == list(getattr(twin, field))
+        assert mine.name + "_p" == twin.name
+        twin.name = mine.name
+        for field in ("bottom", "top"):
+            del getattr(twin, field)[:]
+            getattr(twin, field).extend(getattr(mine, field))
+        assert mine == twin
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}-{path.name}")
+def test_deploy_is_the_first_tower(folder: Path) -> None:
+    train = {layer.name: layer for layer in read_net(folder / "train_val.prototxt").layer}
+    deploy = read_net(folder / "deploy.prototxt")
+    assert list(deploy.layer[0].input_param.shape[0].dim) == [1, 3, side(folder), side(folder)]
+    assert len(deploy.layer) > 5
+    for layer in deploy.layer[1:]:
+        assert layer == train[layer.name]
+    assert deploy.layer[-1].top[0] == "feat"
+
+
+def test_the_nets_of_one_kind_differ_in_their_last_layer_alone() -> None:
+    for part in ("", "small/"):
+        for one, other in (("siamese_8", "siamese_128"), ("siamese_resnet27_256", "siamese_resnet27_512")):
+            texts = [(ROOT / f"prototxt/{part}{name}/train_val.prototxt").read_text() for name in (one, other)]
+            changed = [pair for pair in zip(*(t.splitlines() for t in texts), strict=True) if pair[0] != pair[1]]
+            of_last = [pair for pair in changed if "num_output" in pair[0]]
+            assert len(of_last) == 2  # once a tower
+            assert all(line.startswith(("#", "name:")) for pair in changed if pair not in of_last for line in pair)
+
+
+def test_the_residual_net_has_27_convolutions_and_7x7x512_reach_the_features() -> None:
+    (checked,) = check_file(ROOT / "prototxt/siamese_resnet27_256/deploy.prototxt", phase=1)
+    kinds = [layer.type for layer in checked.net.param.layer]
+    assert kinds.count("Convolution") == kinds.count("BatchNorm") == kinds.count("Scale") == 27
+    assert kinds.count("Eltwise") == 1 + 2 + 5 + 3
+    last = checked.net.plan.nodes[-1]
+    assert checked.net.shapes[checked.net.plan.blobs[last.bottoms[0]]] == (1, 512, 7, 7)
+
+
+def test_the_solvers_are_the_papers() -> None:
+    for name in NETS:
+        solver = read_solver(ROOT / f"prototxt/{name}/solver.prototxt")
+        assert (solver.lr_policy, solver.stepsize, solver.max_iter, solver.type) == ("step", 10000, 30000, "SGD")
+        assert [round(v, 6) for v in (solver.base_lr, solver.gamma, solver.momentum)] == [0.01, 0.1, 0.9]
+        small = read_solver(ROOT / f"prototxt/small/{name}/solver.prototxt")
+        assert 3 * small.stepsize == small.max_iter
+
+
+# One of each kind, since the others differ in their last layer alone.
+@pytest.mark.parametrize(
+    "folder", [FOLDERS[k] for k in (0, 3, 4, 7)], ids=lambda path: f"{path.parent.name}-{path.name}"
+)
+def test_one_iteration_and_back_into_the_deploy_net(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    with Writer("pairs") as writer:
+        for k in range(4):
+            pixels = rng.integers(0, 256, (6, side(folder), side(folder)), dtype=np.uint8)
+            writer.put(b"%08d" % k, array_to_datum(pixels, k % 2).SerializeToString())
+    text = (folder / "train_val.prototxt").read_text()
+    text = re.sub(r'source: "[^"]*"', 'source: "pairs"', text)
+    text, count = re.subn(r"batch_size: \d+", "batch_size: 2", text)
+    assert count == 2
+    parse_net_text(text, "net")
+    Path("net.prototxt").write_text(text)
+    solver = (folder / "solver.prototxt").read_text()
+    solver = re.sub(r'net: "[^"]*"', 'net: "net.prototxt"', solver)
+    solver = re.sub(r'snapshot_prefix: "[^"]*"', 'snapshot_prefix: "x"', solver)
+    solver = re.sub(r"test_initialization: false", "", solver)
+    Path("solver.prototxt").write_text(solver + "test_initialization: false\n")
+    trained = netspec.load_solver("solver.prototxt", device="cpu")
+    before = trained.net.params["feat"][0].detach().clone()
+    trained.step(1)
+    assert np.isfinite(trained.loss)
+    assert not np.array_equal(before.numpy(), trained.net.params["feat"][0].detach().numpy())
+    save_weights(trained.net, "x.caffemodel")
+    trained.close()
+    deploy = load_net(folder / "deploy.prototxt")
+    load_weights(deploy, "x.caffemodel")
+    for name, blobs in deploy.params.items():
+        for mine, theirs in zip(blobs, trained.net.params[name], strict=True):
+            assert np.array_equal(mine.detach().numpy(), theirs.detach().numpy())
