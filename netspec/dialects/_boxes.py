@@ -100,11 +100,10 @@ def outside(boxes: Array) -> Array:
 
 
 def match(boxes: Array, truth: Array, threshold: float | None, leave_out: Array) -> tuple[Array, Array]:
-    """Match boxes (p, 4) with true ones (g, 4): the index of the true box, or NO_MATCH or LEFT_OUT; the overlap.
+    """Match boxes (p, 4) with true ones (g, 4): the index of the true box, or NO_MATCH or LEFT_OUT; largest overlaps.
 
     First the pairs of the largest overlap, each box and each true box once; then, with a threshold, every box left
-    that overlaps one by at least that, with the one it overlaps most. An unmatched box's overlap is its largest.
-    ``leave_out`` (p,) says which boxes take no part.
+    that overlaps one by at least that, with the one it overlaps most. ``leave_out`` (p,) says which boxes take no part.
     """
     found = np.where(leave_out, LEFT_OUT, NO_MATCH)
     table = overlaps(boxes[:, None], truth[None])
@@ -115,7 +114,7 @@ def match(boxes: Array, truth: Array, threshold: float | None, leave_out: Array)
         box, true = np.unravel_index(free.argmax(), free.shape)
         if free[box, true] == 0:
             break
-        found[box], best[box] = true, free[box, true]
+        found[box] = true
         free[box], free[:, true] = 0, 0
     if threshold is not None and len(truth):
         extra = (found == NO_MATCH) & (best >= threshold) & (best > 0)

@@ -288,11 +288,11 @@ def test_objects_of_any_label_are_one_class(build: Build) -> None:
 
 
 def test_hard_examples_that_overlap_one_of_greater_loss_are_suppressed(build: Build) -> None:
-    # Two priors nearly alike and one apart; of the pair only that of greater loss is trained.
-    priors = np.float32([[0.1, 0.1, 0.4, 0.4], [0.11, 0.1, 0.4, 0.4], [0.6, 0.6, 0.9, 0.9]])
-    variances = np.full((3, 4), 0.1, np.float32)
-    conf = np.float32([[[0, 1, 0, 0], [0, 3, 0, 0], [0, 2, 0, 0]]])
-    given = bottoms(np.zeros((1, 3, 1, 4), np.float32), conf, priors, variances, [(0, 1, 0, 0.0, 0.5, 0.05, 0.55, 0)])
+    # Two priors nearly alike, of which only that of greater loss is trained, one apart, and one next to nothing.
+    priors = np.float32([[0.1, 0.1, 0.4, 0.4], [0.11, 0.1, 0.4, 0.4], [0.6, 0.6, 0.9, 0.9], [0.5, 0.5, 0.502, 0.502]])
+    variances = np.full((4, 4), 0.1, np.float32)
+    conf = np.float32([[[0, 1, 0, 0], [0, 3, 0, 0], [0, 2, 0, 0], [0, 2.5, 0, 0]]])
+    given = bottoms(np.zeros((1, 4, 1, 4), np.float32), conf, priors, variances, [(0, 1, 0, 0.0, 0.5, 0.05, 0.55, 0)])
     trained = []
     for nms in ("nms_param { nms_threshold: 0.5 top_k: 10 }", "nms_param { nms_threshold: 0.5 top_k: 1 }", ""):
         words = "mining_type: HARD_EXAMPLE use_prior_for_nms: true " + nms
@@ -300,8 +300,8 @@ def test_hard_examples_that_overlap_one_of_greater_loss_are_suppressed(build: Bu
         scores = given[1].clone().requires_grad_()
         build("ssd", text, *(b.shape for b in given)).run(given[0], scores, *given[2:])[0].backward()
         assert scores.grad is not None
-        trained.append(scores.grad.reshape(3, 4).abs().sum(1).gt(0).tolist())
-    assert trained == [[False, True, True], [False, True, False], [True, True, True]]
+        trained.append(scores.grad.reshape(4, 4).abs().sum(1).gt(0).tolist())
+    assert trained == [[False, True, True, False], [False, True, False, False], [True, True, True, True]]
 
 
 def test_suppression_without_a_top_k_leaves_nothing(build: Build) -> None:

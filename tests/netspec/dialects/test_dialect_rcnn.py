@@ -22,7 +22,7 @@ REGIONS = [  # image, x1, y1, x2, y2 in pixels of the image; the map is half as 
     [1, 2, 1, 6, 5],
     [0, 3, 3, 3, 3],
     [1, 8, 4, 30, 30],  # beyond the map
-    [1, 9, 9, 5, 5],  # turned inside out
+    [1, 6, 6, 2, 2],  # turned inside out
     [0, 40, 40, 50, 50],  # outside
     [0, -9, -7, 4, 1],
     [1, 0.9, 1, 4.9, 3.1],

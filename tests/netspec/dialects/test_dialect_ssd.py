@@ -211,6 +211,7 @@ def some_priors(count: int, rng: np.random.Generator) -> np.ndarray:
     [
         {"threshold": 0.2, "nms": 0.3},
         {"threshold": -math.inf, "nms": 0.8, "eta": 0.9},
+        {"threshold": 0.1, "nms": 0.45, "top_k": 3},
         {"threshold": 0.1, "nms": 0.45, "top_k": 6, "keep": 7},
         {"threshold": 0.1, "nms": 0.45, "top_k": -1, "keep": 0},
     ],
