@@ -6,6 +6,7 @@ Their proposals, anchors and targets are Python layers of py-faster-rcnn, which 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 import torch.nn.functional as F
@@ -112,40 +113,73 @@ class ROIPooling(_RegionPooling):
 
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
         """Return the maxima."""
+        images, channels, height, width = maps.shape
         with torch.no_grad():
             regions = regions.reshape(-1, 5)
-            image = self.images_of(regions, maps.shape[0])
+            image = self.images_of(regions, images)
             corners = _rounded(regions[:, 1:] * self.scale)
-            columns = self._bins(corners[:, 0], corners[:, 2], self.bins[1], maps.shape[3])
-            rows = self._bins(corners[:, 1], corners[:, 3], self.bins[0], maps.shape[2])
-            indices = torch.full(self.top_shapes[0], -1, dtype=torch.long, device=maps.device)
-            for r, of_image in enumerate(image.tolist()):
-                indices[r] = _first_maxima(maps[of_image], rows[r], columns[r])
-            planes = image[:, None] * maps.shape[1] + torch.arange(maps.shape[1], device=maps.device)
-            flat = planes[:, :, None, None] * (maps.shape[2] * maps.shape[3]) + indices.clamp(min=0)
-        return maps.reshape(-1)[flat].where(indices >= 0, 0)
+            rows = self._bins(corners[:, 1], corners[:, 3], self.bins[0], height)[:, :, None]
+            columns = self._bins(corners[:, 0], corners[:, 2], self.bins[1], width)[:, None]
+            windows = torch.cat(torch.broadcast_tensors(rows, columns), dim=3)
+            pixel = torch.empty((*windows.shape[:3], channels), dtype=torch.int32, device=maps.device)
+            for i in image.unique().tolist():
+                own = image == i
+                pixel[own] = _first_maxima(maps[i], windows[own].reshape(-1, 4)).reshape(-1, *pixel.shape[1:])
+            pixel = pixel.permute(0, 3, 1, 2)
+            plane = image[:, None] * channels + torch.arange(channels, device=maps.device)
+            place = plane[:, :, None, None] * (height * width) + pixel.clamp(min=0)
+        return maps.reshape(-1)[place].where(pixel >= 0, 0)
 
     @staticmethod
-    def _bins(first: torch.Tensor, last: torch.Tensor, count: int, size: int) -> list[list[list[int]]]:
-        """Return where each bin of each region begins and ends, in pixels of the map: (R, count, 2)."""
+    def _bins(first: torch.Tensor, last: torch.Tensor, count: int, size: int) -> torch.Tensor:
+        """Return where each bin of each region begins and ends along one axis, in pixels of the map: (R, count, 2)."""
         length = (last - first + 1).clamp(min=1)
         steps = torch.arange(count + 1, dtype=first.dtype, device=first.device) * (length / count)[:, None]
         ends = torch.stack([steps[:, :-1].floor(), steps[:, 1:].ceil()], dim=2) + first[:, None, None]
-        return ends.clamp(0, size).long().tolist()
+        return ends.clamp(0, size).long()
 
 
-def _first_maxima(maps: torch.Tensor, rows: list[list[int]], columns: list[list[int]]) -> torch.Tensor:
-    """Return where, as row * width + column, the first maximum of each bin of maps (C, H, W) is; -1 in an empty bin."""
-    indices = torch.full((maps.shape[0], len(rows), len(columns)), -1, dtype=torch.long, device=maps.device)
-    for j, (left, right) in enumerate(columns):
-        if left >= right:
-            continue
-        values, column = maps[:, :, left:right].max(dim=2)
-        for i, (upper, lower) in enumerate(rows):
-            if upper < lower:
-                row = values[:, upper:lower].argmax(dim=1) + upper
-                indices[:, i, j] = row * maps.shape[2] + column.gather(1, row[:, None]).squeeze(1) + left
-    return indices
+Table = tuple[torch.Tensor, torch.Tensor]  # values and the pixels that they come from
+
+
+def _first_maxima(maps: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
+    """Return the pixel, row * width + column, of the first maximum of each window of maps (C, H, W): (n, C).
+
+    Windows (n, 4) are begin and end of their rows, begin and end of their columns; an empty one yields -1. Each is
+    covered by four, which may overlap, of sides that are powers of two; the maxima of those are made by doubling.
+    """
+    height, width = maps.shape[1:]
+    sides = windows[:, 1::2] - windows[:, ::2]
+    doublings = sides.clamp(min=1).log2().long().masked_fill((sides < 1).any(dim=1, keepdim=True), -1)
+    most_down, most_across = doublings.amax(dim=0).tolist() if len(windows) else (-1, -1)
+    found = torch.full((len(windows), maps.shape[0]), -1, dtype=torch.int32, device=maps.device)
+    values = maps.permute(1, 2, 0).contiguous()
+    pixels = torch.arange(height * width, dtype=torch.int32, device=maps.device).reshape(height, width, 1).expand_as(values)
+    tall = values, pixels
+    for down in range(most_down + 1):
+        tall = tall if down == 0 else _doubled(tall, 0, 1 << down - 1)
+        table = tall
+        for across in range(most_across + 1):
+            table = table if across == 0 else _doubled(table, 1, 1 << across - 1)
+            own = (doublings[:, 0] == down) & (doublings[:, 1] == across)
+            upper, lower, left, right = windows[own].unbind(dim=1)
+            corners = [(y, x) for y in (upper, lower - (1 << down)) for x in (left, right - (1 << across))]
+            parts = [(table[0][corner], table[1][corner]) for corner in corners]
+            found[own] = reduce(_first_of, parts)[1]
+    return found
+
+
+def _doubled(table: Table, axis: int, side: int) -> Table:
+    """Return the first maxima of windows of twice a side along an axis, from those of that side."""
+    count = table[0].shape[axis] - side
+    values, pixels = ([part.narrow(axis, start, count) for start in (0, side)] for part in table)
+    return _first_of((values[0], pixels[0]), (values[1], pixels[1]))
+
+
+def _first_of(a: Table, b: Table) -> Table:
+    """Return the greater values; of equal ones those of the first pixel."""
+    second = (b[0] > a[0]) | ((b[0] == a[0]) & (b[1] < a[1]))
+    return torch.where(second, b[0], a[0]), torch.where(second, b[1], a[1])
 
 
 @register("PSROIPooling", "psroi_pooling_param")
