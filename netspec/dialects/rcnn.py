@@ -154,7 +154,8 @@ def _first_maxima(maps: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
     most_down, most_across = doublings.amax(dim=0).tolist() if len(windows) else (-1, -1)
     found = torch.full((len(windows), maps.shape[0]), -1, dtype=torch.int32, device=maps.device)
     values = maps.permute(1, 2, 0).contiguous()
-    pixels = torch.arange(height * width, dtype=torch.int32, device=maps.device).reshape(height, width, 1).expand_as(values)
+    pixels = torch.arange(height * width, dtype=found.dtype, device=maps.device)
+    pixels = pixels.reshape(height, width, 1).expand_as(values)
     tall = values, pixels
     for down in range(most_down + 1):
         tall = tall if down == 0 else _doubled(tall, 0, 1 << down - 1)

@@ -43,7 +43,7 @@ def known_files() -> dict[str, DialectFile]:
         except Exception:  # whatever another package does when it is imported, it must not hide the user's own fault
             spec = None
         if spec is None or spec.origin is None:
-            log.warning("dialect_files.py", f'dialect "{point.name}": there is no module {module}; it is left out')
+            log.logger.warning(f'dialect "{point.name}": there is no module {module}; it is left out')
         else:
             found[point.name] = DialectFile(point.name, Path(spec.origin), module)
     for path in sorted(FOLDER.glob("[!_]*.py")):
@@ -112,4 +112,4 @@ def announce_known() -> None:
         try:
             announce(read_dialect(file))
         except SpecError as fault:
-            log.warning("dialect_files.py", f'dialect "{file.name}" is left out: {fault}')
+            log.logger.warning(f'dialect "{file.name}" is left out: {fault}')

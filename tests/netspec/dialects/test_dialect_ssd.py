@@ -283,6 +283,19 @@ def test_detection_output_refuses(build: Build, settings: str, shapes: list[tupl
         build("ssd", f"type: 'DetectionOutput' detection_output_param {{ {settings} }}", *shapes)
 
 
+def test_what_detection_output_does_not_do_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    use_dialect("ssd")
+    text = """
+      layer { name: 'in' type: 'Input' top: 'loc' top: 'conf' top: 'prior' input_param { shape { dim: 1 dim: 4 }
+              shape { dim: 1 dim: 2 } shape { dim: 1 dim: 2 dim: 4 } } }
+      layer { name: 'out' type: 'DetectionOutput' bottom: 'loc' bottom: 'conf' bottom: 'prior' top: 'out'
+              detection_output_param { num_classes: 2 keep_top_k: 3 save_output_param { output_directory: 'x' } } }
+    """
+    build_net(*parse_net_text(text, "f"), BuildOptions())
+    (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert "detection_output_param.save_output_param has no effect" in warning
+
+
 # ---- All together ----
 
 NET = """
