@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from netspec.advice import missing_data, net_advice, solver_advice
-from netspec.errors import SpecError
+from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.filter import with_state
 from netspec.layers.base import Shape
 from netspec.net import BuildOptions, Net, build_net
@@ -71,7 +71,24 @@ def check_file(
     if is_solver(path):
         return _check_solver(path, level, stages, given, allow_python)
     net, source = parse_net(path)
-    return [check_net(with_state(net, phase, level, stages), source, str(path), given, allow_python)]
+    checked = check_net(with_state(net, phase, level, stages), source, str(path), given, allow_python)
+    checked.faults.extend(_not_to_be_given(given, [net], path))
+    return [checked]
+
+
+def _not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[Any], path: str | Path) -> list[SpecError]:
+    """Return a fault for each given shape of a blob that no data layer (or Python layer) makes."""
+    makers = [layer for net in nets for layer in net.layer if not layer.bottom or layer.type == "Python"]
+    blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
+    known = ", ".join(blobs) or "none"
+    return [
+        SpecError(
+            f'--shape names "{name}"{did_you_mean(name, blobs) or ";"} the blobs of data layers: {known}',
+            Where(str(path)),
+        )
+        for name in shapes
+        if name not in blobs
+    ]
 
 
 def _check_solver(
@@ -89,6 +106,8 @@ def _check_solver(
         faults.append(fault)
         described = []
     checked = [check_net(part.net, part.source, part.label, shapes, allow_python) for part in described]
+    if described:
+        faults += _not_to_be_given(shapes, [part.net for part in described], path)
     if faults:
         return [Checked(str(path), None, faults), *checked]
     nets = [part.net for part in checked if part.net is not None and not part.faults]

@@ -109,7 +109,8 @@ def read_image_list(path: Path) -> ImageList:
     """Return the images of a folder or of a list file.
 
     A folder with an ``rgb.txt`` (TUM RGB-D) gives that file's order and stamps; any other, its images in natural order
-    (2 before 10). A list file has one image a line, relative to its own folder, or ``stamp image``.
+    (2 before 10). A list file has one image a line, relative to its own folder, or ``stamp image``, or ``image label``
+    as Caffe's lists; the label is not used.
     """
     if path.is_dir():
         if (path / "rgb.txt").is_file():
@@ -130,6 +131,9 @@ def read_image_list(path: Path) -> ImageList:
         first, _, rest = text.partition(" ")
         stamp = _as_stamp(first) if rest else None
         name = rest.strip() if stamp is not None else text
+        before, _, label = name.rpartition(" ")
+        if label.isdigit() and (path.parent / before).is_file():
+            name = before
         if not (path.parent / name).is_file():
             raise SpecError(
                 f"image {name!r} is missing in {path.parent}", Where(str(path), number, line.find(name) + 1)

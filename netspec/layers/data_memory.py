@@ -20,7 +20,7 @@ T = TypeVar("T")
 class Input(Layer):
     """Name blobs that the caller fills: ``net(data=array)``.
 
-    top[i]  the shape given for it; one shape may stand for all tops
+    top[i]  the shape given for it; one shape may stand for all tops; the caller's own wins (``check --shape``)
     Caffe: src/caffe/layers/input_layer.cpp
     """
 
@@ -36,7 +36,8 @@ class Input(Layer):
             shapes = [given[top] for top in self.param.top]
         if len(shapes) not in (1, self.num_tops):
             raise self.error(f"found {len(shapes)} shapes, expected 1 or one a top ({self.num_tops})", "input_param")
-        self.shapes = shapes * self.num_tops if len(shapes) == 1 else shapes
+        shapes = shapes * self.num_tops if len(shapes) == 1 else shapes
+        self.shapes = [given.get(top, shape) for top, shape in zip(self.param.top, shapes, strict=True)]
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shapes."""

@@ -47,6 +47,17 @@ def test_check_opens_no_data(run: Run) -> None:
     assert run("check", NET).fault == wanted + "say --shape pair_data=50,C,H,W"
 
 
+def test_check_gives_shapes_to_data_layers_and_inputs_only(run: Run) -> None:
+    expected = f'{NET}: --shape names "pair"; did you mean "pair_data"? the blobs of data layers: pair_data, sim'
+    assert run("check", NET, *PAIR_SHAPE, "--shape", "pair=1,2,28,28").fault == expected
+    fault = run("check", SOLVER, *PAIR_SHAPE, "--shape", "conv1=1,6,24,24").fault
+    assert fault == f'{SOLVER}: --shape names "conv1"; the blobs of data layers: pair_data, sim'
+    Path("net.prototxt").write_text(
+        'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 } } }'
+    )
+    assert json.loads(run("check", "net.prototxt", "--json", "--shape", "x=5,3").out)["blobs"] == {"x": [5, 3]}
+
+
 def test_check_filters_by_phase_level_and_stage(run: Run) -> None:
     kinds = ("phase: TRAIN", "phase: TEST", "min_level: 2", 'stage: "a" stage: "b"', 'not_stage: "a"')
     layers = [f'layer {{ name: "l{i}" type: "DummyData" top: "b{i}" dummy_data_param {{ shape {{ dim: 1 }} }} '
