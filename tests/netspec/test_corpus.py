@@ -16,8 +16,8 @@ SOLVERS = [name for name in FILES if "solver" in Path(name).name]
 
 SHAPES = json.loads((CORPUS / "shapes.json").read_text()) if FILES else {}
 WITH_DATA = [name for name in FILES if name.startswith(("BVLC", "forresti")) and name not in SHAPES]
-#: What cannot be checked by itself: code to run, a net that a stage chooses, nets that scripts write.
-OTHERS = ("linreg.prototxt", "mnist_autoencoder.prototxt", "lenet_auto_solver.prototxt")
+#: What cannot be checked by itself: code to run, and nets that a script writes.
+OTHERS = ("linreg.prototxt", "lenet_auto_solver.prototxt")
 
 
 def given_shapes(name: str) -> dict[str, tuple[int, ...]]:
