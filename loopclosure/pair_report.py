@@ -158,7 +158,8 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
         ylabel="contrastive loss of the validation pairs",
         title="Validation loss (circle: judged)",
     )
-    axes.grid(alpha=0.3)
+    axes.set_yscale("log")
+    axes.grid(alpha=0.3, which="both")
     axes.legend()
     figure.savefig(path, dpi=120)
     plt.close(figure)
