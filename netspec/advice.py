@@ -36,6 +36,7 @@ def net_advice(net: Net) -> Iterator[str]:
     yield from _losses(net)
     yield from _unused(net)
     yield from _bare_batch_norms(net)
+    yield from _namesakes(net)
 
 
 def solver_advice(solver: Any, node: Node, nets: list[Net]) -> Iterator[str]:
@@ -125,6 +126,15 @@ def _bare_batch_norms(net: Net) -> Iterator[str]:
     for i, node in enumerate(net.plan.nodes):
         if node.type == "BatchNorm" and "Scale" not in readers.get(node.tops[0], set()):
             yield f"{_place(net, i)}: no Scale layer follows; Caffe's BatchNorm has no scale and shift of its own"
+
+
+def _namesakes(net: Net) -> Iterator[str]:
+    """Saved weights find their layer by its name."""
+    names: set[str] = set()
+    for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
+        if node.name in names and layer.blob_shapes:
+            yield f"{_place(net, i)}: an earlier layer has this name, and gets the weights that are loaded by it"
+        names.add(node.name)
 
 
 def _test_size(iterations: int, where: Where, net: Net) -> Iterator[str]:

@@ -25,7 +25,9 @@ def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
     """
     if filler.type not in _FILLERS:
         known = sorted(_FILLERS)
-        raise ValueError(f'unknown filler "{filler.type}"{did_you_mean(filler.type, known)}; known: {", ".join(known)}')
+        raise ValueError(
+            f'unknown filler "{filler.type}"{did_you_mean(filler.type, known) or ";"} known: {", ".join(known)}'
+        )
     if math.prod(shape) == 0:
         raise ValueError(f"cannot fill an empty blob of shape {shape}")
     if filler.sparse != -1 and filler.type != "gaussian":

@@ -93,7 +93,7 @@ class Layer(torch.nn.Module):
         self.context.created()
         self._check_counts()
         self.setup()
-        self.top_shapes: list[Shape] = [tuple(s) for s in self.reshape(self.bottom_shapes)]
+        self.top_shapes: list[Shape] = [self.possible(s) for s in self.reshape(self.bottom_shapes)]
 
     def construct(self) -> None:
         """Do what Caffe does in the layer's constructor, where that shows in the log."""
@@ -137,7 +137,7 @@ class Layer(torch.nn.Module):
 
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
         """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""
-        data = torch.full(tuple(shape), value, device=self.context.device)
+        data = torch.full(self.possible(shape), value, device=self.context.device)
         if filler is not None and data.device.type != "meta":
             try:
                 filled = fillers.fill(filler, tuple(shape), self.context.random.on("cpu"))
@@ -151,6 +151,12 @@ class Layer(torch.nn.Module):
         """Return learnable blob ``index`` in this layer's shape (a PERMISSIVE sharer's owner may have another)."""
         tensor = self.blobs[index]
         return tensor if tensor.shape == self.blob_shapes[index] else tensor.view(self.blob_shapes[index])
+
+    def possible(self, shape: Sequence[int]) -> Shape:
+        """Return a shape as a tuple; refuse one with a negative size."""
+        if min(shape, default=0) < 0:
+            raise self.error(f"found shape {tuple(shape)}, expected no size below 0")
+        return tuple(shape)
 
     def error(self, message: str, *path: str | int) -> SpecError:
         """Return a SpecError at a field of this layer, e.g. ``self.error("...", "pooling_param", "kernel_size")``."""

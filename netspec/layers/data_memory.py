@@ -62,7 +62,7 @@ class DummyData(Layer):
 
     def setup(self) -> None:
         """Read the shapes, and fill each blob for a try; those of constant fillers are kept."""
-        self.shapes = self._read_shapes()
+        self.shapes = [self.possible(shape) for shape in self._read_shapes()]
         given = list(self.param.dummy_data_param.data_filler)
         self._fillers = self._one_a_top(given or [FillerParameter()], "data_filler")
         self._constants: list[torch.Tensor | None] = []

@@ -84,6 +84,14 @@ def test_a_batch_norm_without_scale(advice: Callable[..., list[str]]) -> None:
     assert advice(norm + 'layer { name: "s" type: "Scale" bottom: "y" top: "y" }') == []
 
 
+def test_two_layers_of_one_name(advice: Callable[..., list[str]]) -> None:
+    said = advice(siamese().replace('"ip2"', '"ip1"'))
+    assert said == [
+        'net.prototxt:6:1: layer "ip1" (InnerProduct): an earlier layer has this name, and gets the weights that are '
+        "loaded by it"
+    ]
+
+
 def test_a_phase_without_its_data_layer(advice: Callable[..., list[str]], tmp_path: Path) -> None:
     net = (DATA % "nowhere").replace('top: "sim"', 'top: "sim" include { phase: TRAIN }')
     Path("net.prototxt").write_text(net)

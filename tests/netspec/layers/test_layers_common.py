@@ -123,3 +123,16 @@ def test_embed_needs_both_its_sizes(build, missing: str) -> None:
     given = "input_dim" if missing == "num_output" else "num_output"
     with pytest.raises(SpecError, match=rf"^embed_param\.{missing}: {missing} must be at least 1"):
         build(f'type: "Embed" embed_param {{ {given}: 4 }}', (2,))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'type: "Input" input_param { shape { dim: 2 dim: -3 } }',
+        'type: "DummyData" dummy_data_param { shape { dim: 2 dim: -3 } }',
+        'type: "Parameter" parameter_param { shape { dim: 2 dim: -3 } }',
+    ],
+)
+def test_no_blob_has_a_size_below_0(build, text: str) -> None:
+    with pytest.raises(SpecError, match=r"found shape \(2, -3\), expected no size below 0"):
+        build(text)
