@@ -255,13 +255,19 @@ def _load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: st
     )
 
 
-def _test(arguments: argparse.Namespace) -> None:
-    from netspec.runs import test_net
+def _load_weights(net: Any, paths: str | None) -> None:
+    """Load weights from one file after the other; their paths are separated by commas."""
     from netspec.weights import load_weights
 
+    for path in paths.split(",") if paths else ():
+        load_weights(net, path.strip())
+
+
+def _test(arguments: argparse.Namespace) -> None:
+    from netspec.runs import test_net
+
     net = _load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
-    for path in arguments.weights.split(","):
-        load_weights(net, path)
+    _load_weights(net, arguments.weights)
     test_net(net, arguments.iterations)
     net.close()
 
@@ -309,7 +315,6 @@ def _extract(arguments: argparse.Namespace) -> None:
     from netspec.graph.filter import with_state
     from netspec.net import BuildOptions, build_net
     from netspec.proto.text import parse_net
-    from netspec.weights import load_weights
 
     device = _device(arguments.gpu)
     out = Path(arguments.out)
@@ -326,16 +331,14 @@ def _extract(arguments: argparse.Namespace) -> None:
         images = read_image_list(Path(arguments.images))
         shape = arguments.shape[1] if arguments.shape else None
         net, scaling = image_net(arguments.model, blob, arguments.input, shape, device)
-        if arguments.weights:
-            load_weights(net, arguments.weights)
+        _load_weights(net, arguments.weights)
         arrays = extract_images(net, scaling, blob, images, progress=_bar("extract", "batch"))
     else:
         message, source = parse_net(arguments.model)
         stated = with_state(message, PHASES[arguments.phase], arguments.level, _stages(arguments))
         stated = with_sources(stated, source, dict(arguments.source))
         net = build_net(stated, source, BuildOptions(device, allow_python=arguments.allow_python_layers))
-        if arguments.weights:
-            load_weights(net, arguments.weights)
+        _load_weights(net, arguments.weights)
         arrays = extract_records(net, arguments.blob, arguments.iterations, _bar("extract", "batch"))
     net.close()
     with out.open("wb") as file:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.errors import SpecError, did_you_mean
+from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph import Report, raise_fault
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import Node, Param, Plan, make_plan, plan_backward
@@ -267,7 +267,8 @@ class Net(torch.nn.Module):
         missing = [name for name in self.inputs if name not in inputs]
         if unknown or missing:
             found = f"unknown input {unknown[0]!r}" if unknown else f"no value for input {missing[0]!r}"
-            raise ValueError(f"{found}; this net's inputs: {', '.join(self.inputs) or 'none (it reads its own data)'}")
+            known = ", ".join(self.inputs) or "none (it reads its own data)"
+            raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
         kept = self._kept()
         values: dict[int, torch.Tensor] = {}
         memories: dict[int, Memory] = {}

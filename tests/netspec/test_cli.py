@@ -246,6 +246,15 @@ def test_a_file_that_is_no_prototxt(run: Run) -> None:
     assert run("check", "nowhere.prototxt").fault == "nowhere.prototxt: cannot be read: No such file or directory"
 
 
+def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
+    deploy = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 } } }'
+    Path("net.prototxt").write_text(deploy)
+    expected = "net.prototxt: no value for input 'x'; this net's inputs: x"
+    assert run("test", "--model", "net.prototxt", "--weights", INIT).fault == expected
+    assert run("train", edited(SOLVER, NET, "net.prototxt", "test_iter: 4", "")).fault == expected
+    assert run("time", "--model", "net.prototxt", "--iterations", 1).status == 0
+
+
 # Usage
 
 
