@@ -138,7 +138,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--gpu", default="", help="the GPU to run on (default: as the solver says, else the CPU)")
+    parser.add_argument(
+        "--gpu", default="", help="the GPU; for training also several: 0,1 or all (default: as the solver says)"
+    )
 
 
 def _add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
@@ -179,24 +181,30 @@ def _stages(arguments: argparse.Namespace) -> tuple[str, ...]:
     return tuple(stage for stage in arguments.stage.split(",") if stage)
 
 
-def _device(gpu: str) -> Any:
-    """Return the torch device of ``--gpu``: the CPU where it is empty."""
+def _devices(gpu: str) -> list[Any]:
+    """Return the torch devices of ``--gpu``: the CPU where it is empty, every GPU for ``all``, else those numbered."""
     import torch
 
     if not gpu:
-        return torch.device("cpu")
+        return [torch.device("cpu")]
     count = torch.cuda.device_count()
-    if "," in gpu or (gpu == "all" and count > 1):
-        raise SpecError(f"--gpu {gpu}: several GPUs are not supported; give one number")
-    if gpu == "all":
-        gpu = "0"
-    if not gpu.isdigit():
-        raise SpecError(f"--gpu {gpu}: expected the number of a GPU")
-    if int(gpu) >= count:
-        raise SpecError(
-            f"--gpu {gpu}: this machine has {count or 'no'} GPU(s) that torch can use; leave --gpu out for the CPU"
-        )
-    return torch.device("cuda", int(gpu))
+    numbers = [str(k) for k in range(count)] or ["0"] if gpu == "all" else gpu.split(",")
+    for number in numbers:
+        if not number.isdigit():
+            raise SpecError(f"--gpu {gpu}: expected the number of a GPU, several separated by commas, or all")
+        if int(number) >= count:
+            raise SpecError(
+                f"--gpu {gpu}: this machine has {count or 'no'} GPU(s) that torch can use; leave --gpu out for the CPU"
+            )
+    return [torch.device("cuda", int(number)) for number in numbers]
+
+
+def _device(gpu: str) -> Any:
+    """Return the one torch device of ``--gpu``."""
+    first, *others = _devices(gpu)
+    if others:
+        raise SpecError(f"--gpu {gpu}: several GPUs are for training; give one number")
+    return first
 
 
 def _bar(description: str, unit: str) -> Callable[[Any], Any]:
@@ -222,7 +230,7 @@ def _train(arguments: argparse.Namespace) -> None:
             path,
             weights=arguments.weights,
             snapshot=arguments.snapshot,
-            device=_device(arguments.gpu) if arguments.gpu else None,
+            device=_devices(arguments.gpu) if arguments.gpu else None,
             level=arguments.level,
             stages=tuple(arguments.stage.split(",")),
             allow_python=arguments.allow_python_layers,

@@ -10,6 +10,8 @@ from __future__ import annotations
 import logging
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 logger = logging.getLogger("netspec")
 
@@ -27,6 +29,16 @@ def warning(site: str, message: str) -> None:
 def error(site: str, message: str) -> None:
     """Log at the level at which some of Caffe's tools tell their progress; see :func:`info`."""
     logger.error(message, extra={"site": site})
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Log nothing for a while."""
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 class GlogFormatter(logging.Formatter):

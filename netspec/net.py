@@ -52,7 +52,8 @@ class BuildOptions:
     """How a net is built.
 
     ``seed`` None draws one; ``open_data`` False opens no data (``given_shapes``: the tops of data layers, by blob);
-    ``report`` gets each fault (the default raises the first); ``allow_python`` lets Python layers run code.
+    ``report`` gets each fault (the default raises the first); ``allow_python`` lets Python layers run code. Of
+    ``ranks`` nets that train side by side this one is number ``rank``: its data layers read their share of the records.
     """
 
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
@@ -61,6 +62,8 @@ class BuildOptions:
     given_shapes: Mapping[str, Shape] | None = None
     report: Report = raise_fault
     allow_python: bool = False
+    rank: int = 0
+    ranks: int = 1
 
 
 def load_net(
@@ -163,6 +166,8 @@ class Net(torch.nn.Module):
                 open_data=options.open_data,
                 given_shapes=options.given_shapes or {},
                 allow_python=options.allow_python,
+                rank=options.rank,
+                ranks=options.ranks,
                 created=partial(self._log_wiring, node),
             )
             try:

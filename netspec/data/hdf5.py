@@ -37,6 +37,8 @@ class Hdf5Source:
         seed: int,
         stream: str,
         where: Where | None = None,
+        rank: int = 0,
+        ranks: int = 1,
     ) -> None:
         log.info("hdf5_data_layer.cpp:80", f"Loading list of HDF5 filenames from: {list_file}")
         named = [(name, place) for line, place in list_lines(list_file, where) for name in line.split()]
@@ -48,7 +50,7 @@ class Hdf5Source:
         self._row_shapes = _row_shapes(*named[0], self._tops)[1]
         counts = [self._rows_of(name, place) for name, place in named]
         self._starts = np.cumsum([0, *counts])
-        self.cursor = Cursor(int(self._starts[-1]), batch_size)
+        self.cursor = Cursor(int(self._starts[-1]), batch_size, rank=rank, ranks=ranks)
         self._shuffle, self._seed, self._stream = shuffle, seed, stream
         self._order = lru_cache(maxsize=2)(self._order_of)
         self._load = lru_cache(maxsize=_FILES_IN_MEMORY)(self._load_file)
@@ -80,8 +82,8 @@ class Hdf5Source:
 
     def _rows(self, iteration: int) -> np.ndarray:
         """Return the rows of an iteration, counted through all files."""
-        count, size = self.cursor.count, self.cursor.batch_size
-        places = np.arange(iteration * size, (iteration + 1) * size)
+        count = self.cursor.count
+        places = np.array(self.cursor.positions(iteration))
         if not self._shuffle:
             return places % count
         return np.array([self._order(epoch)[i] for epoch, i in zip(places // count, places % count, strict=True)])

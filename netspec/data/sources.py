@@ -26,26 +26,46 @@ class Cursor:
     """Which records each iteration reads: batch after batch, from the start again after the last record.
 
     ``skip`` records are passed over at the very start. With ``shuffle`` each epoch has an order of its own, which
-    follows from ``seed``, ``stream`` and the epoch's number.
+    follows from ``seed``, ``stream`` and the epoch's number. Of the ``ranks`` nets that read the same data side by
+    side, this one, ``rank``, takes each ``ranks``-th record (Caffe: DataLayer::Skip).
     """
 
     def __init__(
-        self, count: int, batch_size: int, skip: int = 0, shuffle: bool = False, seed: int = 0, stream: str = ""
+        self,
+        count: int,
+        batch_size: int,
+        skip: int = 0,
+        shuffle: bool = False,
+        seed: int = 0,
+        stream: str = "",
+        rank: int = 0,
+        ranks: int = 1,
     ) -> None:
         self.count, self.batch_size, self.skip = count, batch_size, skip
+        self._rank, self._ranks = rank, ranks
         self._shuffle = shuffle
         self._order = lru_cache(maxsize=2)(lambda epoch: permutation(seed, f"{stream}/shuffle/{epoch}", count))
 
     def records(self, iteration: int) -> list[int]:
         """Return the numbers of the records of an iteration."""
-        start = self.skip + iteration * self.batch_size
-        places = (divmod(k, self.count) for k in range(start, start + self.batch_size))
+        places = (divmod(k, self.count) for k in self.positions(iteration))
         return [int(self._order(epoch)[i]) if self._shuffle else i for epoch, i in places]
+
+    def positions(self, iteration: int) -> range:
+        """Return the places of an iteration's records in the endless sequence that all ranks read."""
+        start, end = self._span(iteration)
+        return range(start + self._rank, end, self._ranks)
 
     def wraps(self, iteration: int) -> int:
         """Return how often the last record is passed in an iteration."""
-        start = self.skip + iteration * self.batch_size
-        return (start + self.batch_size) // self.count - start // self.count
+        start, end = self._span(iteration)
+        return end // self.count - start // self.count
+
+    def _span(self, iteration: int) -> tuple[int, int]:
+        """Return where the records that all ranks read in an iteration begin and end."""
+        width = self.batch_size * self._ranks
+        start = self.skip + iteration * width
+        return start, start + width
 
 
 def draw_skip(rand_skip: int, seed: int, stream: str) -> int:

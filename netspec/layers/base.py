@@ -44,7 +44,8 @@ class Context:
 
     ``at(*path)`` is the place in the prototxt of a field of this layer. ``device`` is where blobs are made; on
     ``meta`` they have shapes and no values. Where ``open_data`` is false, a layer that reads files must not: its tops'
-    shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``.
+    shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``. Of ``ranks`` nets
+    that train side by side the layer's net is number ``rank``.
     """
 
     phase: int = TEST
@@ -54,6 +55,8 @@ class Context:
     open_data: bool = True
     given_shapes: Mapping[str, Shape] = field(default_factory=dict)
     allow_python: bool = False
+    rank: int = 0
+    ranks: int = 1
     created: Callable[[], None] = lambda: None  # called when ``construct`` has run: Caffe's log goes by it
 
 

@@ -202,7 +202,7 @@ class Data(ReadingLayer):
         if p.force_encoded_color:
             transformer.color = True
         skip = self.skip(p.rand_skip, len(reader), "data_param", "rand_skip")
-        cursor = Cursor(len(reader), self.batch_size, skip)
+        cursor = Cursor(len(reader), self.batch_size, skip, rank=self.context.rank, ranks=self.context.ranks)
         source = DatabaseSource(reader, cursor, transformer, self.context.at("data_param", "source"))
         self.log_size(source, "data_layer.cpp:45")
         return source
@@ -283,8 +283,11 @@ class HDF5Data(ReadingLayer):
         p = self.param.hdf5_data_param
         name = self.named(p.source, "hdf5_data_param", "source")
         at = self.context.at("hdf5_data_param", "source")
-        seed = self.context.random.seed
-        return Hdf5Source(name, self.param.top, self.batch_size, p.shuffle, seed, self.stream, at)
+        context = self.context
+        seed = context.random.seed - context.rank  # all ranks share one order
+        return Hdf5Source(
+            name, self.param.top, self.batch_size, p.shuffle, seed, self.stream, at, context.rank, context.ranks
+        )
 
     def shapes_without_data(self) -> list[Shape]:
         """Return the shapes given by the caller; the prototxt says nothing of them."""

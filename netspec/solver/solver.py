@@ -5,9 +5,10 @@ Caffe: src/caffe/solver.cpp; the sites in the log calls are the lines of that fi
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from netspec.solver import nets, update
 from netspec.solver.checks import check_settings, check_writable
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
+from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
 from netspec.weights import load_weights, save_weights
 
@@ -40,7 +42,7 @@ def load_solver(
     path: str | Path,
     weights: str | Path | Iterable[str | Path] | None = None,
     snapshot: str | Path | None = None,
-    device: str | torch.device | None = None,
+    device: str | torch.device | Sequence[str | torch.device] | None = None,
     level: int | None = None,
     stages: Iterable[str] = (),
     allow_python: bool = False,
@@ -49,8 +51,9 @@ def load_solver(
     """Make the solver of a prototxt, its nets built and ready to step.
 
     ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field;
-    ``snapshot`` is a .solverstate to go on from; ``level`` and ``stages`` go to the training net. For ``device`` and
-    ``action`` see :class:`Solver`. Raises SpecError for every fault of the files.
+    ``snapshot`` is a .solverstate to go on from; ``level`` and ``stages`` go to the training net. Several devices train
+    side by side, the first being the root. For ``device`` and ``action`` see :class:`Solver`. Raises SpecError for
+    every fault of the files.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
@@ -60,12 +63,15 @@ def load_solver(
     if weights is not None:
         param.ClearField("weights")
         param.weights.extend([str(weights)] if isinstance(weights, (str, Path)) else map(str, weights))
-    chosen = choose_device(param, node) if device is None else torch.device(device)
-    if chosen.type == "cpu":
+    if device is None:
+        chosen = [choose_device(param, node)]
+    else:
+        chosen = [torch.device(d) for d in ([device] if isinstance(device, (str, torch.device)) else device)]
+    if chosen[0].type == "cpu":
         log.info("caffe.cpp:197", "Use CPU.")
     else:
-        log.info("caffe.cpp:204", f"Using GPUs {chosen.index or 0}")
-    solver = Solver(param, node, device=chosen, allow_python=allow_python, action=action)
+        log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in chosen))
+    solver = Solver(param, node, device=chosen[0], others=chosen[1:], allow_python=allow_python, action=action)
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
         solver.restore(snapshot)
@@ -102,14 +108,16 @@ class Solver:
         node: Node | None = None,
         *,
         device: torch.device | None = None,
+        others: Sequence[torch.device] = (),
         allow_python: bool = False,
         action: Callable[[], str | None] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Build the nets of a solver as ``proto.text.parse_solver`` returns it; raise SpecError for what is wrong.
 
-        ``device`` overrides solver_mode and device_id. ``action`` is asked between iterations, also those of a test:
-        "stop" ends the training, "snapshot" takes one. ``clock`` gives the seconds behind "iter/s".
+        ``device`` overrides solver_mode and device_id; on ``others`` run replicas of the training net. ``action`` is
+        asked between iterations, also those of a test: "stop" ends the training, "snapshot" takes one. ``clock`` gives
+        the seconds behind "iter/s".
         """
         node = node or Node(Where("<solver>"))
         log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
@@ -131,15 +139,20 @@ class Solver:
         self._rule = update.find_rule(param, node)
         self._device = device or choose_device(param, node)
         self._allow_python = allow_python
+        drawn = int.from_bytes(os.urandom(4), "little")
+        self._seed = param.random_seed if param.random_seed >= 0 else drawn
 
         train, *tests = nets.solver_nets(param, node)
         site, sentence = _CREATING[train.origin.split()[0]]
         log.info(site, sentence.format(train.origin))
-        self.net = self._build(train, 0)
+        self.net = self._build(train, 0, self._device, 0, 1 + len(others))
+        with log.silent():  # Caffe tells of the root only
+            replicas = [self._build(train, k, other, k, 1 + len(others)) for k, other in enumerate(others, 1)]
+        self._replicas = Replicas(self.net, replicas)
         self.test_nets: list[Net] = []
         for i, test in enumerate(tests):
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
-            self.test_nets.append(self._build(test, 1 + i))
+            self.test_nets.append(self._build(test, 1 + i, self._device))
         log.info("solver.cpp:57", "Solver scaffolding done.")
         self.history = [
             torch.zeros_like(learnable.parameter.detach())
@@ -147,10 +160,11 @@ class Solver:
             for learnable in self.net.learnable
         ]
 
-    def _build(self, described: nets.SolverNet, offset: int) -> Net:
+    def _build(
+        self, described: nets.SolverNet, offset: int, device: torch.device, rank: int = 0, ranks: int = 1
+    ) -> Net:
         """Build a net; ``offset`` keeps the random draws of a solver's nets apart."""
-        seed = self.param.random_seed + offset if self.param.random_seed >= 0 else None
-        options = BuildOptions(self._device, seed, allow_python=self._allow_python)
+        options = BuildOptions(device, self._seed + offset, allow_python=self._allow_python, rank=rank, ranks=ranks)
         net = build_net(described.net, described.source, options)
         for paths in self.param.weights:
             for path in paths.split(","):
@@ -191,6 +205,7 @@ class Solver:
     def step(self, iterations: int) -> None:
         """Run some iterations. The window of the averaged loss begins anew."""
         self.stopped = False
+        self._replicas.begin()
         self._losses.clear()
         self._displayed = (self.clock(), self.iteration)
         for _ in range(iterations):
@@ -219,6 +234,7 @@ class Solver:
         """Sum the gradients of iter_size passes; return the mean of their losses, and the outputs of the last."""
         for learnable in self.net.learnable:
             learnable.parameter.grad = None
+        self._replicas.clear()
         total = 0.0
         outputs: dict[str, torch.Tensor] = {}
         for _ in range(self.param.iter_size):
@@ -226,7 +242,9 @@ class Solver:
                 loss, outputs = self.net.forward_loss()
                 if loss.requires_grad:
                     loss.backward()
+            self._replicas.backward()
             total += loss.item()
+        self._replicas.reduce()
         return total / self.param.iter_size, outputs
 
     def _debugged(self, net: Net, wanted: bool = True) -> AbstractContextManager[None]:
@@ -256,6 +274,7 @@ class Solver:
         rates = [rate * item.lr_mult for item in learnable]
         self._rule.compute(self.param, diffs, rates, self.history, self.iteration)
         update.subtract(weights, diffs)
+        self._replicas.update()
 
     def _advance_rate(self) -> float:
         step = next_step(self.param, self.iteration, self.current_step)
@@ -355,11 +374,13 @@ class Solver:
         self.current_step = state.current_step
         for net in (self.net, *self.test_nets):
             net.restart_data()
+        self._replicas.restart_data()
 
     def close(self) -> None:
         """Let go of the files and threads of all nets."""
         for net in (self.net, *self.test_nets):
             net.close()
+        self._replicas.close()
 
 
 def _log_scores(site: str, phase: str, scores: Scores, weights: dict[str, float]) -> None:

@@ -164,9 +164,11 @@ def test_without_a_gpu_the_cpu_is_used_and_a_wish_for_a_gpu_refused(run: Run, ed
 # What is wrong, in one line
 
 
-def test_several_gpus_are_refused_clearly(run: Run) -> None:
-    assert run("train", SOLVER, "--gpu", "0,1").fault == "--gpu 0,1: several GPUs are not supported; give one number"
-    assert run("train", SOLVER, "--gpu=first").fault == "--gpu first: expected the number of a GPU"
+def test_gpus_that_are_not_numbers_or_not_there(run: Run) -> None:
+    fault = "--gpu first: expected the number of a GPU, several separated by commas, or all"
+    assert run("train", SOLVER, "--gpu=first").fault == fault
+    count = torch.cuda.device_count()
+    assert f"this machine has {count or 'no'} GPU(s)" in run("train", SOLVER, "--gpu", f"0,{count + 1}").fault
 
 
 def test_a_typo_in_a_field_a_type_or_a_blob(run: Run, edited: Edit) -> None:

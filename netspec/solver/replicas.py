@@ -1,0 +1,71 @@
+"""Copies of the training net on further devices: each runs its share of the records, the root does the update.
+
+So the batch of an iteration is batch_size records a device, and the gradient the mean of the devices' own.
+BatchNorm's statistics stay each device's own during a run; the root's are tested and saved.
+
+Caffe: src/caffe/parallel.cpp (NCCL: all-reduce of the gradients, scaled by 1 / solver_count)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from netspec.net import Net
+
+
+class Replicas:
+    """The training nets besides the root, which has rank 0."""
+
+    def __init__(self, root: Net, others: Sequence[Net]) -> None:
+        self._root, self._others = root, others
+
+    @torch.no_grad()
+    def begin(self) -> None:
+        """Give every replica the root's parameters, BatchNorm's statistics too."""
+        self._copy(everything=True)
+
+    def backward(self) -> None:
+        """Add the gradients of one pass to each replica's own. Nothing waits for a device: they work together."""
+        losses = [net.forward_loss()[0] for net in self._others]
+        for loss in losses:
+            if loss.requires_grad:
+                loss.backward()
+
+    @torch.no_grad()
+    def reduce(self) -> None:
+        """Make the root's gradients the mean over all devices."""
+        for own, *theirs in zip(*(net.learnable for net in (self._root, *self._others)), strict=True):
+            if own.parameter.grad is None:
+                continue
+            for learnable in theirs:
+                own.parameter.grad += learnable.parameter.grad.to(own.parameter.device, non_blocking=True)
+            own.parameter.grad /= 1 + len(theirs)
+
+    def clear(self) -> None:
+        """Forget the gradients of the last iteration."""
+        for net in self._others:
+            for learnable in net.learnable:
+                learnable.parameter.grad = None
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Give every replica the weights that the root has learned."""
+        self._copy(everything=False)
+
+    def restart_data(self) -> None:
+        """Make every replica begin at its first record again."""
+        for net in self._others:
+            net.restart_data()
+
+    def close(self) -> None:
+        """Let go of files and threads."""
+        for net in self._others:
+            net.close()
+
+    def _copy(self, everything: bool) -> None:
+        for net in self._others:
+            for own, theirs in zip(self._root.learnable, net.learnable, strict=True):
+                if everything or own.lr_mult:
+                    theirs.parameter.copy_(own.parameter, non_blocking=True)

@@ -1,0 +1,47 @@
+"""Training on several devices: each takes its share of the records, and together they are one larger batch."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.data.sources import Cursor
+from netspec.solver.solver import load_solver
+
+GOLDEN = Path(__file__).parents[2] / "golden"
+CPU = torch.device("cpu")
+
+
+def test_ranks_share_the_records_between_them() -> None:
+    alone = Cursor(10, 6)
+    ranks = [Cursor(10, 3, rank=rank, ranks=2) for rank in (0, 1)]
+    for iteration in range(5):
+        together = [record for pair in zip(*(r.records(iteration) for r in ranks), strict=True) for record in pair]
+        assert together == alone.records(iteration)
+        assert [r.wraps(iteration) for r in ranks] == [alone.wraps(iteration)] * 2
+
+
+@pytest.mark.parametrize("devices", [2, 4])
+def test_devices_with_a_share_of_the_batch_train_as_one_with_all_of_it(
+    devices: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pairs").symlink_to(GOLDEN / "pairs")
+    (tmp_path / "sgd_step").mkdir()
+    monkeypatch.chdir(tmp_path)
+    weights = GOLDEN / "train" / "sgd_step" / "init.caffemodel"
+    for name in ("solver.prototxt", "train_val.prototxt"):
+        text = (GOLDEN / "train" / "sgd_step" / name).read_text()
+        Path("sgd_step", name).write_text(text)
+    alone = load_solver("sgd_step/solver.prototxt", weights, device="cpu")
+    text = Path("sgd_step/train_val.prototxt").read_text()
+    Path("sgd_step/train_val.prototxt").write_text(text.replace("batch_size: 32", f"batch_size: {32 // devices}"))
+    together = load_solver("sgd_step/solver.prototxt", weights, device=[CPU] * devices)
+    for solver in (alone, together):
+        solver.step(5)
+        solver.step(5)
+        solver.close()
+    for name, blobs in alone.net.params.items():
+        for mine, theirs in zip(blobs, together.net.params[name], strict=True):
+            scale = mine.detach().abs().max().item()
+            assert np.allclose(mine.detach(), theirs.detach(), rtol=0, atol=1e-3 * scale)
