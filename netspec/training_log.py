@@ -19,7 +19,7 @@ def read_test_scores(path: str | Path, output: str, net: int = 0) -> list[tuple[
     try:
         lines = Path(path).read_text(errors="replace").splitlines()
     except OSError as fault:
-        raise SpecError(f"cannot read this log: {fault.strerror}", Where(str(path))) from None
+        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
     scores: dict[int, float] = {}
     iteration = None
     for line in lines:

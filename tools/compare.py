@@ -9,6 +9,7 @@ which the table and the pictures are made.
 
 import argparse
 import json
+import os
 import re
 import subprocess
 import sys
@@ -73,7 +74,12 @@ def read_entry(path: str) -> Entry:
 def netspec(*arguments: str, log: Path) -> None:
     """Run one netspec command; keep its log in a file and show the lines that tell progress."""
     command = [sys.executable, "-m", "netspec", *arguments]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process, log.open("w") as file:
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    environment = {**os.environ, "PYTHONPATH": path}
+    with (
+        subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process,
+        log.open("w") as file,
+    ):
         assert process.stderr is not None
         line = ""
         for line in process.stderr:
