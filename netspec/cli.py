@@ -19,7 +19,6 @@ from netspec import log
 from netspec.cli_run import WrongUsage, run, signals
 from netspec.errors import SpecError
 
-PHASES = {"TRAIN": 0, "TEST": 1}
 EFFECTS = ("stop", "snapshot", "none")
 
 
@@ -145,7 +144,9 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 
 def _add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
     if phase:
-        parser.add_argument("--phase", default=phase, choices=sorted(PHASES), type=str.upper, help=f"default: {phase}")
+        parser.add_argument(
+            "--phase", default=phase, choices=("TEST", "TRAIN"), type=str.upper, help=f"default: {phase}"
+        )
     parser.add_argument("--level", type=int, default=0, help="the NetState's level (default: 0)")
     parser.add_argument("--stage", default="", help="the NetState's stages, separated by commas")
 
@@ -290,6 +291,7 @@ def _time(arguments: argparse.Namespace) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.check import as_json, check_file, table
+    from netspec.net import PHASES
 
     shapes = dict(arguments.shape)
     checked = check_file(
@@ -321,7 +323,7 @@ def _extract(arguments: argparse.Namespace) -> None:
 
     from netspec.extract import extract_images, extract_records, image_net, read_image_list, with_sources
     from netspec.graph.filter import with_state
-    from netspec.net import BuildOptions, build_net
+    from netspec.net import PHASES, BuildOptions, build_net
     from netspec.proto.text import parse_net
 
     device = _device(arguments.gpu)

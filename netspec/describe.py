@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from netspec.extract import image_net, planar
+from netspec.extract import fitted, image_net
 from netspec.weights import load_weights
 
 
@@ -29,7 +29,7 @@ class Describer:
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the descriptor (D,) float32 of an image (H, W, 3) or (H, W), uint8, BGR, of any size."""
         (name,) = self.net.inputs
-        pixels = planar(image, self.net.shapes[name][1:])
+        pixels = fitted(image, self.net.shapes[name][1:])
         with torch.no_grad():
             self.net(**{name: ((pixels - self.scaling.mean) * self.scaling.scale)[None]})
         return self.net.blobs[self.blob].reshape(-1).cpu().numpy()

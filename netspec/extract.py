@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from netspec import log
+from netspec.data.datum import planar
 from netspec.data.transformer import read_mean
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.filter import filter_net, with_state
@@ -220,14 +221,14 @@ def _scaling(layer: Any, shape: Shape, file: str) -> Scaling:
 
 
 def _read(path: Path, shape: Shape) -> np.ndarray:
-    """Return an image file as :func:`planar` does."""
+    """Return an image file as :func:`fitted` does."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR if shape[0] == 3 else cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise SpecError("cannot read this image", Where(str(path)))
-    return planar(image, shape)
+    return fitted(image, shape)
 
 
-def planar(image: np.ndarray, shape: Shape) -> np.ndarray:
+def fitted(image: np.ndarray, shape: Shape) -> np.ndarray:
     """Return an image (H, W, 3) BGR or (H, W), uint8, as ``shape`` (C, H, W): resized (bilinear), in colour or grey."""
     channels, height, width = shape
     if channels == 3 and image.ndim == 2:
@@ -236,7 +237,7 @@ def planar(image: np.ndarray, shape: Shape) -> np.ndarray:
         image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     if image.shape[:2] != (height, width):
         image = cv2.resize(image, (width, height))
-    return np.ascontiguousarray(image.reshape(height, width, channels).transpose(2, 0, 1))
+    return planar(image)
 
 
 def _as_stamp(text: str) -> float | None:

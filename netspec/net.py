@@ -6,6 +6,7 @@ Caffe: src/caffe/net.cpp
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,7 @@ from netspec.graph.plan import Node, Param, Plan, make_plan, plan_backward
 from netspec.graph.splits import insert_splits
 from netspec.in_place import Memory, is_overwritten, run_overwritten
 from netspec.layers import layer_class, layer_types
-from netspec.layers.base import Context, Layer, Random, Shape
+from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.proto.dialect import advice_for_type
 from netspec.proto.dialect_files import announce_known
 from netspec.proto.schema import NetParameter
@@ -183,9 +184,8 @@ class Net(torch.nn.Module):
                 self.shapes[self.plan.blobs[v]] = shape
             log.info("net.cpp:124", f"Setting up {node.name}")
             for shape, weight in zip(layer.top_shapes, weights, strict=True):
-                count = _count(shape)
-                memory += count * 4
-                log.info("net.cpp:131", "Top shape: " + "".join(f"{d} " for d in shape) + f"({count})")
+                memory += math.prod(shape) * 4
+                log.info("net.cpp:131", "Top shape: " + shape_string(shape))
                 if weight:
                     log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
             log.info("net.cpp:139", f"Memory required for data: {memory}")
@@ -226,12 +226,12 @@ class Net(torch.nn.Module):
             owner = layers[owner_index]
             here, there = layer.blob_shapes[j], owner.blob_shapes[owner_blob]
             owner_name = self.plan.nodes[owner_index].name
-            fits = _count(here) == _count(there) if spec.permissive else here == there
+            fits = math.prod(here) == math.prod(there) if spec.permissive else here == there
             if not fits:
                 rule = "equal counts" if spec.permissive else "equal shapes (share_mode: STRICT)"
                 raise layer.error(
                     f'cannot share param "{spec.name}" owned by layer "{owner_name}", param index {owner_blob}: '
-                    f"found shape {_spaced(here)} here and {_spaced(there)} there, expected {rule}",
+                    f"found shape {shape_string(here)} here and {shape_string(there)} there, expected {rule}",
                     "param",
                     j,
                 )
@@ -414,11 +414,3 @@ def _unknown_type(name: str) -> str:
     fork = advice_for_type(name)
     advice = f"; {fork}" if fork else did_you_mean(name, layer_types()) or "; `netspec layers` lists the known ones"
     return f'unknown layer type "{name}"{advice}'
-
-
-def _count(shape: Shape) -> int:
-    return int(np.prod(shape, dtype=np.int64))
-
-
-def _spaced(shape: Shape) -> str:
-    return " ".join(str(d) for d in shape) + f" ({_count(shape)})"

@@ -5,7 +5,6 @@ Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import torch
 
 from netspec import blobs, log
 from netspec.errors import SpecError, Where
+from netspec.layers.base import shape_string
 from netspec.net import Net
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import NetParameter
@@ -199,14 +199,9 @@ def _wrong_count(path: Path, name: str, found: int, expected: int) -> SpecError:
 
 
 def _wrong_shape(path: Path, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:
-    message = (
-        f"cannot copy param {j} weights from layer '{name}'; shape mismatch. Source param shape is {_spaced(found)}; "
-    )
-    return SpecError(f"{message}target param shape is {_spaced(expected)}. {_RENAME}", Where(str(path)))
+    shapes = f"Source param shape is {shape_string(found)}; target param shape is {shape_string(expected)}."
+    message = f"cannot copy param {j} weights from layer '{name}'; shape mismatch. {shapes} {_RENAME}"
+    return SpecError(message, Where(str(path)))
 
 
 _RENAME = "To learn this layer's parameters from scratch rather than copying from a saved net, rename the layer."
-
-
-def _spaced(shape: tuple[int, ...]) -> str:
-    return " ".join(map(str, shape)) + f" ({math.prod(shape)})"

@@ -6,6 +6,7 @@ by integer arithmetic alone, what ``forward`` will return.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -17,6 +18,11 @@ from netspec.errors import SpecError, Where
 
 Shape = tuple[int, ...]
 TRAIN, TEST = 0, 1  # caffe.proto: enum Phase
+
+
+def shape_string(shape: Sequence[int]) -> str:
+    """Return a shape as Caffe prints it, ``64 20 24 24 (737280)`` (Caffe: Blob::shape_string)."""
+    return "".join(f"{d} " for d in shape) + f"({math.prod(shape)})"
 
 
 class Random:
