@@ -10,10 +10,14 @@ import torch
 from torch.nn import functional as F
 
 from netspec.layers.base import Layer, Shape
+from netspec.layers.column_products import ColumnProducts
 from netspec.layers.registry import register
 
 _CONVOLVE = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
 _DECONVOLVE = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
+
+# Up to so many multiply-adds an image, a CPU sums in Caffe's order; beyond, that would cost time.
+CAFFES_ORDER = 500_000
 
 
 def _by(sizes: Shape) -> str:
@@ -176,6 +180,9 @@ class Convolution(_SlidingFilter):
         if any(overhang):
             maps = F.pad(maps, overhang)
         stride, pad, dilation = geometry
+        work = math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * weight.numel()
+        if axes == 2 and self.group == 1 and maps.device.type == "cpu" and work <= CAFFES_ORDER:
+            return ColumnProducts.apply(maps, weight, bias, geometry)
         return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
 
     def multiply_adds(self) -> int:

@@ -103,9 +103,9 @@ def test_follows_caffe(case: str, work_in: Callable[..., Path]):
     solver.close()
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case.startswith(("sgd", "residual"))])
+@pytest.mark.parametrize("case", [case for case in CASES if case != "adadelta"])
 def test_follows_caffe_in_single_precision(case: str, work_in: Callable[..., Path]):
-    """As users train. (The adaptive rules blow up a tie that falls the other way: there they part from Caffe.)"""
+    """As users train. (AdaDelta's is decided by two ties in max poolings, see TIES, that fall the other way here.)"""
     work_in(f"train/{case}")
     solver = load_solver(f"{case}/solver.prototxt", weights=f"{case}/init.caffemodel")
     assert_follows(solver, case, losses(solver))
