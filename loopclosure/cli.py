@@ -15,6 +15,7 @@ from tqdm import tqdm
 from loopclosure import datasets, detect, evaluate, loop_export
 from loopclosure.detector import DetectorSettings, LoopDetector
 from loopclosure.errors import InputError
+from loopclosure.feature_method import WhitenBy
 from loopclosure.features import read_features
 from loopclosure.frames import Selection, image_paths
 from loopclosure.methods import METHODS, Setting
@@ -89,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         required=True,
         metavar="[LABEL=]METHOD",
         help=f"may be repeated; METHOD is one of {', '.join(METHODS)}, with :settings, or NAME+METHOD: "
-        "features:PATH.npz[:cosine], seqslam+features:PATH.npz, fabmap:model=words.npz",
+        "features:PATH.npz[:cosine][:whiten=OTHER.npz], seqslam+features:PATH.npz, fabmap:model=words.npz",
     )
     p.add_argument(
         "--train",
@@ -119,6 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--with", action="append", default=[], dest="options", metavar="KEY=VALUE", help="a keyword for --describe"
     )
+    p.add_argument("--whiten", metavar="OTHER.npz", help="whiten the descriptors by these, of images of other places")
     which = p.add_mutually_exclusive_group(required=True)
     which.add_argument("--threshold", type=float, help="a loop needs this score (euclidean: minus the distance)")
     which.add_argument(
@@ -253,6 +255,9 @@ def _detect(a: argparse.Namespace) -> None:
     recording = detect.open_recording(a.source, Selection(a.start, a.stop, a.stride, a.limit))
     options = dict(_key_value(text) for text in a.options)
     describe = None if a.features else detect.load_describe(a.describe, options)
+    whitening = None if a.whiten is None else WhitenBy(a.whiten).learn()
+    if describe is not None and whitening is not None:
+        describe = detect.whitened(describe, whitening)
     changes = {name: getattr(a, name) for name in SETTINGS if getattr(a, name) is not None}
     if a.resume:
         if changes or a.verify:
@@ -271,9 +276,9 @@ def _detect(a: argparse.Namespace) -> None:
         else:
             exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
             data = datasets.load_tum(a.calibrate, chosen, exclusion)
-        print(detect.calibrate(detector, data, a.precision, a.calibrate_features, show_progress))
+        print(detect.calibrate(detector, data, a.precision, a.calibrate_features, show_progress, whitening))
     before = len(detector)
-    results = detect.run_detector(detector, recording, a.features, show_progress)
+    results = detect.run_detector(detector, recording, a.features, show_progress, whitening)
     loops = [result for result in results if result.accepted is not None]
     out = Path(a.out)
     # Frames of the run that was resumed have numbers but no names here.

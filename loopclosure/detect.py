@@ -29,6 +29,7 @@ from loopclosure.loop_export import RelativePose, relative_pose
 from loopclosure.methods import Progress, silent
 from loopclosure.same_place import same_place
 from loopclosure.trajectory import MAX_DIFFERENCE_S, Poses, associate, read_groundtruth, read_rgb_list
+from loopclosure.whitening import Whitening
 
 
 @dataclass(frozen=True)
@@ -93,14 +94,24 @@ def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Rec
 
 
 def run_detector(
-    detector: LoopDetector, recording: Recording, features: str | Path | None = None, progress: Progress = silent
+    detector: LoopDetector,
+    recording: Recording,
+    features: str | Path | None = None,
+    progress: Progress = silent,
+    whitening: Whitening | None = None,
 ) -> list[LoopResult]:
-    """Add every frame of a recording; ``features``, an .npz with a descriptor of each image, replaces ``describe``."""
+    """Add every frame of a recording.
+
+    ``features``, an .npz with a descriptor of each image, replaces ``describe``; ``whitening`` is of these alone: a
+    ``describe`` is given whitened (see :func:`whitened`).
+    """
     rows = None
     if features is not None:
         if recording.images is None:
             raise InputError("the frames of a video have no names to find features by; give --describe", features)
         rows = read_features(features).rows_of(recording.images)
+        if whitening is not None:
+            rows = whitening(rows)
     results = []
     if rows is not None and detector.check is None:
         for i, row in enumerate(progress(rows, "frames", len(rows))):
@@ -121,6 +132,7 @@ def calibrate(
     precision: float,
     features: str | Path | None = None,
     progress: Progress = silent,
+    whitening: Whitening | None = None,
 ) -> str:
     """Set the threshold of ``detector`` on a validation sequence with its truth; return a sentence on what came out.
 
@@ -132,7 +144,7 @@ def calibrate(
     trial = LoopDetector(detector.describe, detector.settings)
     images = data.query_images
     recording = Recording(Path(data.name), [p.name for p in images], images, np.arange(len(images)), data.stamps)
-    results = run_detector(trial, recording, features, progress)
+    results = run_detector(trial, recording, features, progress, whitening)
     found = detector.calibrate(results, data.truth.soft, precision)
     return (
         f"threshold {detector.settings.threshold:.6g}: on {data.name} precision at least {precision:g} at recall "
@@ -189,6 +201,11 @@ def load_describe(specification: str, options: dict[str, str]) -> Describe:
     if not callable(target):
         raise InputError(f"--describe {specification} is a {type(target).__name__}, which cannot be called")
     return cast(Describe, target)
+
+
+def whitened(describe: Describe, whitening: Whitening) -> Describe:
+    """Return a ``describe`` whose descriptors (D,) are those of another, whitened."""
+    return lambda image: whitening(np.reshape(describe(image), (1, -1)))[0]
 
 
 def _value(text: str) -> int | float | str:

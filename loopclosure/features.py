@@ -1,8 +1,7 @@
-"""Descriptors that another program computed, as a method of the judge: features.npz of ``netspec extract --images``."""
+"""Descriptors that another program computed: the features.npz of ``netspec extract --images``."""
 
 from __future__ import annotations
 
-import time
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -10,11 +9,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.methods import Method, MethodResult, Progress, Setting
-from loopclosure.similarity import METRICS, check_metric, similarity_matrix
 
 # Arrays of the file that describe the images rather than being descriptors.
 BESIDE_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters")
+# Descriptors of one image by one net, from two machines: they differ by less than this share of their length.
+SAME_DESCRIPTOR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -61,6 +60,22 @@ class Features:
             return self.features[[numbers[0] for numbers in found]]
         raise InputError(f"{missing}; its names are like {self.names[0]}", self.path)
 
+    def described_too(self, images: list[Path], rows: np.ndarray) -> list[Path]:
+        """Return those of ``images``, with descriptors ``rows`` (len(images), D), that this file describes as well.
+
+        An image is the same where the last part of its name and its descriptor are: many a data set has a 0001.jpg.
+        Where the file has no names, the descriptor alone decides.
+        """
+        numbers: dict[str, list[int]] = {}
+        for number, name in enumerate(self.names):
+            numbers.setdefault(PurePosixPath(name).name, []).append(number)
+        found = []
+        for image, row in zip(images, rows, strict=True):
+            candidates = self.features[numbers.get(image.name, [])] if self.names else self.features
+            if np.any(np.linalg.norm(candidates - row, axis=1) <= SAME_DESCRIPTOR * np.linalg.norm(row)):
+                found.append(image)
+        return found
+
 
 def read_features(path: str | Path) -> Features:
     """Read a features.npz; without an array ``features`` its only array of any name, a blob's, is taken."""
@@ -89,56 +104,3 @@ def read_features(path: str | Path) -> Features:
             raise InputError(f"has {len(features)} descriptors but {len(values)} {what}", path)
     seconds = float(arrays["seconds_per_image"]) if "seconds_per_image" in arrays else float("nan")
     return Features(path, features, names, stamps, seconds)
-
-
-@dataclass(frozen=True)
-class FeatureMethod:
-    """Descriptors from files, compared in one metric; one file for queries and references, or one for each."""
-
-    query_file: Path
-    reference_file: Path
-    metric: str = "euclidean"
-
-    @property
-    def name(self) -> str:
-        """The file's name and the metric."""
-        return f"{self.query_file.stem} ({self.metric})"
-
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
-        """Score as :class:`loopclosure.methods.Method` says; the seconds of the net are those the file carries."""
-        query_features = read_features(self.query_file)
-        queries = query_features.rows_of(query_images)
-        references = None
-        if reference_images is not None:
-            same = self.reference_file == self.query_file
-            references = (query_features if same else read_features(self.reference_file)).rows_of(reference_images)
-        begin = time.perf_counter()
-        scores = similarity_matrix(queries, references, self.metric)
-        seconds = {"similarity": time.perf_counter() - begin}
-        images = len(query_images) + len(reference_images or [])
-        notes = [f"{queries.shape[1]} dimensions, {self.metric}"]
-        if np.isfinite(query_features.seconds_per_image):
-            seconds = {"features": query_features.seconds_per_image * images, **seconds}
-        else:
-            notes.append("the file does not say how long the features took")
-        return MethodResult(scores, seconds, notes)
-
-
-def features(argument: str, setting: Setting, inner: Method | None) -> FeatureMethod:
-    """Build the method ``features:PATH.npz[:euclidean|cosine]``, or ``features:QUERIES.npz,REFERENCES.npz[...]``."""
-    if inner is not None:
-        raise InputError("features refines no other method; write features:PATH.npz")
-    files, colon, metric = argument.rpartition(":")
-    if not colon or metric.endswith(".npz"):
-        files, metric = argument, METRICS[0]
-    check_metric(metric)
-    paths = [Path(name) for name in files.split(",") if name]
-    if len(paths) not in (1, 2):
-        raise InputError(f'"features:{argument}": expected features:PATH.npz, or two files with a comma between')
-    return FeatureMethod(paths[0], paths[-1], metric)

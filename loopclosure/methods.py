@@ -87,7 +87,7 @@ METHODS: dict[str, str] = {
     "bow": "loopclosure.baselines.methods:bag_of_words",
     "thumbnails": "loopclosure.baselines.methods:thumbnails",
     "seqslam": "loopclosure.sequences:seqslam",
-    "features": "loopclosure.features:features",
+    "features": "loopclosure.feature_method:features",
 }
 
 Factory = Callable[[str, Setting, "Method | None"], Method]

@@ -8,7 +8,7 @@ import pytest
 from loopclosure.datasets import load_tum
 from loopclosure.errors import InputError
 from loopclosure.evaluate import evaluate, figures, named_method
-from loopclosure.features import FeatureMethod
+from loopclosure.feature_method import FeatureMethod
 from loopclosure.methods import METHODS, MethodResult, Setting, make_method
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 

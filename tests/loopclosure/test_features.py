@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.features import FeatureMethod, read_features
+from loopclosure.feature_method import FeatureMethod
+from loopclosure.features import read_features
 from loopclosure.methods import make_method, silent
 
 ROWS = np.arange(8, dtype=np.float32).reshape(4, 2)

@@ -1,0 +1,88 @@
+"""PCA whitening: what descriptors of many places vary in together should not decide which two are of one place.
+
+After Jegou and Chum, "Negative evidences and co-occurences in image retrieval: the benefit of PCA and whitening"
+(ECCV 2012): centre the descriptors, turn them to their principal directions, keep the strongest, give these equal
+variance, scale to length 1. All of it is learnt from images of other places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopclosure.errors import InputError
+
+COMPONENTS = 512
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """A whitening, to be called with descriptors.
+
+    mean        (D,) float32, of the descriptors it was learnt from
+    projection  (D, K) float32: the principal directions, strongest first, divided by their standard deviation ** power
+    images      from how many descriptors it was learnt
+    power       1 makes the variances of the K directions equal, 0 leaves them as they are
+    source      the file that the descriptors came from, for notes and errors
+    """
+
+    mean: np.ndarray
+    projection: np.ndarray
+    images: int
+    power: float
+    source: str = ""
+
+    def __str__(self) -> str:
+        size = f"{self.images} images, {self.projection.shape[1]} components, power {self.power:g}"
+        return f"whitened by {self.source or 'other descriptors'}: {size}"
+
+    def check(self, descriptors: np.ndarray) -> None:
+        """Raise InputError for descriptors (N, D) of another D than it was learnt from."""
+        if descriptors.shape[1] != len(self.mean):
+            raise InputError(
+                f"has descriptors of {len(self.mean)} dimensions, those to be whitened have {descriptors.shape[1]}; "
+                "both must come from the same net",
+                self.source,
+            )
+
+    def project(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return descriptors (N, D) whitened, (N, K) float32, of the length they come out with."""
+        self.check(descriptors)
+        return (descriptors.astype(np.float32) - self.mean) @ self.projection
+
+    def __call__(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return descriptors (N, D) whitened and of length 1, (N, K) float32; one at the mean itself stays zero."""
+        rows = self.project(descriptors)
+        lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+        return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
+
+
+def learn_whitening(
+    descriptors: np.ndarray, components: int = COMPONENTS, power: float = 1.0, source: str = ""
+) -> Whitening:
+    """Learn a whitening from descriptors (N, D) of other images, N >= 2.
+
+    At most ``components`` directions are kept, fewer where the descriptors vary in fewer, which are min(N - 1, D) at
+    most. Raises InputError, naming ``source``, for descriptors that do not do and for settings out of their range.
+    """
+    if components < 1:
+        raise InputError(f"components is {components}; expected 1 or more")
+    if not 0 <= power <= 1:
+        raise InputError(f"power is {power:g}; expected 0 (variances as they are) to 1 (all equal)")
+    if len(descriptors) < 2:
+        raise InputError(f"has {len(descriptors)} descriptors; a whitening is learnt from 2 at the least", source)
+    if not np.all(np.isfinite(descriptors)):
+        raise InputError("has a descriptor with a NaN or an infinity; did the net diverge?", source)
+    values = descriptors.astype(np.float64)
+    mean = values.mean(axis=0)
+    _, singular, directions = np.linalg.svd(values - mean, full_matrices=False)
+    # Below this a direction holds the rounding of float32 and no variance: dividing by it would blow the rounding up.
+    # The size is that of the descriptors, not of their differences: their mean is rounded too.
+    floor = np.finfo(np.float32).eps * np.linalg.norm(values)
+    kept = min(components, len(values) - 1, int(np.count_nonzero(singular > floor)))
+    if not kept:
+        raise InputError(f"has {len(values)} descriptors that are all the same; there is nothing to whiten by", source)
+    deviations = singular[:kept] / np.sqrt(len(values) - 1)
+    projection = directions[:kept].T / deviations**power
+    return Whitening(mean.astype(np.float32), projection.astype(np.float32), len(values), power, source)
