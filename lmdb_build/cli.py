@@ -1,4 +1,4 @@
-"""The command ``lmdb-build``: walks, pairs of images, contact sheets."""
+"""The command ``lmdb-build``: walks, pairs of images, views in batches, contact sheets."""
 
 from __future__ import annotations
 
@@ -15,8 +15,18 @@ from lmdb_build.contact_sheet import write_contact_sheet
 from lmdb_build.pair_build import Plan, build_lists
 from lmdb_build.pair_list import join_lists, root_of
 from lmdb_build.pair_poses import NEGATIVES, PoseRule, PoseSource, Scenes
-from lmdb_build.pair_sources import CAMERAS, MaskSource, folders_source, index_source, singles_source, table_source
+from lmdb_build.pair_sources import (
+    CAMERAS,
+    MaskSource,
+    folder_runs,
+    folders_source,
+    index_runs,
+    index_source,
+    singles_source,
+    table_source,
+)
 from lmdb_build.pairs import SPLITS, PairSource
+from lmdb_build.views import Batches, write_views
 from lmdb_build.walk import Walk, write_walk
 from loopclosure.errors import InputError
 from loopclosure.features import read_features
@@ -49,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     _add_walk(commands.add_parser("walk", help="render a made-up walk through textured rooms, as TUM RGB-D sequences"))
     _add_pairs(commands.add_parser("pairs", help="choose labelled pairs and write their lists"))
+    _add_views(commands.add_parser("views", help="make two views of each place, in batches of different places"))
     _add_sheet(commands.add_parser("sheet", help="draw sample pairs of a list as a picture"))
     _add_join(commands.add_parser("join", help="shuffle several lists into one"))
     return parser
@@ -220,6 +231,41 @@ def _pose_source(options: argparse.Namespace, root: Path) -> PoseSource:
     scenes = Scenes(tuple(options.same_scene), tuple(options.same_frame), options.different_scenes)
     folders = [Path(os.path.relpath(folder.resolve(), root.resolve())).as_posix() for folder in options.sequences]
     return PoseSource(sequences, folders, rule, scenes)
+
+
+def _add_views(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("folders", type=Path, nargs="*", metavar="FOLDER", help="runs of images, or give --index")
+    add("--out", type=Path, required=True, help="folder for the views; the list is OUT.txt")
+    add("--index", type=Path, metavar="CSV", help="a table of frames, with --track and --time")
+    add("--track", metavar="COLUMN", help="of --index: frames of one run")
+    add("--time", metavar="COLUMN", help="of --index: where in the run")
+    add("--batches", type=int, default=400, help="how many batches (400)")
+    add("--size", type=int, default=48, help="pairs a batch, each of another place (48)")
+    add("--per-track", type=int, default=8, help="of them at most so many of one run (8)")
+    add("--apart", type=float, default=4.0, help="places of one run are further apart: seconds, or images (4)")
+    add("--max-gap", type=float, default=1.0, help="two views may be of two images so far apart (1)")
+    add("--other", type=float, default=0.4, help="in this share of the pairs they are (0.4)")
+    add("--view-size", type=_size, default=(128, 96), help="of a view (128x96)")
+    add("--seed", type=int, default=1, help="another seed, other views (1)")
+    parser.set_defaults(run=_views)
+
+
+def _views(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    if bool(options.folders) == bool(options.index):
+        parser.error("name folders, or --index")
+    if options.index:
+        if not (options.track and options.time):
+            parser.error("--index needs --track and --time")
+        root = options.index.parent
+        runs = index_runs(options.index, root, options.track, options.time)
+    else:
+        root = Path(os.path.commonpath([folder.resolve() for folder in options.folders]))
+        runs = folder_runs(options.folders, root)
+    batches = Batches(options.batches, options.size, options.per_track, options.apart, options.max_gap, options.other)
+    path = write_views(runs, batches, options.view_size, root, options.out, options.seed)
+    print(f"{path}: {options.batches} batches of {options.size} pairs")
+    print(f"tools/convert_pairs_lmdb {path.parent}/ {path} {options.out}_lmdb")
 
 
 def _add_sheet(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""Pairs that somebody listed: a mask of loops, two folders with equal names, a table of positives, single images."""
+"""Pairs and runs that somebody listed: a mask of loops, equal names in two folders, tables, single images."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.pairs import LEFT_OUT, NEGATIVE, POSITIVE, Indices
+from lmdb_build.views import Runs
 from loopclosure.errors import InputError
 from loopclosure.frames import IMAGE_SUFFIXES, image_paths
 from loopclosure.truth_files import read_truth_matrix
@@ -209,14 +210,9 @@ def index_source(index: Path, root: Path, group: str, track: str, time: str, max
     """
     rows, (column,) = _read_table(index, 1)
     tracks: dict[str, list[tuple[float, int]]] = {}
-    times = []
     for number, (line, row) in enumerate(rows):
-        text = _cell(index, line, row, time)
-        try:
-            times.append(float(text))
-        except ValueError:
-            raise InputError(f'expected a number in column {time}, found "{text}"', index, line, 1) from None
-        tracks.setdefault(_cell(index, line, row, track), []).append((times[-1], number))
+        moment = _number(index, line, row, time)
+        tracks.setdefault(_cell(index, line, row, track), []).append((moment, number))
     positives = []
     for frames in tracks.values():
         frames.sort()
@@ -232,6 +228,27 @@ def index_source(index: Path, root: Path, group: str, track: str, time: str, max
         "positive": f"at most {max_gap:g} in {time} apart, of one {track}",
     }
     return PlaceSource(names, groups, positives, settings, group)
+
+
+def index_runs(index: Path, root: Path, track: str, time: str) -> Runs:
+    """Read a CSV table of frames as runs: column ``track`` names the run, ``time`` says where along it."""
+    rows, (column,) = _read_table(index, 1)
+    tracks = [_cell(index, line, row, track) for line, row in rows]
+    return Runs(
+        names=[_relative(index.parent / row[column], root) for _, row in rows],
+        tracks=np.unique(tracks, return_inverse=True)[1],
+        stamps=np.array([_number(index, line, row, time) for line, row in rows]),
+    )
+
+
+def folder_runs(folders: SequenceOf[Path], root: Path) -> Runs:
+    """Take each folder (or list) of images for a run, its images one unit of time apart."""
+    runs = [[_relative(path, root) for path in image_paths(folder)] for folder in folders]
+    return Runs(
+        names=[name for run in runs for name in run],
+        tracks=np.repeat(np.arange(len(runs)), [len(run) for run in runs]),
+        stamps=np.concatenate([np.arange(len(run), dtype=np.float64) for run in runs]),
+    )
 
 
 def _read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]]], list[str]]:
@@ -263,6 +280,14 @@ def _cell(path: Path, line: int, row: dict[str, str], column: str) -> str:
     if not row[column]:
         raise InputError(f"column {column} is empty", path, line, 1)
     return row[column]
+
+
+def _number(path: Path, line: int, row: dict[str, str], column: str) -> float:
+    text = _cell(path, line, row, column)
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f'expected a number in column {column}, found "{text}"', path, line, 1) from None
 
 
 def _linked(pairs: list[tuple[str, str]]) -> dict[str, str]:

@@ -1,0 +1,184 @@
+"""Two views of each place, in batches of different places: for nets that learn to tell a batch's places apart.
+
+Contrastive pairs show a net one negative for each positive. Where the loss compares every first image of a batch with
+every second one (Sohn, Improved Deep Metric Learning with Multi-class N-pair Loss, NIPS 2016), a batch of N pairs holds
+N (N - 1) negatives, and it matters which places stand in it together: those of one run look alike, so a batch takes
+several places of few runs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from lmdb_build.pair_list import write_pair_list
+from lmdb_build.pair_warp import JPEG_QUALITY
+from loopclosure.errors import InputError
+from loopclosure.frames import read_image
+
+Indices = NDArray[np.intp]
+
+# What changes between two views, drawn anew for each.
+ZOOM = 2.0  # the part that is seen has 1 to 1/2 of the image's height
+SHIFT = 0.2  # a pair's views are cut about one point, each shifted by up to this share of what it leaves out
+STRETCH = 0.15  # standing out by up to e^0.15 from the views' own proportions
+TURN_DEG = 4.0  # standard deviation
+CORNER = 0.08  # each corner is moved by up to this share of the part's size: perspective
+GAMMA = 0.3  # standard deviation of its logarithm
+CONTRAST, BRIGHTNESS, TINT, NOISE = 0.2, 20.0, 0.08, 4.0  # standard deviations; of grey levels, but for the logarithms
+BLURRED, BLUR = 0.3, (0.4, 1.5)  # how many views, and by how many pixels
+
+
+@dataclass(frozen=True)
+class Runs:
+    """M images of several runs of a camera.
+
+    names   M names below the root folder
+    tracks  (M,) the number of the run
+    stamps  (M,) where along it: seconds, or the image's number
+    """
+
+    names: list[str]
+    tracks: Indices
+    stamps: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Batches:
+    """How views are arranged.
+
+    count      how many batches
+    size       pairs in a batch, all of different places
+    per_track  of them at most so many from one run
+    apart      places of one run are further apart than this (in units of the stamps)
+    max_gap    a pair's second image may be another one, at most so far from the first
+    other      in this share of the pairs it is, where there is one
+    """
+
+    count: int
+    size: int = 48
+    per_track: int = 8
+    apart: float = 4.0
+    max_gap: float = 1.0
+    other: float = 0.4
+
+    def check(self) -> None:
+        """Raise InputError for numbers that make no batch."""
+        for name in ("count", "size", "per_track"):
+            if getattr(self, name) < 1:
+                raise InputError(f"--{name.replace('_', '-')} is at least 1, not {getattr(self, name)}")
+        if not 0 <= self.other <= 1:
+            raise InputError(f"--other is 0 to 1, not {self.other}")
+        if self.apart < self.max_gap:
+            raise InputError(
+                f"--apart {self.apart:g} is less than --max-gap {self.max_gap:g}: one place would be two of a batch"
+            )
+
+
+def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tuple[Indices, Indices]:
+    """Return the first and second images of all pairs (count * size,), batch after batch.
+
+    A batch draws its images from runs in random order. Raises InputError where all runs together have not enough places
+    for a batch.
+    """
+    batches.check()
+    of_track = [np.flatnonzero(runs.tracks == track) for track in np.unique(runs.tracks)]
+    first: list[int] = []
+    for _ in range(batches.count):
+        batch: list[int] = []
+        for track in rng.permutation(len(of_track)):
+            batch += _different_places(runs.stamps, rng.permutation(of_track[track]), batches)
+            if len(batch) >= batches.size:
+                break
+        else:
+            raise InputError(
+                f"a batch of {batches.size} different places cannot be made: the {len(of_track)} runs gave "
+                f"{len(batch)}; lower --size or --apart, or raise --per-track"
+            )
+        first += batch[: batches.size]
+    return np.array(first), np.array([_partner(runs, image, batches, rng) for image in first])
+
+
+def _different_places(stamps: NDArray[np.float64], images: Indices, batches: Batches) -> list[int]:
+    """Return the first ``per_track`` of the images that are far enough from those before."""
+    taken: list[int] = []
+    for image in images.tolist():
+        if np.all(np.abs(stamps[taken] - stamps[image]) > batches.apart):
+            taken.append(image)
+            if len(taken) == batches.per_track:
+                break
+    return taken
+
+
+def _partner(runs: Runs, image: int, batches: Batches, rng: np.random.Generator) -> int:
+    if rng.random() < batches.other:
+        near = (runs.tracks == runs.tracks[image]) & (np.abs(runs.stamps - runs.stamps[image]) <= batches.max_gap)
+        others = np.flatnonzero(near & (np.arange(len(near)) != image))
+        if len(others):
+            return int(rng.choice(others))
+    return image
+
+
+def cut_view(
+    image: NDArray, size: tuple[int, int], about: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return what a camera nearby might see of the image (H, W, 3) uint8 in other light, as (height, width, 3).
+
+    ``about`` (2,) is where the part that is seen lies: 0 at the left (the top), 1 at the right (the bottom). Views
+    about one point overlap, whatever their zoom.
+    """
+    width, height = size
+    part_h = image.shape[0] * np.exp(rng.uniform(-np.log(ZOOM), 0))
+    part_w = min(image.shape[1], part_h * width / height * np.exp(rng.uniform(-STRETCH, STRETCH)))
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
+    part = np.array([part_w, part_h])
+    quad = (corners - 0.5 + rng.uniform(-CORNER, CORNER, (4, 2))) * part
+    cos, sin = np.cos(np.deg2rad(angle := rng.normal(0, TURN_DEG))), np.sin(np.deg2rad(angle))
+    quad = quad @ np.array([[cos, -sin], [sin, cos]]) + part / 2
+    quad += np.clip(about + rng.uniform(-SHIFT, SHIFT, 2), 0, 1) * (np.array(image.shape[1::-1]) - part)
+    homography = cv2.getPerspectiveTransform(quad.astype(np.float32), (corners * size).astype(np.float32))
+    seen = cv2.warpPerspective(image, homography, size, borderMode=cv2.BORDER_REFLECT)
+    if rng.random() < BLURRED:
+        seen = cv2.GaussianBlur(seen, (0, 0), rng.uniform(*BLUR))
+    light = 255 * (seen.astype(np.float32) / 255) ** np.exp(rng.normal(0, GAMMA))
+    light = (light - light.mean()) * np.exp(rng.normal(0, CONTRAST)) + light.mean() + rng.normal(0, BRIGHTNESS)
+    light = light * np.exp(rng.normal(0, TINT, 3)) + rng.normal(0, NOISE) * rng.standard_normal((height, width, 1))
+    return np.clip(np.round(light), 0, 255).astype(np.uint8)
+
+
+def write_views(runs: Runs, batches: Batches, size: tuple[int, int], root: Path, folder: Path, seed: int) -> Path:
+    """Write two views of ``size`` (width, height) for each pair below ``folder``, and the list ``folder``.txt.
+
+    Both views of a pair are mirrored, or neither. Raises InputError where batches cannot be made, or an image not be
+    read or written.
+    """
+    if seed < 0:
+        raise InputError(f"a seed is 0 or more, not {seed}")
+    first, second = choose_views(runs, batches, np.random.default_rng([seed, 0]))
+    folder.mkdir(parents=True, exist_ok=True)
+    listed = []
+    for number, pair in enumerate(tqdm(zip(first, second, strict=True), total=len(first), unit="pair", disable=None)):
+        rng = np.random.default_rng([seed, 1, number])
+        mirrored, about = rng.random() < 0.5, rng.uniform(0, 1, 2)
+        names = [f"{folder.name}/{number:06d}_{side}.jpg" for side in "ab"]
+        for image, name in zip(pair, names, strict=True):
+            picture = read_image(root / runs.names[image])
+            view = cut_view(picture[:, ::-1] if mirrored else picture, size, about, rng)
+            if not cv2.imwrite(str(folder.parent / name), view, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
+                raise InputError("cannot be written", folder.parent / name)
+        listed.append((*names, 1))
+    out = folder.with_suffix(".txt")
+    settings = {
+        "source": f"{len(runs.names)} images of {len(np.unique(runs.tracks))} runs",
+        "batches": f"{batches.count} of {batches.size} places, up to {batches.per_track} of one run, "
+        f"more than {batches.apart:g} apart",
+        "second image": f"in {batches.other:g} of the pairs another one, up to {batches.max_gap:g} away",
+        "seed": str(seed),
+    }
+    write_pair_list(out, listed, settings)
+    return out

@@ -1,0 +1,115 @@
+"""Two views of each place: what stands in a batch together, what a view shows, and the command that writes them."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lmdb_build.cli import main
+from lmdb_build.pair_list import read_pair_list
+from lmdb_build.views import Batches, Runs, choose_views, cut_view
+from loopclosure.errors import InputError
+
+
+def runs_of(tracks: int = 5, images: int = 40) -> Runs:
+    names = [f"{track}/{image}.jpg" for track in range(tracks) for image in range(images)]
+    return Runs(names, np.repeat(np.arange(tracks), images), np.tile(np.arange(images, dtype=float), tracks))
+
+
+def test_a_batch_has_different_places_of_few_runs() -> None:
+    runs = runs_of()
+    batches = Batches(count=20, size=12, per_track=4, apart=5)
+    first, second = choose_views(runs, batches, np.random.default_rng(0))
+    assert len(first) == len(second) == 240
+    for batch in first.reshape(20, 12):
+        tracks = runs.tracks[batch]
+        assert np.bincount(tracks).max() == 4
+        assert len(np.unique(tracks)) == 3
+        for track in np.unique(tracks):
+            stamps = np.sort(runs.stamps[batch[tracks == track]])
+            assert np.diff(stamps).min() > 5
+    assert len(np.unique(first)) > 100  # not the same few again
+
+
+def test_the_second_image_is_the_first_or_near_it_in_its_run() -> None:
+    runs = runs_of()
+    first, second = choose_views(runs, Batches(count=30, size=12, max_gap=2, other=0.5), np.random.default_rng(0))
+    assert np.all(runs.tracks[first] == runs.tracks[second])
+    gaps = np.abs(runs.stamps[first] - runs.stamps[second])
+    assert set(gaps) == {0, 1, 2}
+    assert 0.4 < np.mean(gaps > 0) < 0.6
+    first, second = choose_views(runs, Batches(count=30, size=12, other=0), np.random.default_rng(0))
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"size": 100}, "a batch of 100 different places cannot be made: the 5 runs gave 3[0-5]; lower --size"),
+        ({"size": 0}, "--size is at least 1, not 0"),
+        ({"apart": 1.0, "max_gap": 2.0}, "--apart 1 is less than --max-gap 2"),
+        ({"other": 1.5}, "--other is 0 to 1"),
+    ],
+)
+def test_batches_that_cannot_be_made_are_refused(settings: dict, words: str) -> None:
+    batches = Batches(**{"count": 1, "per_track": 7, "apart": 4.0, **settings})
+    with pytest.raises(InputError, match=words):
+        choose_views(runs_of(), batches, np.random.default_rng(0))
+
+
+def test_two_views_about_one_point_overlap() -> None:
+    # Colours that say where a pixel was: blue its row, green its column.
+    rows, columns = np.mgrid[0:120, 0:200]
+    image = np.dstack([rows, columns, np.zeros_like(rows)]).astype(np.uint8)
+    rng = np.random.default_rng(3)
+    centres = []
+    for about in ([0.0, 0.0], [1.0, 1.0]):
+        views = [cut_view(image, (64, 48), np.array(about), rng) for _ in range(20)]
+        assert all(view.shape == (48, 64, 3) and view.dtype == np.uint8 for view in views)
+        assert len({view.tobytes() for view in views}) == 20
+        centres.append(np.mean([view[20:28, 28:36, 1].mean() for view in views]))
+    assert centres[1] > centres[0] + 20
+
+
+def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    lines = ["image,run,second"]
+    for run in "ab":
+        (tmp_path / "src" / run).mkdir(parents=True)
+        for number in range(12):
+            picture = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (80, 60))
+            cv2.imwrite(str(tmp_path / "src" / run / f"{number}.jpg"), picture)
+            lines.append(f"{run}/{number}.jpg,{run},{number}")
+    index = tmp_path / "src" / "index.csv"
+    index.write_text("\n".join(lines) + "\n")
+    command = ["views", "--batches", "3", "--size", "4", "--per-track", "2", "--view-size", "32x24"]
+    by_index = [*command, "--index", str(index), "--track", "run", "--time", "second"]
+    assert main([*by_index, "--out", str(tmp_path / "one")]) == 0
+    assert "3 batches of 4 pairs" in capsys.readouterr().out
+    listed = read_pair_list(tmp_path / "one.txt")
+    assert [pair.label for pair in listed] == [1] * 12
+    views = [cv2.imread(str(tmp_path / name)) for pair in listed for name in (pair.first, pair.second)]
+    assert all(view is not None and view.shape == (24, 32, 3) for view in views)
+
+    assert main([*by_index, "--out", str(tmp_path / "again" / "one")]) == 0
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "again" / "one" / path.name).read_bytes()
+
+    folders = [str(tmp_path / "src" / run) for run in "ab"]
+    assert main([*command, *folders, "--out", str(tmp_path / "two")]) == 0
+    assert len(read_pair_list(tmp_path / "two.txt")) == 12
+
+    assert main([*command, *folders, "--size", "9", "--out", str(tmp_path / "three")]) == 1
+    assert "cannot be made" in capsys.readouterr().err
+    assert not (tmp_path / "three").exists()
+    index.write_text("\n".join(lines).replace("a,3", "a,x") + "\n")
+    assert main([*by_index, "--out", str(tmp_path / "four")]) == 1
+    assert 'index.csv:5:1: expected a number in column second, found "x"' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [[], ["folder", "--index", "x.csv"], ["--index", "x.csv"]])
+def test_the_source_is_named_once_and_whole(more: list[str]) -> None:
+    with pytest.raises(SystemExit) as exit:
+        main(["views", "--out", "out", *more])
+    assert exit.value.code == 2
