@@ -58,6 +58,7 @@ class Batches:
     apart      places of one run are further apart than this (in units of the stamps)
     max_gap    a pair's second image may be another one, at most so far from the first
     other      in this share of the pairs it is, where there is one
+    negatives  in this share of the pairs the second image shows another place of the batch, as ContrastiveLoss wants it
     """
 
     count: int
@@ -66,22 +67,26 @@ class Batches:
     apart: float = 4.0
     max_gap: float = 1.0
     other: float = 0.4
+    negatives: float = 0.0
 
     def check(self) -> None:
         """Raise InputError for numbers that make no batch."""
         for name in ("count", "size", "per_track"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name.replace('_', '-')} is at least 1, not {getattr(self, name)}")
-        if not 0 <= self.other <= 1:
-            raise InputError(f"--other is 0 to 1, not {self.other}")
+        for name in ("other", "negatives"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"--{name} is 0 to 1, not {getattr(self, name):g}")
+        if round(self.size * self.negatives) == 1:
+            raise InputError(f"--negatives {self.negatives:g} of --size {self.size} is one pair; expected none or two")
         if self.apart < self.max_gap:
             raise InputError(
                 f"--apart {self.apart:g} is less than --max-gap {self.max_gap:g}: one place would be two of a batch"
             )
 
 
-def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tuple[Indices, Indices]:
-    """Return the first and second images of all pairs (count * size,), batch after batch.
+def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """Return first and second images of all pairs (count * size,), batch after batch, and whether both are one place.
 
     A batch draws its images from runs in random order. Raises InputError where all runs together have not enough places
     for a batch.
@@ -89,6 +94,7 @@ def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tupl
     batches.check()
     of_track = [np.flatnonzero(runs.tracks == track) for track in np.unique(runs.tracks)]
     first: list[int] = []
+    same = np.ones((batches.count, batches.size), bool)
     for _ in range(batches.count):
         batch: list[int] = []
         for track in rng.permutation(len(of_track)):
@@ -101,7 +107,12 @@ def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tupl
                 f"{len(batch)}; lower --size or --apart, or raise --per-track"
             )
         first += batch[: batches.size]
-    return np.array(first), np.array([_partner(runs, image, batches, rng) for image in first])
+    second = np.array([_partner(runs, image, batches, rng) for image in first])
+    for seconds, sames in zip(second.reshape(same.shape), same, strict=True):
+        exchanged = rng.permutation(batches.size)[: round(batches.size * batches.negatives)]
+        seconds[exchanged] = seconds[np.roll(exchanged, 1)]
+        sames[exchanged] = False
+    return np.array(first), second, same.ravel()
 
 
 def _different_places(stamps: NDArray[np.float64], images: Indices, batches: Batches) -> list[int]:
@@ -159,7 +170,7 @@ def write_views(runs: Runs, batches: Batches, size: tuple[int, int], root: Path,
     """
     if seed < 0:
         raise InputError(f"a seed is 0 or more, not {seed}")
-    first, second = choose_views(runs, batches, np.random.default_rng([seed, 0]))
+    first, second, same = choose_views(runs, batches, np.random.default_rng([seed, 0]))
     folder.mkdir(parents=True, exist_ok=True)
     listed = []
     for number, pair in enumerate(tqdm(zip(first, second, strict=True), total=len(first), unit="pair", disable=None)):
@@ -171,13 +182,14 @@ def write_views(runs: Runs, batches: Batches, size: tuple[int, int], root: Path,
             view = cut_view(picture[:, ::-1] if mirrored else picture, size, about, rng)
             if not cv2.imwrite(str(folder.parent / name), view, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
                 raise InputError("cannot be written", folder.parent / name)
-        listed.append((*names, 1))
+        listed.append((*names, int(same[number])))
     out = folder.with_suffix(".txt")
     settings = {
         "source": f"{len(runs.names)} images of {len(np.unique(runs.tracks))} runs",
         "batches": f"{batches.count} of {batches.size} places, up to {batches.per_track} of one run, "
         f"more than {batches.apart:g} apart",
         "second image": f"in {batches.other:g} of the pairs another one, up to {batches.max_gap:g} away",
+        "negatives": f"{batches.negatives:g} of the pairs",
         "seed": str(seed),
     }
     write_pair_list(out, listed, settings)

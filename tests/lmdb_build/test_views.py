@@ -20,8 +20,9 @@ def runs_of(tracks: int = 5, images: int = 40) -> Runs:
 def test_a_batch_has_different_places_of_few_runs() -> None:
     runs = runs_of()
     batches = Batches(count=20, size=12, per_track=4, apart=5)
-    first, second = choose_views(runs, batches, np.random.default_rng(0))
+    first, second, same = choose_views(runs, batches, np.random.default_rng(0))
     assert len(first) == len(second) == 240
+    assert same.all()
     for batch in first.reshape(20, 12):
         tracks = runs.tracks[batch]
         assert np.bincount(tracks).max() == 4
@@ -34,13 +35,23 @@ def test_a_batch_has_different_places_of_few_runs() -> None:
 
 def test_the_second_image_is_the_first_or_near_it_in_its_run() -> None:
     runs = runs_of()
-    first, second = choose_views(runs, Batches(count=30, size=12, max_gap=2, other=0.5), np.random.default_rng(0))
+    first, second, _ = choose_views(runs, Batches(count=30, size=12, max_gap=2, other=0.5), np.random.default_rng(0))
     assert np.all(runs.tracks[first] == runs.tracks[second])
     gaps = np.abs(runs.stamps[first] - runs.stamps[second])
     assert set(gaps) == {0, 1, 2}
     assert 0.4 < np.mean(gaps > 0) < 0.6
-    first, second = choose_views(runs, Batches(count=30, size=12, other=0), np.random.default_rng(0))
+    first, second, _ = choose_views(runs, Batches(count=30, size=12, other=0), np.random.default_rng(0))
     np.testing.assert_array_equal(first, second)
+
+
+def test_negatives_are_other_places_of_the_batch() -> None:
+    runs = runs_of()
+    batches = Batches(count=30, size=12, apart=5, other=0, negatives=0.5)
+    first, second, same = choose_views(runs, batches, np.random.default_rng(0))
+    np.testing.assert_array_equal(first == second, same)
+    np.testing.assert_array_equal(same.reshape(30, 12).sum(axis=1), 6)
+    for firsts, seconds in zip(first.reshape(30, 12), second.reshape(30, 12), strict=True):
+        assert sorted(firsts) == sorted(seconds)
 
 
 @pytest.mark.parametrize(
@@ -50,6 +61,8 @@ def test_the_second_image_is_the_first_or_near_it_in_its_run() -> None:
         ({"size": 0}, "--size is at least 1, not 0"),
         ({"apart": 1.0, "max_gap": 2.0}, "--apart 1 is less than --max-gap 2"),
         ({"other": 1.5}, "--other is 0 to 1"),
+        ({"negatives": -0.5}, "--negatives is 0 to 1"),
+        ({"size": 10, "negatives": 0.1}, "is one pair; expected none or two"),
     ],
 )
 def test_batches_that_cannot_be_made_are_refused(settings: dict, words: str) -> None:

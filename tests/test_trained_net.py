@@ -1,0 +1,23 @@
+"""The trained net that the project brings closes the loops of a walk it never saw, better than the simple baselines."""
+
+import json
+from pathlib import Path
+
+from lmdb_build.cli import main as lmdb_build
+from loopclosure.cli import main as loopclosure
+from netspec.cli import main as netspec
+
+WORDS = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_words_256"
+
+
+def test_the_words_net_is_ahead_of_thumbnails_on_an_unseen_walk(tmp_path: Path) -> None:
+    walk, features, out = tmp_path / "walk_1", tmp_path / "features.npz", tmp_path / "report"
+    command = ["walk", str(tmp_path), "--frames", "120", "--laps", "2", "--size", "160x120", "--seed", "77"]
+    assert lmdb_build(command) == 0
+    net = ["--model", str(WORDS / "deploy.prototxt"), "--weights", str(WORDS / "siamese_words_256.caffemodel")]
+    assert netspec(["extract", *net, "--blob", "feat", "--images", str(walk), "--out", str(features)]) == 0
+    methods = ["--method", "thumbnails", "--method", f"words=features:{features}"]
+    assert loopclosure(["evaluate", "--tum", str(walk), "--exclude-seconds", "5", *methods, "--out", str(out)]) == 0
+    found = json.loads((out / "report.json").read_text())
+    precision = {method["name"]: method["figures"]["all pairs"]["average precision"] for method in found["methods"]}
+    assert precision["words"] > precision["thumbnails"] + 0.2
