@@ -246,9 +246,7 @@ def _add_views(parser: argparse.ArgumentParser) -> None:
     add("--apart", type=float, default=4.0, help="places of one run are further apart: seconds, or images (4)")
     add("--max-gap", type=float, default=1.0, help="two views may be of two images so far apart (1)")
     add("--other", type=float, default=0.4, help="in this share of the pairs they are (0.4)")
-    add(
-        "--negatives", type=float, default=0.0, help="share of pairs of two places, for ContrastiveLoss (0)"
-    )
+    add("--negatives", type=float, default=0.0, help="share of pairs of two places, for ContrastiveLoss (0)")
     add("--view-size", type=_size, default=(128, 96), help="of a view (128x96)")
     add("--seed", type=int, default=1, help="another seed, other views (1)")
     parser.set_defaults(run=_views)
