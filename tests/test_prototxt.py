@@ -158,3 +158,19 @@ def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
     (checked,) = check_file(WORDS / "deploy.prototxt", phase=1)
     shapes = {name: checked.net.shapes[name] for name in checked.net.plan.outputs}
     assert shapes == {"feat": (1, 256 + 6 * 256)}
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted((ROOT / "prototxt").rglob("train_val*.prototxt")),
+    ids=lambda path: f"{path.parent.parent.name}-{path.parent.name}-{path.stem}",
+)
+def test_every_net_checks_without_a_fault_or_advice(path: Path) -> None:
+    """The advice would say, among other things, that towers do not share all parameters."""
+    text = path.read_text()
+    batch = int(re.findall(r"batch_size: (\d+)", text)[0])
+    label = re.findall(r'top: "(\w+)"', text)[1]
+    shapes = {"pair_data": (batch, 6, 64, 64), label: (batch,)}
+    (checked,) = check_file(path, phase=0, shapes=shapes)
+    assert not checked.faults
+    assert not checked.advice
