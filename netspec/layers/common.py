@@ -9,6 +9,7 @@ import torch
 from torch.nn import functional as F
 
 from netspec.layers.base import TRAIN, Layer, Shape
+from netspec.layers.products import VectorProducts, in_caffes_order
 from netspec.layers.registry import register
 
 
@@ -49,9 +50,12 @@ class InnerProduct(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the products."""
-        weight = self.blob(0).t() if self.param.inner_product_param.transpose else self.blob(0)
-        bias = self.blob(1) if len(self.blobs) > 1 else None
-        return F.linear(data.flatten(self.axis), weight, bias)
+        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+        transposed = self.param.inner_product_param.transpose
+        if in_caffes_order(data, weight, weight.numel()):
+            vectors = data.reshape(-1, self.inputs)
+            return VectorProducts.apply(vectors, weight, bias, transposed).reshape(self.top_shapes[0])
+        return F.linear(data.flatten(self.axis), weight.t() if transposed else weight, bias)
 
     def multiply_adds(self) -> int:
         """Return values out times values in."""

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from google.protobuf.message import DecodeError
 
+from netspec.arithmetic import sum_in_order
 from netspec.blobs import to_array
 from netspec.layers.base import Shape
 from netspec.layers.loss_base import (
@@ -282,27 +283,22 @@ class _Contrastive(torch.autograd.Function):
         ctx: Any, a: torch.Tensor, b: torch.Tensor, similar: torch.Tensor, margin: float, legacy: bool
     ) -> torch.Tensor:
         difference = a - b
-        squared = difference.square().sum(1)
-        if legacy:
-            dissimilar = (margin - squared).clamp(min=0)
-        else:
-            dissimilar = (margin - squared.sqrt()).clamp(min=0).square()
-        ctx.save_for_backward(difference, squared, similar)
+        # In double, as OpenBLAS sums up to 31 products; and torch's root of a float may be off by its last bit.
+        squared = difference.square().double().sum(1).to(difference.dtype)
+        distance = squared.double().sqrt().to(difference.dtype)
+        dissimilar = (margin - squared).clamp(min=0) if legacy else (margin - distance).clamp(min=0).square()
+        ctx.save_for_backward(difference, squared if legacy else distance, similar)
         ctx.margin, ctx.legacy = margin, legacy
-        return torch.where(similar, squared, dissimilar).sum() / (2 * len(a))
+        return sum_in_order(torch.where(similar, squared, dissimilar)) / len(a) / 2
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        difference, squared, similar = ctx.saved_tensors
-        if ctx.legacy:
-            lacking = ctx.margin - squared
-            dissimilar = torch.full_like(squared, -1)
-        else:
-            distance = squared.sqrt()
-            lacking = ctx.margin - distance
-            dissimilar = -lacking / (distance + 1e-4)
-        factor = torch.where(similar, 1, dissimilar.where(lacking > 0, 0))
-        grad = grads[0] / len(difference) * factor.unsqueeze(1) * difference
+        difference, distance, similar = ctx.saved_tensors
+        alpha = grads[0] / len(difference)
+        lacking = ctx.margin - distance
+        dissimilar = -alpha if ctx.legacy else -alpha * lacking / (distance + 1e-4)
+        factor = torch.where(similar, alpha, dissimilar.where(lacking > 0, 0))
+        grad = factor.unsqueeze(1) * difference
         return grad, -grad, None, None, None
 
 

@@ -10,14 +10,11 @@ import torch
 from torch.nn import functional as F
 
 from netspec.layers.base import Layer, Shape
-from netspec.layers.column_products import ColumnProducts
+from netspec.layers.products import ColumnProducts, in_caffes_order
 from netspec.layers.registry import register
 
 _CONVOLVE = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
 _DECONVOLVE = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
-
-# Up to so many multiply-adds an image, a CPU sums in Caffe's order; beyond, that would cost time.
-CAFFES_ORDER = 500_000
 
 
 def _by(sizes: Shape) -> str:
@@ -163,7 +160,8 @@ class Convolution(_SlidingFilter):
         weight = self.blob(0)
         bias = self.blob(1) if len(self.blobs) > 1 else None
         axes = max(self.spatial_axes, 1)  # a map without spatial axes is one of a single pixel
-        weight = weight.reshape(*weight.shape[:2], *(self.kernel or (1,)))
+        if not self.kernel:
+            weight = weight.unsqueeze(2)
         geometry = [v or (n,) for v, n in ((self.stride, 1), (self.pad, 0), (self.dilation, 1))]
         tops = []
         for bottom, shape in zip(bottoms, self.top_shapes, strict=True):
@@ -181,7 +179,7 @@ class Convolution(_SlidingFilter):
             maps = F.pad(maps, overhang)
         stride, pad, dilation = geometry
         work = math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * weight.numel()
-        if axes == 2 and self.group == 1 and maps.device.type == "cpu" and work <= CAFFES_ORDER:
+        if axes == 2 and self.group == 1 and in_caffes_order(maps, weight, work):
             return ColumnProducts.apply(maps, weight, bias, geometry)
         return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
 

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
+from netspec.arithmetic import power
 from netspec.errors import SpecError, did_you_mean
 from netspec.proto.source_map import Node
 
@@ -29,13 +31,19 @@ def _power(base: float, exponent: float) -> np.float64:
     return np.power(np.float64(base), np.float64(exponent))  # inf and nan where Python's ** would raise
 
 
+def _powf(base: np.float32, exponent: float) -> float:
+    return power(torch.tensor(base), exponent).item()
+
+
 POLICIES: dict[str, Policy] = {
     "fixed": Policy((), lambda p, i, step: p.base_lr),
     "step": Policy(("gamma", "stepsize"), lambda p, i, step: p.base_lr * _power(p.gamma, step)),
     "exp": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(p.gamma, i)),
-    "inv": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(1 + p.gamma * i, -p.power)),
+    "inv": Policy(("gamma",), lambda p, i, step: p.base_lr * _powf(1 + np.float32(p.gamma) * np.float32(i), -p.power)),
     "multistep": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(p.gamma, step)),
-    "poly": Policy(("max_iter",), lambda p, i, step: p.base_lr * _power(1 - i / p.max_iter, p.power)),
+    "poly": Policy(
+        ("max_iter",), lambda p, i, step: p.base_lr * _powf(1 - np.float32(i) / np.float32(p.max_iter), p.power)
+    ),
     "sigmoid": Policy(
         ("gamma", "stepsize"), lambda p, i, step: p.base_lr / (1 + np.exp(np.float64(-p.gamma * (i - p.stepsize))))
     ),

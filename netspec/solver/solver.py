@@ -13,9 +13,11 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from netspec import log
+from netspec.arithmetic import adding_to_grad
 from netspec.errors import SpecError, Where
 from netspec.net import BuildOptions, Net, build_net
 from netspec.proto.schema import SolverParameter
@@ -235,17 +237,18 @@ class Solver:
         for learnable in self.net.learnable:
             learnable.parameter.grad = None
         self._replicas.clear()
-        total = 0.0
+        total = np.float32(0)
         outputs: dict[str, torch.Tensor] = {}
         for _ in range(self.param.iter_size):
-            with self._debugged(self.net, self._is_due(self.param.display)):
-                loss, outputs = self.net.forward_loss()
-                if loss.requires_grad:
-                    loss.backward()
-            self._replicas.backward()
-            total += loss.item()
+            with adding_to_grad():
+                with self._debugged(self.net, self._is_due(self.param.display)):
+                    loss, outputs = self.net.forward_loss()
+                    if loss.requires_grad:
+                        loss.backward()
+                self._replicas.backward()
+            total += np.float32(loss.item())
         self._replicas.reduce()
-        return total / self.param.iter_size, outputs
+        return float(total / np.float32(self.param.iter_size)), outputs
 
     def _debugged(self, net: Net, wanted: bool = True) -> AbstractContextManager[None]:
         return debug_info(net) if wanted and self.param.debug_info else nullcontext()

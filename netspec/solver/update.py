@@ -15,8 +15,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
+from netspec.arithmetic import power, sum_of_squares
 from netspec.errors import SpecError, did_you_mean
 from netspec.proto.source_map import Node
 
@@ -30,11 +32,12 @@ def clip(diffs: Tensors, limit: float) -> tuple[float, float] | None:
     """
     if limit < 0 or not diffs:
         return None
-    norm = float(torch.linalg.vector_norm(torch.stack(torch._foreach_norm(diffs))))
-    if norm <= limit or math.isnan(norm):
+    norm = np.sqrt(np.float32(sum(sum_of_squares(diff) for diff in diffs)))
+    if norm <= limit or np.isnan(norm):
         return None
-    torch._foreach_mul_(diffs, limit / norm)
-    return norm, limit / norm
+    factor = np.float32(limit) / norm
+    torch._foreach_mul_(diffs, float(factor))
+    return float(norm), float(factor)
 
 
 def normalize(diffs: Tensors, iter_size: int) -> None:
@@ -49,8 +52,8 @@ def regularize(diffs: Tensors, weights: Tensors, decays: Sequence[float], kind: 
     if not chosen:
         return
     pull = [weights[i] for i in chosen]
-    pull = torch._foreach_mul(torch._foreach_sign(pull) if kind == "L1" else pull, [decays[i] for i in chosen])
-    torch._foreach_add_([diffs[i] for i in chosen], pull)
+    pull = torch._foreach_sign(pull) if kind == "L1" else pull
+    _add_scaled([diffs[i] for i in chosen], pull, [decays[i] for i in chosen])
 
 
 def subtract(weights: Tensors, diffs: Tensors) -> None:
@@ -83,23 +86,22 @@ def sgd(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, it
 
 def nesterov(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
     """(1 + momentum) h(t) - momentum h(t-1), h being the history of :func:`sgd`."""
-    before = torch._foreach_mul(history, param.momentum)
+    before = torch._foreach_mul(history, -param.momentum)
     _accelerate(diffs, rates, history, param.momentum)
-    torch._foreach_copy_(diffs, history)
-    torch._foreach_mul_(diffs, 1 + param.momentum)
-    torch._foreach_sub_(diffs, before)
+    torch._foreach_copy_(diffs, before)
+    torch._foreach_add_(diffs, history, alpha=1 + param.momentum)
 
 
 def adagrad(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
     """Rate g / (sqrt(sum of g^2) + delta): delta outside the root."""
-    torch._foreach_addcmul_(history, diffs, diffs)
+    torch._foreach_add_(history, _powers(diffs, 2))
     _divide_by_root(diffs, history, param.delta)
     torch._foreach_mul_(diffs, rates)
 
 
 def rmsprop(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
     """:func:`adagrad` with a fading sum of g^2."""
-    _fade_in_squares(history, diffs, param.rms_decay)
+    _fade_in(history, _powers(diffs, 2), param.rms_decay)
     _divide_by_root(diffs, history, param.delta)
     torch._foreach_mul_(diffs, rates)
 
@@ -107,26 +109,24 @@ def rmsprop(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors
 def adadelta(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
     """Rate g times the root of past updates' squares (the second set) over past gradients' squares (the first)."""
     gradients, updates = history[: len(diffs)], history[len(diffs) :]
-    _fade_in_squares(gradients, diffs, param.momentum)
+    _fade_in(gradients, _powers(diffs, 2), param.momentum)
     scale = torch._foreach_add(updates, param.delta)
     torch._foreach_div_(scale, torch._foreach_add(gradients, param.delta))
-    torch._foreach_sqrt_(scale)
-    torch._foreach_mul_(diffs, scale)
-    _fade_in_squares(updates, diffs, param.momentum)
+    torch._foreach_mul_(diffs, _powers(scale, 0.5))
+    _fade_in(updates, _powers(diffs, 2), param.momentum)
     torch._foreach_mul_(diffs, rates)
 
 
 def adam(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
     """First and second moments; delta is added to the root *before* the bias correction, unlike torch's Adam."""
     means, squares = history[: len(diffs)], history[len(diffs) :]
-    torch._foreach_mul_(means, param.momentum)
-    torch._foreach_add_(means, diffs, alpha=1 - param.momentum)
-    _fade_in_squares(squares, diffs, param.momentum2)
+    _fade_in(means, diffs, param.momentum)
+    _fade_in(squares, torch._foreach_mul(diffs, diffs), param.momentum2)
     torch._foreach_copy_(diffs, means)
     _divide_by_root(diffs, squares, param.delta)
     t = iteration + 1
-    correction = math.sqrt(1 - param.momentum2**t) / (1 - param.momentum**t)
-    torch._foreach_mul_(diffs, [rate * correction for rate in rates])
+    correction = np.float32(math.sqrt(1 - param.momentum2**t) / (1 - param.momentum**t))
+    torch._foreach_mul_(diffs, [float(np.float32(rate) * correction) for rate in rates])
 
 
 RULES: dict[str, Rule] = {
@@ -154,19 +154,29 @@ def find_rule(param: Any, node: Node) -> Rule:
 
 def _accelerate(diffs: Tensors, rates: Sequence[float], history: Tensors, momentum: float) -> None:
     """History = momentum * history + rate * diff."""
-    torch._foreach_mul_(diffs, rates)
     torch._foreach_mul_(history, momentum)
-    torch._foreach_add_(history, diffs)
+    _add_scaled(history, diffs, rates)
 
 
-def _fade_in_squares(history: Tensors, diffs: Tensors, keep: float) -> None:
-    """History = keep * history + (1 - keep) * diff^2."""
+def _add_scaled(sums: Tensors, terms: Tensors, factors: Sequence[float]) -> None:
+    """Sum = sum + factor * term, rounded once, as BLAS' axpy does."""
+    for factor in set(factors):
+        chosen = [i for i, own in enumerate(factors) if own == factor]
+        torch._foreach_add_([sums[i] for i in chosen], [terms[i] for i in chosen], alpha=factor)
+
+
+def _powers(values: Tensors, exponent: float) -> Tensors:
+    return [power(value, exponent) for value in values]
+
+
+def _fade_in(history: Tensors, values: Tensors, keep: float) -> None:
+    """History = keep * history + (1 - keep) * value."""
     torch._foreach_mul_(history, keep)
-    torch._foreach_addcmul_(history, diffs, diffs, value=1 - keep)
+    torch._foreach_add_(history, values, alpha=1 - keep)
 
 
 def _divide_by_root(diffs: Tensors, squares: Tensors, delta: float) -> None:
     """Diff = diff / (sqrt(squares) + delta)."""
-    roots = torch._foreach_sqrt(squares)
+    roots = _powers(squares, 0.5)
     torch._foreach_add_(roots, delta)
     torch._foreach_div_(diffs, roots)

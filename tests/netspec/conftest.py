@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import threadpoolctl
 
 from netspec.cli import main
 from netspec.graph.filter import with_state
@@ -14,6 +15,15 @@ from netspec.net import BuildOptions, Net, build_net
 from netspec.proto.text import parse_net_text
 
 GOLDEN = Path(__file__).parents[1] / "golden"
+
+
+@pytest.fixture(scope="session")
+def same_blas() -> bool:
+    """Whether SciPy's BLAS has the kernels that Caffe's had when it computed the golden files, those for AVX-512."""
+    return any(
+        "scipy.libs" in library["filepath"] and library.get("architecture") == "SkylakeX"
+        for library in threadpoolctl.threadpool_info()
+    )
 
 
 @pytest.fixture

@@ -8,8 +8,24 @@ import pytest
 import torch
 
 import netspec
+from netspec.arithmetic import adding_to_grad
 
 CASES = sorted((Path(__file__).parents[1] / "golden" / "layers").iterdir())
+TO_THE_LAST_BIT = (
+    "conv_1x1",
+    "conv_basic",
+    "conv_dilated_nobias",
+    "conv_repeated",
+    "conv_shared_weights",
+    "conv_stride_pad",
+    "contrastive",
+    "contrastive_default",
+    "contrastive_legacy",
+    "ip",
+    "ip_axis2",
+    "ip_shared_pair",
+    "ip_transpose_nobias",
+)
 TOLERANCE = 1e-5  # of the largest element
 
 
@@ -56,6 +72,30 @@ def test_layer_computes_what_caffe_computed(case: Path) -> None:
         if key.startswith("param_after/"):
             _, layer, index = key.split("/")
             assert_close(net.params[layer][int(index)].detach().numpy(), golden[key], key)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.name in TO_THE_LAST_BIT], ids=lambda path: path.name)
+def test_products_are_caffes_to_the_last_bit(case: Path, same_blas: bool) -> None:
+    if not same_blas:
+        pytest.skip("another kind of CPU than Caffe's: its BLAS rounds differently")
+    golden = np.load(case / "golden.npz")
+    net = netspec.load_net(case / "net.prototxt", phase="TRAIN")
+    inputs = {name: torch.from_numpy(golden[f"in/{name}"]).requires_grad_() for name in net.inputs}
+    parameters = {}
+    for layer, blobs in net.params.items():
+        for i, blob in enumerate(blobs):
+            blob.data.copy_(torch.from_numpy(golden[f"param_init/{layer}/{i}"]))
+            parameters[f"paramdiff/{layer}/{i}"] = blob
+    with adding_to_grad():
+        outputs = net(**inputs)
+        torch.autograd.backward(
+            list(outputs.values()), [torch.from_numpy(golden[f"topdiff/{name}"]) for name in outputs]
+        )
+    for name, output in outputs.items():
+        np.testing.assert_array_equal(output.detach(), golden[f"out/{name}"])
+    for key, leaf in {**{f"indiff/{name}": blob for name, blob in inputs.items()}, **parameters}.items():
+        if key in golden:
+            np.testing.assert_array_equal(_gradient(leaf), golden[key], key)
 
 
 def _gradient(tensor: torch.Tensor) -> np.ndarray:

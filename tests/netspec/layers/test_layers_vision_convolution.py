@@ -98,21 +98,6 @@ def test_gradients_of_bottom_filters_and_bias(build, gradcheck, kind: str, setti
     gradcheck(layer, torch.randn(2, 4, 4, 5))
 
 
-def test_a_small_maps_sums_are_in_caffes_order(build) -> None:
-    # Caffe: one product an image, filters times columns; a float32 sum in that order has exactly these bits.
-    layer = build(f'type: "Convolution" convolution_param {{ num_output: 8 kernel_size: 5 {FILL} }}', (32, 6, 12, 12))
-    data = torch.randn(32, 6, 12, 12)
-    weight, bias = (blob.detach().numpy() for blob in layer.blobs)
-    windows = np.lib.stride_tricks.sliding_window_view(data.numpy(), (5, 5), axis=(2, 3))
-    expected = np.zeros((32, 8, 8, 8), np.float32)
-    for channel, row, column in np.ndindex(6, 5, 5):  # a fused multiply-add rounds once
-        pixels = windows[:, None, channel, :, :, row, column].astype(np.float64)
-        weights = weight[:, channel, row, column, None, None].astype(np.float64)
-        expected = (expected + weights * pixels).astype(np.float32)
-    (top,) = layer.run(data)
-    np.testing.assert_array_equal(top.detach(), expected + bias[:, None, None])
-
-
 @pytest.mark.parametrize("size", [40, 250])
 def test_the_way_to_sum_does_not_show(build, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"num_output: 3 kernel_h: 3 kernel_w: 5 stride: 2 pad: 1 dilation: 2 {FILL}"
@@ -120,7 +105,7 @@ def test_the_way_to_sum_does_not_show(build, size: int, monkeypatch: pytest.Monk
     data = torch.randn(2, 4, size, size, requires_grad=True)
     found = []
     for limit in (0, 10**9):
-        monkeypatch.setattr("netspec.layers.vision_convolution.CAFFES_ORDER", limit)
+        monkeypatch.setattr("netspec.layers.products.MOST_WORK", limit)
         (top,) = layer.run(data)
         found.append([top, *torch.autograd.grad(top.square().sum(), [data, *layer.blobs])])
     for torchs, caffes in zip(*found, strict=True):

@@ -1,0 +1,94 @@
+"""Caffe's arithmetic to the last bit: BLAS' sums in BLAS' order, and the C library's powf.
+
+Float32 sums differ by their order in the last bits. Those decide between two nearly equal pixels in a max pooling, and
+after that two trainings go different ways, so a run of Caffe can only be followed by computing as it did. Caffe hands
+its products to OpenBLAS, and SciPy brings OpenBLAS along: on a CPU of the kind that Caffe ran on, equal calls give
+equal bits.
+
+Caffe: src/caffe/util/math_functions.cpp
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import numpy as np
+import torch
+from scipy.linalg import blas
+
+_PREFIX = {torch.float32: "s", torch.float64: "d"}
+_adding: ContextVar[bool] = ContextVar("adding_to_grad", default=False)
+
+
+def suits_blas(tensor: torch.Tensor) -> bool:
+    """Return whether the functions of this module take it: on the CPU, of single or double precision."""
+    return tensor.device.type == "cpu" and tensor.dtype in _PREFIX
+
+
+def gemm(
+    a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, *, a_t: bool = False, b_t: bool = False, add: bool = False
+) -> None:
+    """C = A B, or C += A B; ``a_t`` and ``b_t`` take the transposes of what is stored (caffe_cpu_gemm).
+
+    All three are matrices, stored row by row without gaps. To BLAS, which goes by columns, they are their transposes.
+    """
+    call = getattr(blas, _PREFIX[c.dtype] + "gemm")
+    views = [m.detach().numpy().T for m in (b, a, c)]
+    call(1.0, views[0], views[1], beta=float(add), c=views[2], trans_a=b_t, trans_b=a_t, overwrite_c=True)
+
+
+def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int) -> None:
+    """Add the sums of matrix A along an axis, as its product with a vector of ones (caffe_cpu_gemv)."""
+    call = getattr(blas, _PREFIX[a.dtype] + "gemv")
+    ones = torch.ones(a.shape[axis], dtype=a.dtype).numpy()
+    call(1.0, a.detach().numpy().T, ones, beta=1.0, y=sums.numpy(), trans=axis == 1, overwrite_y=True)
+
+
+def sum_of_squares(values: torch.Tensor) -> torch.Tensor:
+    """Return the sum of squares, () (caffe_cpu_dot of a blob with itself)."""
+    flat = values.detach().flatten()
+    if not suits_blas(values):
+        return torch.dot(flat, flat)
+    call = getattr(blas, _PREFIX[values.dtype] + "dot")
+    return values.new_tensor(call(flat.numpy(), flat.numpy()))
+
+
+def sum_in_order(values: torch.Tensor) -> torch.Tensor:
+    """Return the sum of a vector, (), each value added to the sum of those before it (a plain loop of Caffe's)."""
+    if not suits_blas(values) or not len(values):
+        return values.sum()
+    return values.new_tensor(np.add.accumulate(values.detach().numpy())[-1])
+
+
+def power(values: torch.Tensor, exponent: float) -> torch.Tensor:
+    """Return values ** exponent as the C library's powf rounds it (caffe_powx).
+
+    Torch's own loops square, take roots, or use a vector pow, all off by a last bit here and there; where the operands
+    have gaps between them, it calls powf for each.
+    """
+    if not suits_blas(values):
+        return values.pow(exponent)
+    gaps = values.new_ones(values.numel() + 1, 2)[:, 0]  # one more: a single value would have no gap
+    gaps[:-1] = values.flatten()
+    return torch.pow(gaps, values.new_full((1,), exponent).expand(len(gaps)))[:-1].reshape(values.shape)
+
+
+@contextmanager
+def adding_to_grad() -> Iterator[None]:
+    """Within, what layers compute for a backward pass adds to the parameters' ``grad`` product by product.
+
+    That is Caffe's order where layers share a parameter or several passes go into one update; autograd sums up each
+    use by itself first. The gradients must be fetched by ``backward()``: ``torch.autograd.grad`` would miss them.
+    """
+    before = _adding.set(True)
+    try:
+        yield
+    finally:
+        _adding.reset(before)
+
+
+def adds_to_grad(parameter: torch.Tensor) -> bool:
+    """Return whether a product with this parameter is to add to its ``grad``."""
+    return _adding.get() and parameter.is_leaf and parameter.is_contiguous()

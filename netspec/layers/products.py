@@ -1,0 +1,155 @@
+"""Products with learned weights as Caffe computes them, to the last bit; see netspec/arithmetic.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from netspec.arithmetic import add_sums, adds_to_grad, gemm, suits_blas
+
+Geometry = tuple[Sequence[int], Sequence[int], Sequence[int]]
+
+# Up to so many multiply-adds an image; beyond, torch's own kernels are faster.
+MOST_WORK = 500_000
+
+
+def in_caffes_order(bottom: torch.Tensor, weight: torch.Tensor, multiply_adds: int) -> bool:
+    """Return whether a product with ``multiply_adds`` an image is one for the classes of this module.
+
+    They call into numpy, which tools that record a net's operations cannot follow.
+    """
+    recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    return multiply_adds <= MOST_WORK and suits_blas(bottom) and bottom.dtype == weight.dtype and not recorded
+
+
+class _Product(torch.autograd.Function):
+    """Base: the place where the gradients of weight and bias are summed up."""
+
+    @staticmethod
+    def keep(ctx: Any, bottom: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> None:
+        ctx.save_for_backward(bottom, weight, bias)
+        ctx.adds = [tensor is not None and adds_to_grad(tensor) for tensor in (weight, bias)]
+
+    @staticmethod
+    def sums(ctx: Any, i: int) -> torch.Tensor | None:
+        """Return where to add the gradient of the weight (0) or the bias (1); None where it is not asked for."""
+        if not ctx.needs_input_grad[1 + i]:
+            return None
+        parameter = ctx.saved_tensors[1 + i]
+        if not ctx.adds[i]:
+            return torch.zeros_like(parameter, memory_format=torch.contiguous_format)
+        if parameter.grad is None:
+            parameter.grad = torch.zeros_like(parameter)
+        return parameter.grad
+
+    @staticmethod
+    def gradients(ctx: Any, *sums: torch.Tensor | None) -> list[torch.Tensor | None]:
+        """Return what autograd is to add: nothing where it was added already."""
+        return [None if added else total for added, total in zip(ctx.adds, sums, strict=True)]
+
+
+class ColumnProducts(_Product):
+    """Cross-correlate maps with filters: the pixels under the filter as columns, times the filters, image by image.
+
+    maps      (N, C, H, W)
+    weight    (num_output, C, kernel_h, kernel_w)
+    bias      (num_output,) or None
+    geometry  stride, pad and dilation, each (vertical, horizontal)
+    returns   (N, num_output, H', W')
+
+    Caffe: src/caffe/layers/base_conv_layer.cpp, src/caffe/util/im2col.cpp
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, geometry: Geometry
+    ) -> torch.Tensor:
+        """Return the responses; keep the maps, not their columns, which are larger by the filter's pixels."""
+        _Product.keep(ctx, maps, weight, bias)
+        ctx.geometry = geometry
+        filters = weight.flatten(1)
+        axes = zip(maps.shape[2:], weight.shape[2:], *geometry, strict=True)
+        spatial = [(size + 2 * p - d * (k - 1) - 1) // s + 1 for size, k, s, p, d in axes]
+        tops = maps.new_empty(len(maps), len(weight), *spatial)
+        for image, top in zip(maps, tops.flatten(2), strict=True):
+            gemm(filters, _columns(image, weight.shape[2:], geometry), top)
+        return tops if bias is None else tops.add_(bias[:, None, None])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
+        """Return the gradients of maps, weight and bias, where they are asked for."""
+        maps, weight, _ = ctx.saved_tensors
+        weight_diff, bias_diff = _Product.sums(ctx, 0), _Product.sums(ctx, 1)
+        filters, kernel = weight.flatten(1), weight.shape[2:]
+        stride, pad, dilation = ctx.geometry
+        maps_diff = torch.empty_like(maps) if ctx.needs_input_grad[0] else None
+        columns_diff = None
+        for n, diff in enumerate(tops_diff.contiguous().flatten(2)):
+            if bias_diff is not None:
+                add_sums(diff, bias_diff, axis=1)
+            if weight_diff is not None:
+                gemm(diff, _columns(maps[n], kernel, ctx.geometry), weight_diff.flatten(1), b_t=True, add=True)
+            if maps_diff is not None:
+                if columns_diff is None:
+                    columns_diff = diff.new_empty(filters.shape[1], diff.shape[1])
+                gemm(filters, diff, columns_diff, a_t=True)
+                maps_diff[n] = F.fold(columns_diff, maps.shape[2:], kernel, dilation, pad, stride)
+        return maps_diff, *_Product.gradients(ctx, weight_diff, bias_diff), None
+
+
+def _columns(image: torch.Tensor, kernel: Sequence[int], geometry: Geometry) -> torch.Tensor:
+    """Return (C kernel_h kernel_w, H' W'): a column for each position of the filter, the pixels under it."""
+    stride, pad, dilation = geometry
+    windows = F.pad(image, (pad[1], pad[1], pad[0], pad[0])) if any(pad) else image
+    for axis in (0, 1):
+        extent = dilation[axis] * (kernel[axis] - 1) + 1
+        windows = windows.unfold(1 + axis, extent, stride[axis])[..., :: dilation[axis]]
+    columns = windows.permute(0, 3, 4, 1, 2).reshape(len(image) * kernel[0] * kernel[1], -1)
+    return columns.contiguous()
+
+
+class VectorProducts(_Product):
+    """Multiply vectors by a matrix.
+
+    vectors  (M, K)
+    weight   (num_output, K), or (K, num_output) where ``transposed``
+    bias     (num_output,) or None
+    returns  (M, num_output)
+
+    Caffe: src/caffe/layers/inner_product_layer.cpp
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, vectors: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, transposed: bool
+    ) -> torch.Tensor:
+        """Return the products."""
+        vectors = vectors.contiguous()
+        _Product.keep(ctx, vectors, weight, bias)
+        ctx.transposed = transposed
+        tops = vectors.new_empty(len(vectors), weight.shape[1 if transposed else 0])
+        gemm(vectors, weight.contiguous(), tops, b_t=not transposed)
+        return tops if bias is None else tops.add_(bias)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
+        """Return the gradients of vectors, weight and bias, where they are asked for."""
+        vectors, weight, _ = ctx.saved_tensors
+        weight_diff, bias_diff = _Product.sums(ctx, 0), _Product.sums(ctx, 1)
+        tops_diff = tops_diff.contiguous()
+        if weight_diff is not None:
+            factors = (vectors, tops_diff) if ctx.transposed else (tops_diff, vectors)
+            gemm(*factors, weight_diff, a_t=True, add=True)
+        if bias_diff is not None:
+            add_sums(tops_diff, bias_diff, axis=0)
+        vectors_diff = None
+        if ctx.needs_input_grad[0]:
+            vectors_diff = torch.empty_like(vectors)
+            gemm(tops_diff, weight.contiguous(), vectors_diff, b_t=ctx.transposed)
+        return vectors_diff, *_Product.gradients(ctx, weight_diff, bias_diff), None
