@@ -255,9 +255,10 @@ def _detect(a: argparse.Namespace) -> None:
     recording = detect.open_recording(a.source, Selection(a.start, a.stop, a.stride, a.limit))
     options = dict(_key_value(text) for text in a.options)
     describe = None if a.features else detect.load_describe(a.describe, options)
+    views = detect.views_of(describe, a.features)
     whitening = None if a.whiten is None else WhitenBy(a.whiten).learn()
     if describe is not None and whitening is not None:
-        describe = detect.whitened(describe, whitening)
+        describe = detect.whitened(describe, whitening, views)
     changes = {name: getattr(a, name) for name in SETTINGS if getattr(a, name) is not None}
     if a.resume:
         if changes or a.verify:
@@ -265,7 +266,7 @@ def _detect(a: argparse.Namespace) -> None:
         detector = LoopDetector.load(a.resume, describe)
     else:
         check = GeometricCheck(**({"min_inliers": a.min_inliers} if a.min_inliers else {})) if a.verify else None
-        detector = LoopDetector(describe, check=check, **changes)
+        detector = LoopDetector(describe, check=check, views=views, **changes)
     if a.calibrate:
         if a.features and not a.calibrate_features:
             raise InputError("--calibrate with --features needs --calibrate-features, the same net's")
@@ -305,6 +306,8 @@ def _similarity(a: argparse.Namespace) -> None:
     queries = read_features(a.features)
     references = None if a.references is None else read_features(a.references)
     rows = None if references is None else references.features
+    if queries.views > 1:
+        raise InputError("describes several views of an image; this command compares one", a.features)
     if a.top_k is None:
         if a.exclude_frames or a.exclude_seconds:
             raise InputError("an exclusion belongs to --top-k; the matrix holds all pairs")

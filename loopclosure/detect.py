@@ -111,7 +111,7 @@ def run_detector(
             raise InputError("the frames of a video have no names to find features by; give --describe", features)
         rows = read_features(features).rows_of(recording.images)
         if whitening is not None:
-            rows = whitening(rows)
+            rows = whitening.of_views(rows, detector.settings.views)
     results = []
     if rows is not None and detector.check is None:
         for i, row in enumerate(progress(rows, "frames", len(rows))):
@@ -203,9 +203,14 @@ def load_describe(specification: str, options: dict[str, str]) -> Describe:
     return cast(Describe, target)
 
 
-def whitened(describe: Describe, whitening: Whitening) -> Describe:
-    """Return a ``describe`` whose descriptors (D,) are those of another, whitened."""
-    return lambda image: whitening(np.reshape(describe(image), (1, -1)))[0]
+def views_of(describe: Describe | None, features: str | Path | None) -> int:
+    """Return how many views of an image are described, by a ``describe`` with ``views`` or by a features.npz."""
+    return getattr(describe, "views", 1) if features is None else read_features(features).views
+
+
+def whitened(describe: Describe, whitening: Whitening, views: int) -> Describe:
+    """Return a ``describe`` whose descriptors (views D,) are those of another, whitened view by view."""
+    return lambda image: whitening.of_views(np.reshape(describe(image), (1, -1)), views)[0]
 
 
 def _value(text: str) -> int | float | str:

@@ -57,6 +57,8 @@ class DetectorSettings:
     """How loops are decided.
 
     metric              "euclidean" (score = minus the distance) or "cosine"
+    views               a descriptor is that of so many views of the image, one after the other; the score of two frames
+                        is that of their two views that are most alike
     exclude_recent      frames i - exclude_recent .. i - 1 are no candidates of frame i
     exclude_seconds     nor are frames less than so many seconds old
     top_k               candidates looked at
@@ -67,6 +69,7 @@ class DetectorSettings:
     """
 
     metric: str = "euclidean"
+    views: int = 1
     exclude_recent: int = 50
     exclude_seconds: float = 0.0
     top_k: int = 5
@@ -76,7 +79,13 @@ class DetectorSettings:
 
     def __post_init__(self) -> None:
         check_metric(self.metric)
-        for name, least in (("exclude_recent", 0), ("exclude_seconds", 0), ("top_k", 1), ("consistency", 0)):
+        for name, least in (
+            ("views", 1),
+            ("exclude_recent", 0),
+            ("exclude_seconds", 0),
+            ("top_k", 1),
+            ("consistency", 0),
+        ):
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; expected {least} or more")
         if self.consistency_window < 0:
@@ -85,18 +94,19 @@ class DetectorSettings:
 
 @dataclass
 class _Frames:
-    """All frames so far, in arrays that double when they are full: ``count`` of the rows are in use."""
+    """All frames so far, in arrays that double when they are full: ``count`` of the rows (views, D) are in use."""
 
     count: int = 0
-    rows: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    squares: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    rows: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0), np.float32))
+    squares: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     stamps: np.ndarray = field(default_factory=lambda: np.zeros(0))
     poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     local: list[LocalFeatures] = field(default_factory=list)
 
     def append(self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None) -> None:
         if self.count == 0:
-            self.rows = np.zeros((0, len(row)), np.float32)
+            self.rows = np.zeros((0, *row.shape), np.float32)
+            self.squares = np.zeros((0, len(row)), np.float32)
         if self.count == len(self.rows):
             capacity = max(FIRST_CAPACITY, 2 * len(self.rows))
             for name in ("rows", "squares", "stamps", "poses"):
@@ -105,7 +115,7 @@ class _Frames:
                 new[: self.count] = old[: self.count]
                 setattr(self, name, new)
         self.rows[self.count] = row
-        self.squares[self.count] = row @ row
+        self.squares[self.count] = np.square(row).sum(1)
         self.stamps[self.count] = np.nan if stamp is None else stamp
         self.poses[self.count] = np.nan if pose is None else pose
         self.count += 1
@@ -124,7 +134,8 @@ class LoopDetector:
     ) -> None:
         """Make an empty detector.
 
-        describe  image (H, W, 3) uint8 BGR -> descriptor (D,), the same D each time; None: use ``add_descriptor``
+        describe  image (H, W, 3) uint8 BGR -> descriptor (D,), the same D each time, or (views D,); None: use
+                  ``add_descriptor``
         settings  or its fields by name: ``LoopDetector(describe, exclude_recent=50, top_k=5, threshold=-0.4)``
         check     verifies candidates by their geometry, best first; None: none is verified
         """
@@ -218,7 +229,8 @@ class LoopDetector:
         """Write all of it but ``describe`` to an .npz, from which ``load`` goes on as if nothing had happened."""
         count = len(self)
         frames = self._frames
-        arrays = {name: getattr(frames, name)[:count] for name in ("rows", "squares", "stamps", "poses")}
+        arrays = {name: getattr(frames, name)[:count] for name in ("stamps", "poses")}
+        arrays["rows"] = frames.rows[:count].reshape(count, -1) if count else np.zeros((0, 0), np.float32)
         about = {
             "format": FORMAT,
             "settings": asdict(self.settings),
@@ -253,7 +265,9 @@ class LoopDetector:
             raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
         check = None if about["check"] is None else GeometricCheck(**about["check"])
         detector = cls(describe, DetectorSettings(**about["settings"]), check=check)
-        frames = _Frames(len(arrays["rows"]), *(arrays[name] for name in ("rows", "squares", "stamps", "poses")))
+        count = len(arrays["rows"])
+        rows = arrays["rows"].reshape(count, detector.settings.views, -1) if count else np.zeros((0, 0, 0), np.float32)
+        frames = _Frames(count, rows, np.square(rows).sum(-1), arrays["stamps"], arrays["poses"])
         if check is not None:
             ends = np.cumsum(arrays["points_of_frame"])[:-1]
             pieces = zip(np.split(arrays["points"], ends), np.split(arrays["descriptors"], ends), strict=True)
@@ -266,14 +280,17 @@ class LoopDetector:
         return detector
 
     def _checked(self, descriptor: np.ndarray, stamp: float | None) -> np.ndarray:
-        """Return the row that is kept: of unit length for cosine."""
+        """Return the row that is kept, (views, D): of unit length for cosine."""
         row = np.asarray(descriptor, np.float32).reshape(-1)
-        frames = self._frames
-        if frames.count and len(row) != frames.rows.shape[1]:
+        frames, views = self._frames, self.settings.views
+        if frames.count and len(row) != frames.rows[0].size:
             raise InputError(
-                f"frame {frames.count} has a descriptor of {len(row)} dimensions, those before {frames.rows.shape[1]}"
+                f"frame {frames.count} has a descriptor of {len(row)} dimensions, those before {frames.rows[0].size}"
             )
-        if not len(row) or not np.all(np.isfinite(row)):
+        if len(row) % views:
+            raise InputError(f"frame {frames.count} has a descriptor of {len(row)} dimensions, not of {views} views")
+        row = row.reshape(views, -1)
+        if not row.size or not np.all(np.isfinite(row)):
             raise InputError(f"the descriptor of frame {frames.count} is empty or not finite")
         if self.settings.exclude_seconds and stamp is None:
             raise InputError(
@@ -282,8 +299,8 @@ class LoopDetector:
         if stamp is not None and frames.count and stamp < frames.stamps[frames.count - 1]:
             raise InputError(f"frame {frames.count} has stamp {stamp:.6f}, earlier than the one before it")
         if self.settings.metric == "cosine":
-            length = float(np.linalg.norm(row))
-            row = row / length if length else row
+            lengths = np.linalg.norm(row, axis=1, keepdims=True)
+            row = row / np.where(lengths > 0, lengths, 1)
         return row
 
     def _search(self, row: np.ndarray, stamp: float | None) -> list[tuple[int, float]]:
@@ -293,15 +310,18 @@ class LoopDetector:
             end = min(end, int(np.searchsorted(frames.stamps[:end], stamp - settings.exclude_seconds, side="right")))
         if end == 0:
             return []
-        scores = frames.rows[:end] @ row
+        scores = frames.rows[:end].reshape(-1, row.shape[1]) @ row.T
         if settings.metric == "euclidean":  # as the distances are ordered, so are these
             scores *= 2
-            scores -= frames.squares[:end]
+            scores -= frames.squares[:end].reshape(-1, 1)
+            scores -= np.square(row).sum(1)
+        scores = scores.reshape(end, -1).max(axis=1)
         k = min(settings.top_k, end)
         best = np.argpartition(scores, end - k)[end - k :]
         # The product is quick but rounds small distances badly: of the few that are reported they are taken anew.
         if settings.metric == "euclidean":
-            values = -np.linalg.norm(frames.rows[best] - row, axis=1)
+            apart = np.linalg.norm(frames.rows[best][:, :, None] - row, axis=-1)
+            values = -apart.reshape(k, -1).min(axis=1)
         else:
             values = scores[best]
         order = np.lexsort((best, -values))

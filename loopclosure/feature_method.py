@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +29,16 @@ class WhitenBy:
     power: float = 1.0
 
     def learn(self, *tested: tuple[list[Path], np.ndarray]) -> Whitening:
-        """Learn the whitening; refuse to learn it from what is ``tested``: N images with their descriptors (N, D)."""
+        """Learn the whitening from every view that the file describes.
+
+        Refuse to learn it from what is ``tested``: N images with the descriptors (N, D) of their first views.
+        """
         training = read_features(self.whiten)
-        whitening = learn_whitening(training.features, self.components, self.power, self.whiten)
+        views = np.split(training.features, training.views, axis=1)
+        whitening = learn_whitening(np.concatenate(views), self.components, self.power, self.whiten)
         for images, rows in tested:
             whitening.check(rows)
-            refuse_overlap(training.described_too(images, rows), images, self.whiten)
+            refuse_overlap(replace(training, features=views[0]).described_too(images, rows), images, self.whiten)
         return whitening
 
 
@@ -61,28 +65,38 @@ class FeatureMethod:
     ) -> MethodResult:
         """Score as :class:`loopclosure.methods.Method` says; the seconds of the net are those the file carries."""
         query_features = read_features(self.query_file)
-        tested = [(query_images, query_features.rows_of(query_images))]
+        views = query_features.views
+        judged = [query_images]
+        rows = [query_features.rows_of(query_images)]
         if reference_images is not None:
             same = self.reference_file == self.query_file
             reference_features = query_features if same else read_features(self.reference_file)
-            tested.append((reference_images, reference_features.rows_of(reference_images)))
-        rows = [descriptors for _, descriptors in tested]
-        notes = [f"{rows[0].shape[1]} dimensions, {self.metric}"]
+            if reference_features.views != views:
+                raise InputError(
+                    f"describes {reference_features.views} view(s) of an image, {self.query_file} {views}; "
+                    "give netspec extract the same --zooms",
+                    self.reference_file,
+                )
+            judged.append(reference_images)
+            rows.append(reference_features.rows_of(reference_images))
+        size = rows[0].shape[1] // views
+        notes = [f"{f'{views} views of ' if views > 1 else ''}{size} dimensions, {self.metric}"]
         seconds: dict[str, float] = {}
         if np.isfinite(query_features.seconds_per_image):
-            seconds["features"] = query_features.seconds_per_image * sum(len(images) for images, _ in tested)
+            seconds["features"] = query_features.seconds_per_image * sum(map(len, judged))
         else:
             notes.append("the file does not say how long the features took")
         once: tuple[str, ...] = ()
         if self.whitening.whiten:
             once = ("training whitening",)
             with timed(seconds, *once):
-                whitening = self.whitening.learn(*tested)
+                whole = [descriptors[:, :size] for descriptors in rows]
+                whitening = self.whitening.learn(*zip(judged, whole, strict=True))
             with timed(seconds, "whitening"):
-                rows = [whitening(descriptors) for descriptors in rows]
+                rows = [whitening.of_views(descriptors, views) for descriptors in rows]
             notes.append(str(whitening))
         with timed(seconds, "similarity"):
-            scores = similarity_matrix(rows[0], rows[1] if len(rows) == 2 else None, self.metric)
+            scores = similarity_matrix(rows[0], rows[1] if len(rows) == 2 else None, self.metric, views)
         return MethodResult(scores, seconds, notes, once)
 
 

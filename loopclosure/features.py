@@ -11,7 +11,7 @@ import numpy as np
 from loopclosure.errors import InputError
 
 # Arrays of the file that describe the images rather than being descriptors.
-BESIDE_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters")
+BESIDE_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms")
 # Descriptors of one image by one net, from two machines: they differ by less than this share of their length.
 SAME_DESCRIPTOR = 1e-3
 
@@ -20,10 +20,11 @@ SAME_DESCRIPTOR = 1e-3
 class Features:
     """Descriptors of images.
 
-    features           (N, D) float32
+    features           (N, D) float32; with several views of each image (N, views D), view after view
     names              the N images' names, empty where the file has none
     stamps             (N,) seconds, None where the file has none
     seconds_per_image  what an image took the net, NaN where the file does not say
+    views              how many views of an image were described: the file's ``zooms``
     """
 
     path: Path
@@ -31,6 +32,7 @@ class Features:
     names: list[str] = field(default_factory=list)
     stamps: np.ndarray | None = None
     seconds_per_image: float = float("nan")
+    views: int = 1
 
     def rows_of(self, images: list[Path]) -> np.ndarray:
         """Return the descriptors (len(images), D) of these images, found by name.
@@ -103,4 +105,7 @@ def read_features(path: str | Path) -> Features:
         if values is not None and len(values) not in (0, len(features)):
             raise InputError(f"has {len(features)} descriptors but {len(values)} {what}", path)
     seconds = float(arrays["seconds_per_image"]) if "seconds_per_image" in arrays else float("nan")
-    return Features(path, features, names, stamps, seconds)
+    views = len(arrays["zooms"]) if "zooms" in arrays else 1
+    if not views or features.shape[1] % views:
+        raise InputError(f"has {features.shape[1]} numbers an image, which are not {views} views", path)
+    return Features(path, features, names, stamps, seconds, views)

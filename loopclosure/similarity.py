@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -105,14 +106,20 @@ def check_metric(metric: str) -> None:
 
 
 def similarity_matrix(
-    queries: np.ndarray, references: np.ndarray | None = None, metric: str = "euclidean"
+    queries: np.ndarray, references: np.ndarray | None = None, metric: str = "euclidean", views: int = 1
 ) -> np.ndarray:
     """Return all scores (Q, R) at once; ``references`` None compares ``queries`` (Q, D) with themselves.
 
+    Where a descriptor is that of several ``views``, one after the other, two images are as alike as the two of their
+    views that are most alike.
+
     100,000 frames would need 40 GB: take :func:`similarity_blocks` or :func:`top_k` for those.
     """
-    query, reference = _pair(queries, references, metric)
-    return reference.scores(query, slice(None), slice(None))
+    if views == 1:
+        query, reference = _pair(queries, references, metric)
+        return reference.scores(query, slice(None), slice(None))
+    parts = [np.split(rows, views, axis=1) for rows in (queries, queries if references is None else references)]
+    return np.max([similarity_matrix(query, reference, metric) for query, reference in product(*parts)], axis=0)
 
 
 def similarity_blocks(

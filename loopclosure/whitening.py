@@ -57,6 +57,10 @@ class Whitening:
         lengths = np.linalg.norm(rows, axis=1, keepdims=True)
         return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
 
+    def of_views(self, descriptors: np.ndarray, views: int) -> np.ndarray:
+        """Return descriptors of several views, one after the other (N, views D), each whitened: (N, views K)."""
+        return np.hstack([self(view) for view in np.split(descriptors, views, axis=1)])
+
 
 def learn_whitening(
     descriptors: np.ndarray, components: int = COMPONENTS, power: float = 1.0, source: str = ""

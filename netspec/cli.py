@@ -103,6 +103,13 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--images", metavar="FOLDER|LIST", help="image files instead of records")
     p.add_argument("--input", default="data", help="the blob that images go into (default: data)")
     p.add_argument(
+        "--zooms",
+        type=_zooms,
+        default=(),
+        metavar="1,0.7",
+        help="of each image the whole and its middle 0.7, one descriptor each",
+    )
+    p.add_argument(
         "--shape", type=_shape, metavar="BLOB=N,C,H,W", help="that blob's shape, where the data is not at hand"
     )
     _add_device(p)
@@ -162,6 +169,13 @@ def _positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"found {text}, expected a positive number")
     return value
+
+
+def _zooms(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers with commas between, e.g. 1,0.7") from None
 
 
 def _shape(text: str) -> tuple[str, tuple[int, ...]]:
@@ -342,7 +356,9 @@ def _extract(arguments: argparse.Namespace) -> None:
         shape = arguments.shape[1] if arguments.shape else None
         net, scaling = image_net(arguments.model, blob, arguments.input, shape, device)
         _load_weights(net, arguments.weights)
-        arrays = extract_images(net, scaling, blob, images, progress=_bar("extract", "batch"))
+        arrays = extract_images(net, scaling, blob, images, progress=_bar("extract", "batch"), zooms=arguments.zooms)
+    elif arguments.zooms:
+        raise WrongUsage("--zooms are of --images; a data layer's records have their own transform_param")
     else:
         message, source = parse_net(arguments.model)
         stated = with_state(message, PHASES[arguments.phase], arguments.level, _stages(arguments))

@@ -172,12 +172,21 @@ def image_net(model: str, blob: str, input_blob: str, shape: Shape | None, devic
 
 
 def extract_images(
-    net: Net, scaling: Scaling, blob: str, images: ImageList, batch: int = 16, progress: Progress = iter
+    net: Net,
+    scaling: Scaling,
+    blob: str,
+    images: ImageList,
+    batch: int = 16,
+    progress: Progress = iter,
+    zooms: Sequence[float] = (),
 ) -> dict[str, np.ndarray]:
     """Return ``features`` (N, D) float32, ``names`` (N,), ``stamps`` (N,) [s] where known, ``seconds_per_image`` ().
 
-    The seconds are the whole way from file to feature: reading, resizing, the net.
+    The seconds are the whole way from file to feature: reading, resizing, the net. With ``zooms`` each image has as
+    many views, all of one size for the net: for 0.7, what is in the middle 0.7 of its width and height, as a camera
+    further ahead would see it. ``features`` are then (N, V D), view after view, and ``zooms`` (V,) is there too.
     """
+    views = check_zooms(zooms)
     (name,) = net.inputs
     shape = net.shapes[name][1:]
     net.keep = [blob]
@@ -185,9 +194,10 @@ def extract_images(
     begin = time.perf_counter()
     with torch.no_grad():
         for start in progress(range(0, len(images.paths), batch)):
-            stack = [_read(path, shape) for path in images.paths[start : start + batch]]
+            read = [_read(path, shape[0]) for path in images.paths[start : start + batch]]
+            stack = [fitted(middle(image, zoom), shape) for image in read for zoom in views]
             net(**{name: (np.stack(stack) - scaling.mean) * scaling.scale})
-            parts.append(net.blobs[blob].reshape(len(stack), -1).cpu().numpy())
+            parts.append(net.blobs[blob].reshape(len(read), -1).cpu().numpy())
     seconds = (time.perf_counter() - begin) / len(images.paths)
     arrays = {
         "features": np.concatenate(parts),
@@ -196,7 +206,24 @@ def extract_images(
     }
     if images.stamps is not None:
         arrays["stamps"] = images.stamps
+    if zooms:
+        arrays["zooms"] = np.array(views)
     return arrays
+
+
+def check_zooms(zooms: Sequence[float]) -> tuple[float, ...]:
+    """Return the zooms, 1 where there are none; refuse any that is not more than 0 and at most 1."""
+    for zoom in zooms:
+        if not 0 < zoom <= 1:
+            raise SpecError(f"found zoom {zoom:g}, expected more than 0 and at most 1, the whole image")
+    return tuple(zooms) or (1.0,)
+
+
+def middle(image: np.ndarray, zoom: float) -> np.ndarray:
+    """Return the middle ``zoom`` of an image's height and width; 1 is all of it."""
+    height, width = image.shape[:2]
+    top, left = round(height * (1 - zoom) / 2), round(width * (1 - zoom) / 2)
+    return image[top : max(height - top, top + 1), left : max(width - left, left + 1)]
 
 
 def _scaling(layer: Any, shape: Shape, file: str) -> Scaling:
@@ -220,12 +247,11 @@ def _scaling(layer: Any, shape: Shape, file: str) -> Scaling:
     return Scaling(values[:channels, None, None], param.scale)
 
 
-def _read(path: Path, shape: Shape) -> np.ndarray:
-    """Return an image file as :func:`fitted` does."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR if shape[0] == 3 else cv2.IMREAD_GRAYSCALE)
+def _read(path: Path, channels: int) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR if channels == 3 else cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise SpecError("cannot read this image", Where(str(path)))
-    return fitted(image, shape)
+    return image
 
 
 def fitted(image: np.ndarray, shape: Shape) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 
 from loopclosure.detector import FIRST_CAPACITY, DetectorSettings, LoopDetector
 from loopclosure.errors import InputError
-from loopclosure.similarity import top_k
+from loopclosure.similarity import similarity_matrix, top_k
 from loopclosure.truth import Exclusion
 from loopclosure.verification import GeometricCheck
 
@@ -42,6 +42,22 @@ def test_candidates_are_those_of_the_search_by_blocks(metric):
         np.testing.assert_allclose(
             [score for _, score in result.candidates], scores[: len(result.candidates)], atol=1e-4
         )
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+def test_of_several_views_the_two_most_alike_count(metric, tmp_path):
+    descriptors = np.random.default_rng(1).normal(2.0, 1.0, (60, 24)).astype(np.float32)
+    expected = similarity_matrix(descriptors, None, metric, views=3)
+    detector = LoopDetector(metric=metric, views=3, exclude_recent=7, top_k=4)
+    results = run(detector, descriptors[:30])
+    detector.save(tmp_path / "detector.npz")
+    results += run(LoopDetector.load(tmp_path / "detector.npz"), descriptors[30:])
+    for i, result in enumerate(results):
+        scores = expected[i, : max(0, i - 7)]
+        assert [number for number, _ in result.candidates] == np.argsort(-scores)[:4].tolist()
+        np.testing.assert_allclose([score for _, score in result.candidates], np.sort(scores)[::-1][:4], atol=1e-3)
+    with pytest.raises(InputError, match="25 dimensions, not of 3 views"):
+        LoopDetector(views=3).add_descriptor(np.ones(25))
 
 
 def test_seconds_exclude_too():

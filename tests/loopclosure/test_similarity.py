@@ -34,6 +34,17 @@ def test_matrix(features, metric):
     )
 
 
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+def test_of_several_views_the_two_most_alike_count(features, metric):
+    queries, references = features[:20].reshape(10, -1), features[20:].reshape(10, -1)
+    expected = [
+        brute_force(queries[:, 7 * u : 7 * u + 7], references[:, 7 * v : 7 * v + 7], metric)
+        for u in (0, 1)
+        for v in (0, 1)
+    ]
+    np.testing.assert_allclose(similarity_matrix(queries, references, metric, views=2), np.max(expected, axis=0))
+
+
 def test_blocks_are_the_matrix(features):
     blocks = list(similarity_blocks(features, rows=16))
     assert [start for start, _ in blocks] == [0, 16, 32]

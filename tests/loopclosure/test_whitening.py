@@ -181,6 +181,38 @@ def test_queries_and_references(tmp_path, training, laps):
     assert result.once == ("training whitening",)
 
 
+def test_each_view_is_whitened(files, training, laps):
+    """The first lap sees the places in its first views, the second lap in its second ones."""
+    elsewhere = under_any_light(places(seed=5, count=2 * PLACES), seed=6)
+    rows = np.hstack([laps, elsewhere])
+    rows[PLACES:] = np.hstack([elsewhere, laps])[PLACES:]
+    names = np.array([f"rgb/{i}.png" for i in range(len(rows))])
+    np.savez(files / "views.npz", features=rows, names=names, zooms=np.array([1, 0.7]))
+    halves = np.hstack([training[:200], training[200:]])
+    np.savez(files / "halves.npz", features=halves, zooms=np.array([1, 0.7]))  # the same, as 200 images of two views
+    images = [Path(f"/data/two_laps/rgb/{i}.png") for i in range(len(laps))]
+    shares = {}
+    for other in ("other.npz", "halves.npz"):
+        result = make_method(f"features:{files}/views.npz:whiten={files / other}").score(images, None, [], silent)
+        shares[other] = found(result.scores[PLACES:, :PLACES])
+        assert "2 views of 24 dimensions, euclidean" in result.notes
+    assert min(shares.values()) >= 0.95
+    with pytest.raises(InputError, match=r"laps.npz: describes 1 view\(s\) of an image, .*views.npz 2"):
+        make_method(f"features:{files}/views.npz,{files}/laps.npz").score(images, images, [], silent)
+
+
+def test_detect_finds_loops_through_the_views(two_laps, tmp_path):
+    rng = np.random.default_rng(0)
+    lap, other = rng.normal(size=(2, 2 * PLACES, 8))
+    rows = np.hstack([lap, other])
+    rows[PLACES:, :8] = other[:PLACES]  # the second lap's whole image is what the first saw in the middle
+    np.savez(tmp_path / "views.npz", features=rows, zooms=np.array([1, 0.7]))
+    words = ["detect", str(two_laps), "--features", str(tmp_path / "views.npz"), "--threshold", "-0.01"]
+    assert main([*words, "--exclude-recent", "10", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "loops.csv").open() as stream:
+        assert [int(row["match_id"]) for row in csv.DictReader(stream)] == list(range(PLACES))
+
+
 def test_tested_images_are_not_learnt_from(files, training, laps):
     images = [Path(f"/data/two_laps/rgb/{i}.png") for i in range(len(laps))]
     nearly = laps[5] * np.float32(1.0001)

@@ -106,6 +106,18 @@ def test_extract_runs_a_training_nets_tower_over_a_folder_of_images(run: Run, im
         np.testing.assert_allclose(row, features_of(images / "rgb" / str(name)), rtol=1e-4, atol=1e-6)
 
 
+def test_extract_describes_the_middle_of_each_image_too(run: Run, images: Path) -> None:
+    whole = images / "rgb" / "1.png"
+    middle = cv2.imread(str(whole))[9:26, 10:30]  # round(35 / 4) and round(40 / 4) off each side
+    cv2.imwrite("middle.png", middle)
+    assert run("extract", *IMAGES, "--images", images / "rgb", "--zooms", "1,0.5").status == 0
+    found = np.load("f.npz")
+    assert found["zooms"].tolist() == [1, 0.5]
+    np.testing.assert_allclose(
+        found["features"][0], [*features_of(whole), *features_of(Path("middle.png"))], rtol=1e-4, atol=1e-6
+    )
+
+
 @pytest.mark.parametrize("where", ["walk", "walk/rgb.txt"])
 def test_extract_keeps_the_order_and_the_stamps_of_a_tum_list(run: Run, images: Path, where: str) -> None:
     assert run("extract", *IMAGES, "--images", where).status == 0
@@ -154,6 +166,7 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
             f'{NET}: no data layer "pair" to give a source to; this net\'s: pair_data',
         ),
         (["--source", "pair_data=nowhere"], 'database "nowhere" is not there'),
+        (["--images", "walk/rgb", "--zooms", "1,2"], "found zoom 2, expected more than 0 and at most 1"),
         (["--out", "nowhere/f.npz"], "--out nowhere/f.npz: there is no folder nowhere; make it first"),
         (["--weights", "nowhere.caffemodel"], "nowhere.caffemodel: cannot be read: No such file or directory"),
     ],

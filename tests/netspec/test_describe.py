@@ -10,6 +10,7 @@ from loopclosure.detector import LoopDetector
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
 from netspec.describe import Describer
+from netspec.errors import SpecError
 from netspec.extract import extract_records
 from netspec.net import load_net
 
@@ -39,6 +40,25 @@ def test_images_of_any_size_are_resized(describe: Describer) -> None:
     image = np.random.default_rng(0).integers(0, 256, (60, 90, 3), dtype=np.uint8)
     small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (28, 28))
     assert np.array_equal(describe(image), describe(small))
+
+
+def test_zooms_are_views_of_the_middle_and_a_detector_sees_through_them(describe: Describer) -> None:
+    near = Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel", zooms="1,0.5")
+    images = np.random.default_rng(1).integers(0, 256, (8, 56, 56, 3), dtype=np.uint8)
+    descriptor = near(images[0])
+    np.testing.assert_allclose(descriptor, [*describe(images[0]), *describe(images[0][14:42, 14:42])], atol=1e-6)
+    detectors = [LoopDetector(d, views=d.views, exclude_recent=2, threshold=-1e-3) for d in (describe, near)]
+    for detector in detectors:
+        for image in images:
+            detector.add(image)
+    # A step ahead, the camera sees what was in the middle.
+    assert [detector.add(images[3][14:42, 14:42]).accepted for detector in detectors] == [None, 3]
+
+
+@pytest.mark.parametrize(("zooms", "fault"), [("1,x", "expected numbers"), (1.5, "at most 1"), ("0", "more than 0")])
+def test_odd_zooms(describe: Describer, zooms: str | float, fault: str) -> None:
+    with pytest.raises(SpecError, match=fault):
+        Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel", zooms=zooms)
 
 
 def test_a_detector_takes_it(describe: Describer) -> None:
