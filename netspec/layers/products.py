@@ -1,5 +1,7 @@
 """Products with learned weights as Caffe computes them, to the last bit; see netspec/arithmetic.py."""
 
+# pyright: reportPrivateImportUsage=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -22,7 +22,7 @@ from netspec.arithmetic import power, sum_of_squares
 from netspec.errors import SpecError, did_you_mean
 from netspec.proto.source_map import Node
 
-Tensors = list[torch.Tensor]
+Tensors = list[torch.Tensor] | tuple[torch.Tensor, ...]
 
 
 def clip(diffs: Tensors, limit: float) -> tuple[float, float] | None:
@@ -158,18 +158,18 @@ def _accelerate(diffs: Tensors, rates: Sequence[float], history: Tensors, moment
     _add_scaled(history, diffs, rates)
 
 
-def _add_scaled(sums: Tensors, terms: Sequence[torch.Tensor], factors: Sequence[float]) -> None:
+def _add_scaled(sums: Tensors, terms: Tensors, factors: Sequence[float]) -> None:
     """Sum = sum + factor * term, rounded once, as BLAS' axpy does."""
     for factor in set(factors):
         chosen = [i for i, own in enumerate(factors) if own == factor]
         torch._foreach_add_([sums[i] for i in chosen], [terms[i] for i in chosen], alpha=factor)
 
 
-def _powers(values: Sequence[torch.Tensor], exponent: float) -> Tensors:
+def _powers(values: Tensors, exponent: float) -> Tensors:
     return [power(value, exponent) for value in values]
 
 
-def _fade_in(history: Tensors, values: Sequence[torch.Tensor], keep: float) -> None:
+def _fade_in(history: Tensors, values: Tensors, keep: float) -> None:
     """History = keep * history + (1 - keep) * value."""
     torch._foreach_mul_(history, keep)
     torch._foreach_add_(history, values, alpha=1 - keep)
