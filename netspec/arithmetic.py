@@ -13,10 +13,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 
 import numpy as np
 import torch
 from scipy.linalg import blas
+from threadpoolctl import ThreadpoolController
 
 _PREFIX = {torch.float32: "s", torch.float64: "d"}
 _adding: ContextVar[bool] = ContextVar("adding_to_grad", default=False)
@@ -52,7 +54,8 @@ def sum_of_squares(values: torch.Tensor) -> torch.Tensor:
     if not suits_blas(values):
         return torch.dot(flat, flat)
     call = getattr(blas, _PREFIX[values.dtype] + "dot")
-    return values.new_tensor(call(flat.numpy(), flat.numpy()))
+    with one_thread():
+        return values.new_tensor(call(flat.numpy(), flat.numpy()))
 
 
 def sum_in_order(values: torch.Tensor) -> torch.Tensor:
@@ -73,6 +76,18 @@ def power(values: torch.Tensor, exponent: float) -> torch.Tensor:
     gaps = values.new_ones(values.numel() + 1, 2)[:, 0]  # one more: a single value would have no gap
     gaps[:-1] = values.flatten()
     return torch.pow(gaps, values.new_full((1,), exponent).expand(len(gaps)))[:-1].reshape(values.shape)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Within, BLAS uses one thread: others, like torch's waiting awake for more work, would hinder these."""
+    with _pools().limit(limits=1):
+        yield
+
+
+@cache
+def _pools() -> ThreadpoolController:
+    return ThreadpoolController().select(internal_api="openblas")
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from netspec.arithmetic import add_sums, adds_to_grad, gemm, suits_blas
+from netspec.arithmetic import add_sums, adds_to_grad, gemm, one_thread, suits_blas
 
 Geometry = tuple[Sequence[int], Sequence[int], Sequence[int]]
 
@@ -77,12 +77,14 @@ class ColumnProducts(_Product):
         axes = zip(maps.shape[2:], weight.shape[2:], *geometry, strict=True)
         spatial = [(size + 2 * p - d * (k - 1) - 1) // s + 1 for size, k, s, p, d in axes]
         tops = maps.new_empty(len(maps), len(weight), *spatial)
-        for image, top in zip(maps, tops.flatten(2), strict=True):
-            gemm(filters, _columns(image, weight.shape[2:], geometry), top)
+        with one_thread():
+            for image, top in zip(maps, tops.flatten(2), strict=True):
+                gemm(filters, _columns(image, weight.shape[2:], geometry), top)
         return tops if bias is None else tops.add_(bias[:, None, None])
 
     @staticmethod
     @once_differentiable
+    @one_thread()
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, _ = ctx.saved_tensors
@@ -135,11 +137,13 @@ class VectorProducts(_Product):
         _Product.keep(ctx, vectors, weight, bias)
         ctx.transposed = transposed
         tops = vectors.new_empty(len(vectors), weight.shape[1 if transposed else 0])
-        gemm(vectors, weight.contiguous(), tops, b_t=not transposed)
+        with one_thread():
+            gemm(vectors, weight.contiguous(), tops, b_t=not transposed)
         return tops if bias is None else tops.add_(bias)
 
     @staticmethod
     @once_differentiable
+    @one_thread()
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of vectors, weight and bias, where they are asked for."""
         vectors, weight, _ = ctx.saved_tensors

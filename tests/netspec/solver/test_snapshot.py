@@ -124,20 +124,20 @@ def test_resume_from_caffes_state_ends_at_caffes_weights(work_in: Callable[..., 
     solver.close()
 
 
-def test_a_run_with_a_snapshot_is_caffes_run(work_in: Callable[..., Path]):
+def test_a_run_with_a_snapshot_is_caffes_run(work_in: Callable[..., Path], same_blas: bool):
     """Straight through to 60, with the snapshot at 40 on the way; then on from our snapshot as Caffe from its own."""
     work_in("snapshot", "sgd_step")
     state = read_state("sgd_step/ref_iter_40.solverstate")
+    caffes = [Path(f"sgd_step/ref_iter_40.{kind}").rename(kind).read_bytes() for kind in ("caffemodel", "solverstate")]
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel")
     solver.step(60)
     _assert_weights(solver, "sgd_step/straight_iter_60.caffemodel")
     solver.restore("sgd_step/ref_iter_40.solverstate")
-    _assert_weights(solver, "sgd_step/ref_iter_40.caffemodel")
+    _assert_weights(solver, "caffemodel")
     ours = read_state("sgd_step/ref_iter_40.solverstate")
     assert (ours.iteration, ours.learned_net, ours.current_step) == (40, state.learned_net, state.current_step)
-    assert any(not np.array_equal(a, b) for a, b in zip(ours.history, state.history, strict=True)), (
-        "it was written anew"
-    )
+    if same_blas:
+        assert [Path(f"sgd_step/ref_iter_40.{kind}").read_bytes() for kind in ("caffemodel", "solverstate")] == caffes
     solver.step(20)
     _assert_weights(solver, "sgd_step/resumed_from_40_iter_60.caffemodel")
     solver.close()
