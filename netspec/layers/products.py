@@ -22,10 +22,11 @@ MOST_WORK = 500_000
 def in_caffes_order(bottom: torch.Tensor, weight: torch.Tensor, multiply_adds: int) -> bool:
     """Return whether a product with ``multiply_adds`` an image is one for the classes of this module.
 
-    They call into numpy, which tools that record a net's operations cannot follow.
+    They call into numpy, which tools that record a net's operations cannot follow, and BLAS refuses empty matrices.
     """
-    recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()
-    return multiply_adds <= MOST_WORK and suits_blas(bottom) and bottom.dtype == weight.dtype and not recorded
+    if torch.compiler.is_compiling() or torch.jit.is_tracing() or not bottom.numel():
+        return False
+    return multiply_adds <= MOST_WORK and suits_blas(bottom) and bottom.dtype == weight.dtype
 
 
 class _Product(torch.autograd.Function):

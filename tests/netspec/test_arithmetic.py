@@ -101,6 +101,10 @@ def test_adding_to_grad_adds_pass_after_pass_what_autograd_would(net_of) -> None
         torch.testing.assert_close(parameter.grad, 3 * one)
 
 
+def test_no_image_is_no_fault(net_of) -> None:
+    assert net_of(SIAMESE).layers[2].run(torch.zeros(0, 2, 2, 2))[0].shape == (0, 3)
+
+
 def test_frozen_parameters_get_no_gradient(net_of) -> None:
     net = net_of(SIAMESE.replace('"w" }', '"w" lr_mult: 0 }').replace('"y" }', '"y" lr_mult: 0 }'), phase=0)
     with adding_to_grad():
