@@ -177,8 +177,8 @@ class Writer:
     """Writes a new database that appears at its path only when it is whole.
 
     A context manager: records are put into a hidden folder beside, which takes the path's name at the end, and is
-    removed if anything went wrong. Memory stays flat, and real Caffe reads the result. Raises SpecError where the path
-    exists already (as Caffe does) or cannot be written to.
+    removed if anything went wrong. Missing folders above it are made. Memory stays flat, and real Caffe reads the
+    result. Raises SpecError where the path exists already (as Caffe does) or cannot be written to.
     """
 
     def __init__(self, path: str, backend: str = "lmdb") -> None:
@@ -194,7 +194,7 @@ class Writer:
         if os.path.lexists(self.path):
             raise SpecError("exists already; remove it or choose another name for the database", Where(self.path))
         try:
-            os.mkdir(self._partial)
+            os.makedirs(self._partial)
             self._store = (_LmdbStore if self._backend == "lmdb" else _LevelDbStore)(self._partial)
         except (OSError, ValueError, lmdb.Error) as fault:
             shutil.rmtree(self._partial, ignore_errors=True)

@@ -238,9 +238,12 @@ def test_a_key_that_lmdb_cannot_hold_is_named(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+def test_a_missing_folder_is_made_and_one_that_cannot_be_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "new" / "folder" / "db", {})
+    assert os.listdir(tmp_path / "new" / "folder") == ["db"]
+    (tmp_path / "file").touch()
     with pytest.raises(SpecError, match="cannot write a database here"):
-        write(tmp_path / "nowhere" / "db", {})
+        write(tmp_path / "file" / "db", {})
 
 
 def test_an_unknown_backend_is_named(tmp_path: Path) -> None:
