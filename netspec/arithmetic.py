@@ -41,11 +41,11 @@ def gemm(
     call(1.0, views[0], views[1], beta=float(add), c=views[2], trans_a=b_t, trans_b=a_t, overwrite_c=True)
 
 
-def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int) -> None:
-    """Add the sums of matrix A along an axis, as its product with a vector of ones (caffe_cpu_gemv)."""
+def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int, factor: float = 1.0) -> None:
+    """Add the sums of matrix A along an axis, times a factor, as its product with a vector of ones (caffe_cpu_gemv)."""
     call = getattr(blas, _PREFIX[a.dtype] + "gemv")
     ones = torch.ones(a.shape[axis], dtype=a.dtype).numpy()
-    call(1.0, a.detach().numpy().T, ones, beta=1.0, y=sums.numpy(), trans=axis == 1, overwrite_y=True)
+    call(factor, a.detach().numpy().T, ones, beta=1.0, y=sums.numpy(), trans=axis == 1, overwrite_y=True)
 
 
 def sum_of_squares(values: torch.Tensor) -> torch.Tensor:
@@ -63,6 +63,11 @@ def sum_in_order(values: torch.Tensor) -> torch.Tensor:
     if not suits_blas(values) or not len(values):
         return values.sum()
     return values.new_tensor(np.add.accumulate(values.detach().numpy())[-1])
+
+
+def root(values: torch.Tensor) -> torch.Tensor:
+    """Return square roots as C rounds them (caffe_sqrt); torch's of floats may be off by the last bit."""
+    return values.double().sqrt().to(values.dtype)
 
 
 def power(values: torch.Tensor, exponent: float) -> torch.Tensor:

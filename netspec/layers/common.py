@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional as F
 
 from netspec.layers.base import TRAIN, Layer, Shape
-from netspec.layers.products import VectorProducts, in_caffes_order
+from netspec.layers.caffes_order import VectorProducts, in_caffes_order
 from netspec.layers.registry import register
 
 

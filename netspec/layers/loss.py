@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from google.protobuf.message import DecodeError
 
-from netspec.arithmetic import sum_in_order
+from netspec.arithmetic import root, sum_in_order
 from netspec.blobs import to_array
 from netspec.layers.base import Shape
 from netspec.layers.loss_base import (
@@ -283,9 +283,8 @@ class _Contrastive(torch.autograd.Function):
         ctx: Any, a: torch.Tensor, b: torch.Tensor, similar: torch.Tensor, margin: float, legacy: bool
     ) -> torch.Tensor:
         difference = a - b
-        # In double, as OpenBLAS sums up to 31 products; and torch's root of a float may be off by its last bit.
-        squared = difference.square().double().sum(1).to(difference.dtype)
-        distance = squared.double().sqrt().to(difference.dtype)
+        squared = difference.square().double().sum(1).to(difference.dtype)  # as OpenBLAS sums up to 31 products
+        distance = root(squared)
         dissimilar = (margin - squared).clamp(min=0) if legacy else (margin - distance).clamp(min=0).square()
         ctx.save_for_backward(difference, squared if legacy else distance, similar)
         ctx.margin, ctx.legacy = margin, legacy

@@ -9,7 +9,9 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
+from netspec.arithmetic import root
 from netspec.layers.base import TEST, Layer, Shape
+from netspec.layers.caffes_order import PASSES, BatchNormalization, ChannelProducts, in_caffes_order
 from netspec.layers.registry import register
 
 ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
@@ -67,22 +69,34 @@ class BatchNorm(Layer):
             factor = torch.where(weight == 0, 0, 1 / weight)
             mean, variance = self.blob(0) * factor, self.blob(1) * factor
         eps = self.param.batch_norm_param.eps
+        if self._in_caffes_order(data):
+            return (data - _along(mean, 1, data)) / _along(root(variance + eps), 1, data)
         if _far_from_zero(mean, variance, eps):
             data, mean = data - _along(mean, 1, data), torch.zeros_like(mean)
         return torch.batch_norm(data, None, None, mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
 
     def _by_batch(self, data: torch.Tensor) -> torch.Tensor:
-        eps = self.param.batch_norm_param.eps
-        top, mean, variance = _normalize(data, eps)
-        if _far_from_zero(mean, variance, eps):
-            # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
-            top, _, variance = _normalize(data - _along(mean, 1, data), eps)
-        if data.numel() == self.channels:
-            variance = torch.zeros_like(variance)  # a single value: torch's unbiased variance is 0 / 0, Caffe's 0
+        eps, keep = self.param.batch_norm_param.eps, self.param.batch_norm_param.moving_average_fraction
+        values = data.numel() // self.channels
+        unbiased = 1.0
+        if self._in_caffes_order(data):
+            top, mean, variance = BatchNormalization.apply(data, eps)
+            unbiased = values / (values - 1) if values > 1 else 1.0
+        else:
+            top, mean, variance = _normalize(data, eps)
+            if _far_from_zero(mean, variance, eps):
+                # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
+                top, _, variance = _normalize(data - _along(mean, 1, data), eps)
+            if values == 1:
+                variance = torch.zeros_like(variance)  # torch's unbiased variance is 0 / 0, Caffe's 0
         with torch.no_grad():
-            for i, addend in enumerate((mean, variance, 1.0)):
-                self.blob(i).mul_(self.param.batch_norm_param.moving_average_fraction).add_(addend)
+            self.blob(0).mul_(keep).add_(mean)
+            self.blob(1).mul_(keep).add_(variance, alpha=unbiased)
+            self.blob(2).mul_(keep).add_(1)
         return top
+
+    def _in_caffes_order(self, data: torch.Tensor) -> bool:
+        return in_caffes_order(data, self.blob(0), PASSES * math.prod(data.shape[1:]))
 
 
 def _normalize(data: torch.Tensor, eps: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -165,6 +179,8 @@ class Scale(_Affine):
         scale = self.blob(0) if factors is None else factors
         bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
         if self.axis == 1 and scale.dim() == 1:
+            if in_caffes_order(data, scale, PASSES * math.prod(data.shape[1:])):
+                return ChannelProducts.apply(data, scale, bias)
             # By channel: batch normalisation with mean 0 and variance 1 is this, three times as fast, backward too.
             zero, one = torch.zeros_like(scale), torch.ones_like(scale)
             return torch.batch_norm(data, scale, bias, zero, one, False, 0.0, 0.0, torch.backends.cudnn.enabled)

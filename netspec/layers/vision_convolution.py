@@ -10,7 +10,7 @@ import torch
 from torch.nn import functional as F
 
 from netspec.layers.base import Layer, Shape
-from netspec.layers.products import ColumnProducts, in_caffes_order
+from netspec.layers.caffes_order import ColumnProducts, in_caffes_order
 from netspec.layers.registry import register
 
 _CONVOLVE = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}

@@ -105,7 +105,7 @@ def test_the_way_to_sum_does_not_show(build, size: int, monkeypatch: pytest.Monk
     data = torch.randn(2, 4, size, size, requires_grad=True)
     found = []
     for limit in (0, 10**9):
-        monkeypatch.setattr("netspec.layers.products.MOST_WORK", limit)
+        monkeypatch.setattr("netspec.layers.caffes_order.MOST_WORK", limit)
         (top,) = layer.run(data)
         found.append([top, *torch.autograd.grad(top.square().sum(), [data, *layer.blobs])])
     for torchs, caffes in zip(*found, strict=True):

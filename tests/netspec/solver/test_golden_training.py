@@ -37,8 +37,9 @@ def losses(solver: Solver) -> list[float]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_follows_caffe(case: str, work_in: Callable[..., Path], same_blas: bool):
-    """Its losses, weights, history and test losses, to the last bit; nets with BatchNorm to 1e-2, as BatchNorm's sums
-    are torch's. On other CPUs than Caffe's only the losses, and these only to 1e-2: there, rounding goes another way.
+    """Its losses, weights, history and test losses, to the last bit.
+
+    On other CPUs than Caffe's only the losses, and these only to 1e-2: there, rounding goes another way.
     """
     if not same_blas and case in ("adadelta", "rmsprop"):
         pytest.skip("decided by ties in max poolings, which fall as the CPU's kernels round")
@@ -51,10 +52,9 @@ def test_follows_caffe(case: str, work_in: Callable[..., Path], same_blas: bool)
         tested = [solver.test_nets[0].forward_loss()[0].item() for _ in golden["test/loss"]]
     solver.close()
 
-    to_the_bit = same_blas and "residual" not in case
-    # Those of sgd_iter_size are means that Caffe did not take.
-    assert_equal(found, golden["loss"], 0 if to_the_bit and case != "sgd_iter_size" else 1e-2)
-    assert_equal(tested, golden["test/loss"], 0 if to_the_bit else 1e-2)
+    # The losses of sgd_iter_size are means that Caffe did not take.
+    assert_equal(found, golden["loss"], 0 if same_blas and case != "sgd_iter_size" else 1e-2)
+    assert_equal(tested, golden["test/loss"], 0 if same_blas else 1e-2)
     state = read_state(next(Path(case).glob("ref_iter_*.solverstate")))
     assert state.iteration == solver.iteration
     assert state.current_step == solver.current_step
@@ -62,9 +62,9 @@ def test_follows_caffe(case: str, work_in: Callable[..., Path], same_blas: bool)
         for key in golden.files:
             if key.startswith("final/"):
                 _, layer, index = key.split("/")
-                assert_equal(solver.net.params[layer][int(index)].detach(), golden[key], 0 if to_the_bit else 1e-2, key)
+                assert_equal(solver.net.params[layer][int(index)].detach(), golden[key], 0, key)
         for i, (mine, theirs) in enumerate(zip(solver.history, state.history, strict=True)):
-            assert_equal(mine, theirs, 0 if to_the_bit else 0.1, f"history {i}")
+            assert_equal(mine, theirs, 0, f"history {i}")
 
 
 def assert_equal(found: Any, expected: np.ndarray, tolerance: float, what: str = "losses") -> None:

@@ -1,4 +1,4 @@
-"""Products with learned weights as Caffe computes them, to the last bit; see netspec/arithmetic.py."""
+"""What layers sum up, in Caffe's order and so to the last bit; see netspec/arithmetic.py."""
 
 # pyright: reportPrivateImportUsage=false
 
@@ -11,12 +11,14 @@ import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from netspec.arithmetic import add_sums, adds_to_grad, gemm, one_thread, suits_blas
+from netspec.arithmetic import add_sums, adds_to_grad, gemm, one_thread, root, suits_blas
 
 Geometry = tuple[Sequence[int], Sequence[int], Sequence[int]]
 
 # Up to so many multiply-adds an image; beyond, torch's own kernels are faster.
 MOST_WORK = 500_000
+# What the passes over memory of BatchNorm or Scale cost for each value, in multiply-adds.
+PASSES = 60
 
 
 def in_caffes_order(bottom: torch.Tensor, weight: torch.Tensor, multiply_adds: int) -> bool:
@@ -160,3 +162,87 @@ class VectorProducts(_Product):
             vectors_diff = torch.empty_like(vectors)
             gemm(tops_diff, weight.contiguous(), vectors_diff, b_t=ctx.transposed)
         return vectors_diff, *_Product.gradients(ctx, weight_diff, bias_diff), None
+
+
+class ChannelProducts(_Product):
+    """Multiply each channel by a factor and add a bias.
+
+    maps     (N, C, ...)
+    factors  (C,)
+    bias     (C,) or None
+    returns  (N, C, ...)
+
+    Caffe: src/caffe/layers/scale_layer.cpp, bias_layer.cpp
+    """
+
+    @staticmethod
+    def forward(ctx: Any, maps: torch.Tensor, factors: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+        """Return the products, and the bias added."""
+        _Product.keep(ctx, maps, factors, bias)
+        tops = _by_channel(maps) * factors[:, None]
+        return (tops if bias is None else tops.add_(bias[:, None])).view(maps.shape)
+
+    @staticmethod
+    @once_differentiable
+    @one_thread()
+    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
+        """Return the gradients of maps, factors and bias, where they are asked for."""
+        maps, factors, _ = ctx.saved_tensors
+        factors_diff, bias_diff = _Product.sums(ctx, 0), _Product.sums(ctx, 1)
+        diff = _by_channel(tops_diff)
+        if bias_diff is not None:
+            for image in diff:
+                add_sums(image, bias_diff, axis=1)
+        if factors_diff is not None:
+            factors_diff += _channel_sums(_by_channel(maps) * diff)
+        maps_diff = (diff * factors[:, None]).view(maps.shape) if ctx.needs_input_grad[0] else None
+        return maps_diff, *_Product.gradients(ctx, factors_diff, bias_diff)
+
+
+class BatchNormalization(torch.autograd.Function):
+    """Subtract each channel's mean over the batch, and divide by the root of its variance + eps.
+
+    maps     (N, C, ...)
+    returns  (N, C, ...), the means (C,) and the biased variances (C,)
+
+    Caffe: src/caffe/layers/batch_norm_layer.cpp
+    """
+
+    @staticmethod
+    @one_thread()
+    def forward(ctx: Any, maps: torch.Tensor, eps: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the normalised maps and what they were normalised by."""
+        values = _by_channel(maps)
+        count = values.numel() // values.shape[1]
+        mean = _channel_sums(values, 1 / count)
+        centred = values - mean[:, None]
+        variance = _channel_sums(centred * centred, 1 / count)
+        deviation = root(variance + eps)
+        tops = centred / deviation[:, None]
+        ctx.save_for_backward(tops, deviation)
+        ctx.mark_non_differentiable(mean, variance)
+        return tops.view(maps.shape), mean, variance
+
+    @staticmethod
+    @once_differentiable
+    @one_thread()
+    def backward(ctx: Any, tops_diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
+        """Return the gradient of the maps: (d - mean(d) - mean(d y) y) / deviation, for the gradient d of y."""
+        tops, deviation = ctx.saved_tensors
+        diff = _by_channel(tops_diff)
+        count = diff.numel() // diff.shape[1]
+        sums = tops * _channel_sums(tops * diff)[:, None] + _channel_sums(diff)[:, None]
+        return (diff + sums * (-1 / count)).div_(deviation[:, None]).view(tops_diff.shape), None
+
+
+def _by_channel(maps: torch.Tensor) -> torch.Tensor:
+    """Return maps (N, C, ...) as (N, C, pixels), without gaps."""
+    return maps.contiguous().view(*maps.shape[:2], -1)
+
+
+def _channel_sums(values: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
+    """Return the sums (C,) of values (N, C, pixels): of each map, times a factor, then over the images."""
+    of_maps, sums = values.new_zeros(values.shape[:2]), values.new_zeros(values.shape[1])
+    add_sums(values.flatten(0, 1), of_maps.view(-1), axis=1, factor=factor)
+    add_sums(of_maps, sums, axis=0)
+    return sums
