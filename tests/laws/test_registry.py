@@ -152,6 +152,21 @@ EXAMPLES = {
         "batch_size: 4 }"
     ),
 }
+# What they compute follows from values, such as labels or indices, so that a device without memory cannot run them.
+LOOK_AT_VALUES = {
+    "Accuracy",
+    "BatchReindex",
+    "Embed",
+    "Filter",
+    "HDF5Output",
+    "HingeLoss",
+    "InfogainLoss",
+    "MultinomialLogisticLoss",
+    "Pooling",
+    "Python",
+    "SPP",
+    "SoftmaxWithLoss",
+}
 TYPES = [name for name in layer_types() if getattr(layer_class(name), "__module__", "").startswith("netspec.layers.")]
 
 
@@ -176,7 +191,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def build(name: str, folder: Path, shapes: Sequence[Shape]) -> Layer:
+def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu") -> Layer:
     example = EXAMPLES[name]
     param = LayerParameter(name="it", type=name)
     text_format.Merge(example.text.replace("{tmp}", str(folder)), param)
@@ -188,7 +203,8 @@ def build(name: str, folder: Path, shapes: Sequence[Shape]) -> Layer:
     def at(*path: str | int) -> Where:
         return Where(".".join(map(str, path)))
 
-    return cls(param, shapes, Context(phase=example.phase, random=Random(0), at=at, allow_python=True))
+    context = Context(phase=example.phase, random=Random(0), at=at, allow_python=True, device=torch.device(device))
+    return cls(param, shapes, context)
 
 
 @pytest.fixture
@@ -248,6 +264,25 @@ def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
         return tuple(top for top in layer.run(*tensors[: len(bottoms)]) if top.requires_grad)
 
     assert torch.autograd.gradcheck(compute, (*bottoms, *learned))
+
+
+@pytest.mark.parametrize("name", [name for name in TYPES if name not in LOOK_AT_VALUES])
+def test_computes_on_the_device_of_its_bottoms_alone(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forward and backward, on a device without memory, which refuses to meet the CPU as a GPU does."""
+    monkeypatch.chdir(folder)
+    example = EXAMPLES[name]
+    layer = build(name, folder, example.shapes, "meta")
+    if isinstance(layer, MemoryData):
+        layer.set_input_arrays(np.zeros((4, 3, 4, 5)), np.zeros(4))
+    bottoms = [torch.empty(bottom.shape, device="meta") for bottom in example.bottoms()]
+    for i, bottom in enumerate(bottoms):
+        bottom.requires_grad_(example.smooth and i not in layer.label_bottoms)
+    tops = layer.run(*bottoms)
+    learned = [top for top in tops if top.requires_grad]
+    torch.autograd.backward(learned, [torch.empty_like(top) for top in learned])
+    gradients = [tensor.grad for tensor in (*bottoms, *layer.blobs) if tensor.grad is not None]
+    assert {tensor.device.type for tensor in (*tops, *layer.blobs, *layer.buffers(), *gradients)} <= {"meta"}
+    layer.close()
 
 
 @pytest.mark.parametrize("name", TYPES)
