@@ -1,4 +1,4 @@
-"""What all tests share: one thread a process, so that runs in parallel stay quick."""
+"""What all tests share: one thread a process, so that runs in parallel stay quick, and a GPU that is none."""
 
 import pytest
 
@@ -8,3 +8,8 @@ def _one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _pretended_gpu() -> None:
+    import pretend_gpu  # noqa: F401  autograd counts the devices at its first backward pass

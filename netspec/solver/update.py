@@ -32,7 +32,7 @@ def clip(diffs: Tensors, limit: float) -> tuple[float, float] | None:
     """
     if limit < 0 or not diffs:
         return None
-    norm = np.sqrt(np.float32(sum(sum_of_squares(diff) for diff in diffs)))
+    norm = np.sqrt(np.float32(float(sum(sum_of_squares(diff) for diff in diffs))))
     if norm <= limit or np.isnan(norm):
         return None
     factor = np.float32(limit) / norm

@@ -1,6 +1,7 @@
 """Every layer case that BVLC Caffe computed: outputs, input gradients, parameter gradients, running statistics."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 
 import netspec
 from netspec.arithmetic import adding_to_grad
+from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 CASES = sorted((Path(__file__).parents[1] / "golden" / "layers").iterdir())
 TO_THE_LAST_BIT = (
@@ -44,11 +46,22 @@ def assert_close(found: np.ndarray, expected: np.ndarray, what: str) -> None:
     assert worst <= TOLERANCE, f"{what}: off by {worst:.2e} of the largest element"
 
 
+@pytest.fixture(params=["cpu", "gpu"])
+def device(request: pytest.FixtureRequest) -> Iterator[str]:
+    if request.param == "cpu":
+        yield "cpu"
+    elif POSSIBLE:
+        with pretended_gpu():
+            yield NAME
+    else:
+        pytest.skip("this torch cannot pretend a GPU")
+
+
 @pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
-def test_layer_computes_what_caffe_computed(case: Path) -> None:
+def test_layer_computes_what_caffe_computed(case: Path, device: str) -> None:
     golden = np.load(case / "golden.npz")
     meta = json.loads(str(golden["meta"]))
-    net = netspec.load_net(case / "net.prototxt", phase=meta["phase"])
+    net = netspec.load_net(case / "net.prototxt", phase=meta["phase"], device=device)
     for key in golden.files:
         if key.startswith("param_init/"):
             _, layer, index = key.split("/")
@@ -56,19 +69,21 @@ def test_layer_computes_what_caffe_computed(case: Path) -> None:
     names = [node.name for node in net.plan.nodes]
     inputs = {}
     for name in net.inputs:
-        inputs[name] = torch.from_numpy(golden[f"in/{name}"]).requires_grad_(bool(meta["grad"]))
+        inputs[name] = torch.from_numpy(golden[f"in/{name}"]).to(device).requires_grad_(bool(meta["grad"]))
     for _ in range(meta["warmup"]):
         net(**inputs)
     outputs = net(**inputs)
     expected_outputs = [key[len("out/") :] for key in golden.files if key.startswith("out/")]
     assert list(outputs) == sorted(expected_outputs)
     for name, output in outputs.items():
-        assert_close(output.detach().numpy(), golden[f"out/{name}"], f"output {name}")
+        assert_close(output.detach().cpu().numpy(), golden[f"out/{name}"], f"output {name}")
     if meta["grad"]:
         # Without force_backward, Caffe leaves the gradients of what is not under a loss at zero. Torch's are real.
         caffe_ran_backward = dict(zip(names, net.backward_plan.layers, strict=True))
         reached = {name: blob for name, blob in outputs.items() if blob.requires_grad and f"topdiff/{name}" in golden}
-        diffs = [torch.from_numpy(golden[f"topdiff/{name}"]).reshape(blob.shape) for name, blob in reached.items()]
+        diffs = [
+            torch.from_numpy(golden[f"topdiff/{name}"]).reshape(blob.shape).to(device) for name, blob in reached.items()
+        ]
         torch.autograd.backward(list(reached.values()), diffs)
         for key in golden.files:
             kind, *rest = key.split("/")
@@ -79,7 +94,7 @@ def test_layer_computes_what_caffe_computed(case: Path) -> None:
     for key in golden.files:
         if key.startswith("param_after/"):
             _, layer, index = key.split("/")
-            assert_close(net.params[layer][int(index)].detach().numpy(), golden[key], key)
+            assert_close(net.params[layer][int(index)].detach().cpu().numpy(), golden[key], key)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case.name in TO_THE_LAST_BIT], ids=lambda path: path.name)
@@ -110,4 +125,4 @@ def test_layer_computes_caffes_bits(case: Path, same_blas: bool) -> None:
 
 
 def _gradient(tensor: torch.Tensor) -> np.ndarray:
-    return np.zeros(tuple(tensor.shape), np.float32) if tensor.grad is None else tensor.grad.numpy()
+    return np.zeros(tuple(tensor.shape), np.float32) if tensor.grad is None else tensor.grad.cpu().numpy()
