@@ -12,6 +12,7 @@ from netspec.layers import Context, Layer, Random, layer_class, registry
 from netspec.layers.base import TEST
 from netspec.proto import dialect, dialect_files
 from netspec.proto.text import parse_net_text
+from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +52,8 @@ def build() -> Callable[..., Layer]:
 def gradcheck() -> Callable[..., None]:
     """``gradcheck(layer, *bottoms, fixed=...)``: in double, gradients of bottoms and blobs are the function's.
 
-    ``fixed`` are bottoms that get no gradient; layers whose blobs are statistics learn those not in ``not_learned``.
+    And a GPU computes the same. ``fixed`` are bottoms that get no gradient; layers whose blobs are statistics learn
+    those not in ``not_learned``.
     """
 
     def check(layer: Layer, *bottoms: torch.Tensor, fixed: tuple[int, ...] = ()) -> None:
@@ -59,5 +61,22 @@ def gradcheck() -> Callable[..., None]:
         inputs = [bottom.double().requires_grad_(i not in fixed) for i, bottom in enumerate(bottoms)]
         learned = [blob for j, blob in enumerate(layer.blobs) if j not in layer.not_learned]
         torch.autograd.gradcheck(lambda *args: layer.run(*args[: len(inputs)])[0], (*inputs, *learned))
+        if POSSIBLE:
+            _compare_on_the_gpu(layer.float(), [bottom.detach().float() for bottom in bottoms])
 
     return check
+
+
+def _compare_on_the_gpu(layer: Layer, bottoms: list[torch.Tensor]) -> None:
+    expected = layer.run(*bottoms)
+    with pretended_gpu():
+        for tensors in (module._parameters for module in layer.modules()):
+            tensors.update({name: torch.nn.Parameter(p.detach().to(NAME)) for name, p in tensors.items()})
+        for tensors in (module._buffers for module in layer.modules()):
+            tensors.update({name: buffer.to(NAME) for name, buffer in tensors.items()})
+        found = layer.run(*[bottom.to(NAME).requires_grad_() for bottom in bottoms])
+        learned = [top for top in found if top.requires_grad]
+        torch.autograd.backward(learned, [torch.ones_like(top) for top in learned])
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.device.type == NAME
+        torch.testing.assert_close(ours.detach().cpu(), theirs.detach(), rtol=1e-4, atol=1e-5)
