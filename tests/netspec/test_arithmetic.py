@@ -112,6 +112,7 @@ def test_frozen_parameters_get_no_gradient(net_of) -> None:
     assert [item.parameter.grad is None for item in net.learnable] == [True, False, False, True]
 
 
+@pytest.mark.filterwarnings("ignore")  # torch.jit.trace is deprecated, but in use
 def test_a_recorded_net_computes_and_does_not_remember(net_of) -> None:
     net = net_of(SIAMESE)
     layer, data = net.layers[1], torch.randn(2, 1, 4, 4)
