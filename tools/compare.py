@@ -91,14 +91,15 @@ def netspec(*arguments: str, log: Path) -> None:
         sys.exit(process.returncode)
 
 
-def snapshots(entry: Entry) -> dict[int, Path]:
-    """Return the snapshots there are, by iteration."""
+def snapshots(entry: Entry, log: Path) -> dict[int, Path]:
+    """Return the snapshots there are, by iteration: those that the log tells of, where it tells of any."""
     folder = Path(entry.prefix).parent
     pattern = re.compile(re.escape(Path(entry.prefix).name) + r"_iter_(\d+)\.caffemodel(\.h5)?$")
     found = {int(m[1]): path for path in folder.glob("*") if (m := pattern.match(path.name))}
     if not found:
         raise SpecError("no snapshot of this net; train it first (without --no-train)", Where(entry.prefix))
-    return found
+    written = set(log.read_text(errors="replace").split()) if log.is_file() else set()
+    return {iteration: path for iteration, path in found.items() if str(path) in written} or found
 
 
 def best_snapshot(entry: Entry, log: Path, out: Path) -> tuple[int, Path, list[tuple[int, float]]]:
@@ -106,7 +107,7 @@ def best_snapshot(entry: Entry, log: Path, out: Path) -> tuple[int, Path, list[t
 
     Snapshots whose training left no log here are scored by ``netspec test``.
     """
-    saved = snapshots(entry)
+    saved = snapshots(entry, log)
     losses = dict(read_test_scores(log, entry.loss)) if log.is_file() else {}
     for iteration, path in sorted(saved.items()):
         if iteration not in losses:
