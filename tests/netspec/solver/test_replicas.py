@@ -44,4 +44,4 @@ def test_devices_with_a_share_of_the_batch_train_as_one_with_all_of_it(
     for name, blobs in alone.net.params.items():
         for mine, theirs in zip(blobs, together.net.params[name], strict=True):
             scale = mine.detach().abs().max().item()
-            assert np.allclose(mine.detach(), theirs.detach(), rtol=0, atol=1e-3 * scale)
+            assert np.allclose(mine.detach(), theirs.detach(), rtol=0, atol=1e-3 * scale + 1e-6)
