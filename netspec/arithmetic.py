@@ -58,11 +58,17 @@ def sum_of_squares(values: torch.Tensor) -> torch.Tensor:
         return values.new_tensor(call(flat.numpy(), flat.numpy()))
 
 
-def sum_in_order(values: torch.Tensor) -> torch.Tensor:
-    """Return the sum of a vector, (), each value added to the sum of those before it (a plain loop of Caffe's)."""
-    if not suits_blas(values) or not len(values):
-        return values.sum()
-    return values.new_tensor(np.add.accumulate(values.detach().numpy())[-1])
+def sum_in_order(values: torch.Tensor, axis: int = 0) -> torch.Tensor:
+    """Return the sums along an axis, each value added to the sum of those before it (a plain loop of Caffe's)."""
+    if not suits_blas(values) or not values.numel():
+        return values.sum(axis)
+    sums = np.add.accumulate(values.detach().numpy(), axis).take(-1, axis)
+    return torch.as_tensor(sums, dtype=values.dtype)
+
+
+def exponential(values: torch.Tensor) -> torch.Tensor:
+    """Return exp(values) as the C library rounds it, which computes expf in double (caffe_exp)."""
+    return values.double().exp().to(values.dtype)
 
 
 def root(values: torch.Tensor) -> torch.Tensor:

@@ -17,7 +17,7 @@ Geometry = tuple[Sequence[int], Sequence[int], Sequence[int]]
 
 # Up to so many multiply-adds an image; beyond, torch's own kernels are faster.
 MOST_WORK = 500_000
-# What the passes over memory of BatchNorm or Scale cost for each value, in multiply-adds.
+# What the passes over memory of BatchNorm, Scale or a softmax cost for each value, in multiply-adds.
 PASSES = 250
 
 

@@ -14,9 +14,10 @@ import torch
 import torch.nn.functional as F
 from google.protobuf.message import DecodeError
 
-from netspec.arithmetic import root, sum_in_order
+from netspec.arithmetic import exponential, root, sum_in_order
 from netspec.blobs import to_array
 from netspec.layers.base import Shape
+from netspec.layers.caffes_order import PASSES, in_caffes_order
 from netspec.layers.loss_base import (
     BATCH_SIZE,
     VALID,
@@ -46,14 +47,38 @@ class SoftmaxLoss(Loss, Classified):
         self.reshape_scores(bottom_shapes, axis, *path)
         return shapes[: self.num_tops]
 
-    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, log_p: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the normalised sum of the losses (outer, inner) that count and, for a second top, the softmax."""
+    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, p: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the normalised sum of the losses (outer, inner) that count and, for a second top, the softmax p."""
         if valid is not None:
             losses = losses.where(valid, 0)
         loss = losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
         if self.num_tops == 1:
             return (loss,)
-        return loss, log_p.detach().exp().reshape(self.bottom_shapes[0])
+        return loss, p.detach().reshape(self.bottom_shapes[0])
+
+
+class _NegativeLogOfSoftmax(torch.autograd.Function):
+    """-log p of the labels' classes, p being the softmax; the logarithm is of no less than FLT_MIN."""
+
+    @staticmethod
+    def forward(ctx: Any, scores: torch.Tensor, label: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the losses (outer, inner) and p, for scores (outer, classes, inner) and labels (outer, inner)."""
+        if in_caffes_order(scores, scores, PASSES * math.prod(scores.shape[1:])):
+            p = exponential(scores - scores.amax(1, keepdim=True))
+            p /= sum_in_order(p, 1).unsqueeze(1)
+        else:
+            p = F.softmax(scores, 1)
+        ctx.save_for_backward(p, label)
+        ctx.mark_non_differentiable(p)
+        chosen = p.gather(1, label.unsqueeze(1)).squeeze(1)
+        return -chosen.clamp(min=FLT_MIN).log(), p
+
+    @staticmethod
+    def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
+        """Return (p - 1 at the label's class) times the losses' gradient."""
+        p, label = ctx.saved_tensors
+        of_label = torch.zeros_like(p).scatter_(1, label.unsqueeze(1), 1)
+        return (p - of_label) * diff.unsqueeze(1), None
 
 
 @register("SoftmaxWithLoss", "loss_param", "softmax_param")
@@ -84,9 +109,8 @@ class SoftmaxWithLoss(SoftmaxLoss):
         """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
         valid = self.valid(label, self.ignore_label)
-        log_p = F.log_softmax(x, 1)
-        chosen = log_p.gather(1, (label if valid is None else label * valid).unsqueeze(1)).squeeze(1)
-        return self.sum_up(-Floor.apply(chosen, math.log(FLT_MIN)), valid, log_p)
+        losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid)
+        return self.sum_up(losses, valid, p)
 
 
 @register("InfogainLoss", "infogain_loss_param", "loss_param")
@@ -157,7 +181,7 @@ class InfogainLoss(SoftmaxLoss):
         log_p = F.log_softmax(x, 1)
         weights = gain[label if valid is None else label * valid].movedim(2, 1)  # (outer, classes, inner)
         losses = -(weights * Floor.apply(log_p, math.log(LOG_THRESHOLD))).sum(1)
-        return self.sum_up(losses, valid, log_p)
+        return self.sum_up(losses, valid, log_p.exp())
 
 
 @register("MultinomialLogisticLoss")

@@ -7,7 +7,7 @@ import torch
 from google.protobuf import text_format
 
 from netspec.errors import Where
-from netspec.layers import Context, Layer, Random, layer_class
+from netspec.layers import Context, Layer, Random, caffes_order, layer_class
 from netspec.layers.base import TEST
 from netspec.proto.schema import LayerParameter
 
@@ -15,6 +15,12 @@ from netspec.proto.schema import LayerParameter
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(params=["small", "large"])
+def small_or_large(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is small is summed up in Caffe's order, what is large by torch. A test runs twice: all is small, or large."""
+    monkeypatch.setattr(caffes_order, "MOST_WORK", 10**9 if request.param == "small" else 0)
 
 
 def _at(*path: str | int) -> Where:

@@ -10,13 +10,7 @@ from netspec.errors import SpecError
 from netspec.layers import caffes_order
 from netspec.layers.base import TEST, TRAIN
 
-
-@pytest.fixture(autouse=True, params=["small", "large"])
-def _size(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """BatchNorm and Scale sum up in Caffe's order where the maps are small, and leave large ones to torch."""
-    if request.param == "large":
-        monkeypatch.setattr(caffes_order, "MOST_WORK", 0)
-
+pytestmark = pytest.mark.usefixtures("small_or_large")
 
 # BatchNorm
 
