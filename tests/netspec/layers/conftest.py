@@ -19,7 +19,7 @@ def _seeded() -> None:
 
 @pytest.fixture(params=["small", "large"])
 def small_or_large(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is small is summed up in Caffe's order, what is large by torch. A test runs twice: all is small, or large."""
+    """What is small is summed up in Caffe's order, what is large by torch. Tests run twice: all small, all large."""
     monkeypatch.setattr(caffes_order, "MOST_WORK", 10**9 if request.param == "small" else 0)
 
 
