@@ -254,8 +254,9 @@ def _evaluate(a: argparse.Namespace) -> None:
 def _detect(a: argparse.Namespace) -> None:
     recording = detect.open_recording(a.source, Selection(a.start, a.stop, a.stride, a.limit))
     options = dict(_key_value(text) for text in a.options)
-    describe = None if a.features else detect.load_describe(a.describe, options)
-    views = detect.views_of(describe, a.features)
+    features = read_features(a.features) if a.features else None
+    describe = None if features is not None else detect.load_describe(a.describe, options)
+    views = detect.views_of(describe, features)
     whitening = None if a.whiten is None else WhitenBy(a.whiten).learn()
     if describe is not None and whitening is not None:
         describe = detect.whitened(describe, whitening, views)
@@ -277,9 +278,10 @@ def _detect(a: argparse.Namespace) -> None:
         else:
             exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
             data = datasets.load_tum(a.calibrate, chosen, exclusion)
-        print(detect.calibrate(detector, data, a.precision, a.calibrate_features, show_progress, whitening))
+        validation = read_features(a.calibrate_features) if a.calibrate_features else None
+        print(detect.calibrate(detector, data, a.precision, validation, show_progress, whitening))
     before = len(detector)
-    results = detect.run_detector(detector, recording, a.features, show_progress, whitening)
+    results = detect.run_detector(detector, recording, features, show_progress, whitening)
     loops = [result for result in results if result.accepted is not None]
     out = Path(a.out)
     # Frames of the run that was resumed have numbers but no names here.

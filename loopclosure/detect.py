@@ -15,7 +15,7 @@ import numpy as np
 from loopclosure.datasets import DataSet
 from loopclosure.detector import Describe, LoopDetector, LoopResult
 from loopclosure.errors import InputError
-from loopclosure.features import read_features
+from loopclosure.features import Features
 from loopclosure.frames import (
     ALL_FRAMES,
     VIDEO_SUFFIXES,
@@ -96,20 +96,20 @@ def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Rec
 def run_detector(
     detector: LoopDetector,
     recording: Recording,
-    features: str | Path | None = None,
+    features: Features | None = None,
     progress: Progress = silent,
     whitening: Whitening | None = None,
 ) -> list[LoopResult]:
     """Add every frame of a recording.
 
-    ``features``, an .npz with a descriptor of each image, replaces ``describe``; ``whitening`` is of these alone: a
+    ``features``, with a descriptor of each image, replace ``describe``; ``whitening`` is of these alone: a
     ``describe`` is given whitened (see :func:`whitened`).
     """
     rows = None
     if features is not None:
         if recording.images is None:
-            raise InputError("the frames of a video have no names to find features by; give --describe", features)
-        rows = read_features(features).rows_of(recording.images)
+            raise InputError("the frames of a video have no names to find features by; give --describe", features.path)
+        rows = features.rows_of(recording.images)
         if whitening is not None:
             rows = whitening.of_views(rows, detector.settings.views)
     results = []
@@ -130,7 +130,7 @@ def calibrate(
     detector: LoopDetector,
     data: DataSet,
     precision: float,
-    features: str | Path | None = None,
+    features: Features | None = None,
     progress: Progress = silent,
     whitening: Whitening | None = None,
 ) -> str:
@@ -203,9 +203,9 @@ def load_describe(specification: str, options: dict[str, str]) -> Describe:
     return cast(Describe, target)
 
 
-def views_of(describe: Describe | None, features: str | Path | None) -> int:
-    """Return how many views of an image are described, by a ``describe`` with ``views`` or by a features.npz."""
-    return getattr(describe, "views", 1) if features is None else read_features(features).views
+def views_of(describe: Describe | None, features: Features | None) -> int:
+    """Return how many views of an image are described, by a ``describe`` with ``views`` or by features."""
+    return getattr(describe, "views", 1) if features is None else features.views
 
 
 def whitened(describe: Describe, whitening: Whitening, views: int) -> Describe:

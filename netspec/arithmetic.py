@@ -10,10 +10,11 @@ Caffe: src/caffe/util/math_functions.cpp
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +30,10 @@ def suits_blas(tensor: torch.Tensor) -> bool:
     return tensor.device.type == "cpu" and tensor.dtype in _PREFIX
 
 
+def _routine(name: str, tensor: torch.Tensor) -> Callable[..., Any]:
+    return getattr(blas, _PREFIX[tensor.dtype] + name)
+
+
 def gemm(
     a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, *, a_t: bool = False, b_t: bool = False, add: bool = False
 ) -> None:
@@ -36,14 +41,14 @@ def gemm(
 
     All three are matrices, stored row by row without gaps. To BLAS, which goes by columns, they are their transposes.
     """
-    call = getattr(blas, _PREFIX[c.dtype] + "gemm")
+    call = _routine("gemm", c)
     views = [m.detach().numpy().T for m in (b, a, c)]
     call(1.0, views[0], views[1], beta=float(add), c=views[2], trans_a=b_t, trans_b=a_t, overwrite_c=True)
 
 
 def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int, factor: float = 1.0) -> None:
     """Add the sums of matrix A along an axis, times a factor, as its product with a vector of ones (caffe_cpu_gemv)."""
-    call = getattr(blas, _PREFIX[a.dtype] + "gemv")
+    call = _routine("gemv", a)
     ones = torch.ones(a.shape[axis], dtype=a.dtype).numpy()
     call(factor, a.detach().numpy().T, ones, beta=1.0, y=sums.numpy(), trans=axis == 1, overwrite_y=True)
 
@@ -53,7 +58,7 @@ def sum_of_squares(values: torch.Tensor) -> torch.Tensor:
     flat = values.detach().flatten()
     if not suits_blas(values):
         return torch.dot(flat, flat)
-    call = getattr(blas, _PREFIX[values.dtype] + "dot")
+    call = _routine("dot", values)
     with one_thread():
         return values.new_tensor(call(flat.numpy(), flat.numpy()))
 

@@ -40,16 +40,19 @@ class _Product(torch.autograd.Function):
         ctx.adds = [tensor is not None and adds_to_grad(tensor) for tensor in (weight, bias)]
 
     @staticmethod
-    def sums(ctx: Any, i: int) -> torch.Tensor | None:
-        """Return where to add the gradient of the weight (0) or the bias (1); None where it is not asked for."""
-        if not ctx.needs_input_grad[1 + i]:
-            return None
-        parameter = ctx.saved_tensors[1 + i]
-        if not ctx.adds[i]:
-            return torch.zeros_like(parameter, memory_format=torch.contiguous_format)
-        if parameter.grad is None:
-            parameter.grad = torch.zeros_like(parameter)
-        return parameter.grad
+    def sums(ctx: Any) -> list[torch.Tensor | None]:
+        """Return where to add the gradients of the weight and of the bias; None where one is not asked for."""
+        found: list[torch.Tensor | None] = []
+        for parameter, asked, adds in zip(ctx.saved_tensors[1:], ctx.needs_input_grad[1:3], ctx.adds, strict=True):
+            if not asked:
+                found.append(None)
+            elif not adds:
+                found.append(torch.zeros_like(parameter, memory_format=torch.contiguous_format))
+            else:
+                if parameter.grad is None:
+                    parameter.grad = torch.zeros_like(parameter)
+                found.append(parameter.grad)
+        return found
 
     @staticmethod
     def gradients(ctx: Any, *sums: torch.Tensor | None) -> list[torch.Tensor | None]:
@@ -91,7 +94,7 @@ class ColumnProducts(_Product):
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, _ = ctx.saved_tensors
-        weight_diff, bias_diff = _Product.sums(ctx, 0), _Product.sums(ctx, 1)
+        weight_diff, bias_diff = _Product.sums(ctx)
         filters, kernel = weight.flatten(1), weight.shape[2:]
         stride, pad, dilation = ctx.geometry
         maps_diff = torch.empty_like(maps) if ctx.needs_input_grad[0] else None
@@ -150,7 +153,7 @@ class VectorProducts(_Product):
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of vectors, weight and bias, where they are asked for."""
         vectors, weight, _ = ctx.saved_tensors
-        weight_diff, bias_diff = _Product.sums(ctx, 0), _Product.sums(ctx, 1)
+        weight_diff, bias_diff = _Product.sums(ctx)
         tops_diff = tops_diff.contiguous()
         if weight_diff is not None:
             factors = (vectors, tops_diff) if ctx.transposed else (tops_diff, vectors)
@@ -188,7 +191,7 @@ class ChannelProducts(_Product):
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of maps, factors and bias, where they are asked for."""
         maps, factors, _ = ctx.saved_tensors
-        factors_diff, bias_diff = _Product.sums(ctx, 0), _Product.sums(ctx, 1)
+        factors_diff, bias_diff = _Product.sums(ctx)
         diff = _by_channel(tops_diff)
         if bias_diff is not None:
             for image in diff:

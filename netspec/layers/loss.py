@@ -47,14 +47,11 @@ class SoftmaxLoss(Loss, Classified):
         self.reshape_scores(bottom_shapes, axis, *path)
         return shapes[: self.num_tops]
 
-    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, p: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the normalised sum of the losses (outer, inner) that count and, for a second top, the softmax p."""
+    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None) -> torch.Tensor:
+        """Return the normalised sum of the losses (outer, inner) that count."""
         if valid is not None:
             losses = losses.where(valid, 0)
-        loss = losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
-        if self.num_tops == 1:
-            return (loss,)
-        return loss, p.detach().reshape(self.bottom_shapes[0])
+        return losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
 
 
 class _NegativeLogOfSoftmax(torch.autograd.Function):
@@ -110,7 +107,7 @@ class SoftmaxWithLoss(SoftmaxLoss):
         x, label = self.scores_and_labels(scores, labels)
         valid = self.valid(label, self.ignore_label)
         losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid)
-        return self.sum_up(losses, valid, p)
+        return (self.sum_up(losses, valid), p.reshape(scores.shape))[: self.num_tops]
 
 
 @register("InfogainLoss", "infogain_loss_param", "loss_param")
@@ -181,7 +178,8 @@ class InfogainLoss(SoftmaxLoss):
         log_p = F.log_softmax(x, 1)
         weights = gain[label if valid is None else label * valid].movedim(2, 1)  # (outer, classes, inner)
         losses = -(weights * Floor.apply(log_p, math.log(LOG_THRESHOLD))).sum(1)
-        return self.sum_up(losses, valid, log_p.exp())
+        loss = self.sum_up(losses, valid)
+        return (loss,) if self.num_tops == 1 else (loss, log_p.detach().exp().reshape(scores.shape))
 
 
 @register("MultinomialLogisticLoss")

@@ -8,6 +8,7 @@ from loopclosure.datasets import load_tum
 from loopclosure.detect import calibrate, from_poses, judged_by_poses, load_describe, open_recording, run_detector
 from loopclosure.detector import LoopDetector
 from loopclosure.errors import InputError
+from loopclosure.features import Features, read_features
 from loopclosure.frames import Selection
 from loopclosure.verification import GeometricCheck
 
@@ -31,7 +32,7 @@ def test_sequence_with_poses(two_laps):
 
 def test_features_take_the_place_of_describe(two_laps, two_laps_features):
     detector = LoopDetector(exclude_recent=5, threshold=-0.2)
-    results = run_detector(detector, open_recording(two_laps, Selection(stride=2)), two_laps_features)
+    results = run_detector(detector, open_recording(two_laps, Selection(stride=2)), read_features(two_laps_features))
     assert [r.accepted for r in results] == [None] * 10 + list(range(10))
 
 
@@ -39,7 +40,7 @@ def test_features_with_verification_read_the_images(two_laps, two_laps_features)
     detector = LoopDetector(
         exclude_recent=10, threshold=-0.2, check=GeometricCheck(max_features=100, min_inliers=8, ratio=0.9)
     )
-    results = run_detector(detector, open_recording(two_laps), two_laps_features)
+    results = run_detector(detector, open_recording(two_laps), read_features(two_laps_features))
     assert {r.verdict for r in results[20:]} <= {"accepted", "not verified"}
     assert all(r.inliers is not None for r in results[20:])
 
@@ -62,7 +63,7 @@ def test_video(tmp_path):
     assert [r.accepted for r in results] == [None] * 5 + list(range(5))
     assert detector.stamps[1] == pytest.approx(0.3)
     with pytest.raises(InputError, match="no names to find features by"):
-        run_detector(detector, recording, tmp_path / "f.npz")
+        run_detector(detector, recording, Features(tmp_path / "f.npz", np.zeros((1, 2))))
     with pytest.raises(InputError, match="no such video"):
         open_recording(tmp_path / "gone.mp4")
 
