@@ -9,29 +9,28 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
-from tqdm import tqdm
 
-from lmdb_build.contact_sheet import write_contact_sheet
-from lmdb_build.pair_build import Plan, build_lists
-from lmdb_build.pair_list import join_lists, root_of
-from lmdb_build.pair_poses import NEGATIVES, PoseRule, PoseSource, Scenes
-from lmdb_build.pair_sources import (
+from lmdb_build.bar import bar
+from lmdb_build.pairs.build import Plan, build_lists
+from lmdb_build.pairs.by_list import (
     CAMERAS,
     MaskSource,
-    folder_runs,
     folders_source,
-    index_runs,
     index_source,
     singles_source,
     table_source,
 )
-from lmdb_build.pairs import SPLITS, PairSource
+from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
+from lmdb_build.pairs.choose import SPLITS, PairSource
+from lmdb_build.pairs.contact_sheet import write_contact_sheet
+from lmdb_build.pairs.list_file import join_lists, root_of
+from lmdb_build.pairs.runs import folder_runs, index_runs
 from lmdb_build.views import Batches, write_views
-from lmdb_build.walk import Walk, write_walk
+from lmdb_build.walk.sequence import Walk, write_walk
+from loopclosure.descriptors.feature_file import read_features
 from loopclosure.errors import InputError
-from loopclosure.features import read_features
-from loopclosure.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
+from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
 
 PROGRAM = "lmdb-build"
 
@@ -92,7 +91,7 @@ def _walk(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
             start_s=10_000.0 * number,
         )
         folder = options.out / f"walk_{number}"
-        for _ in tqdm(write_walk(folder, walk), total=walk.frames, desc=folder.name, unit="image", disable=None):
+        for _ in bar(write_walk(folder, walk), folder.name, walk.frames):
             pass
         print(f"{folder}: {walk.frames} images, {walk.laps} laps of {walk.rooms} rooms")
 
@@ -174,7 +173,7 @@ def _pairs(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None
         hard_share=options.hard_share,
         warp_share=1.0 if options.singles else options.warp_share,
     )
-    lists = build_lists(source, plan, root, options.out, print, _warn)
+    lists = build_lists(source, plan, root, options.out, print, _warn, bar)
     for split, path in lists.items():
         print(f"tools/convert_pairs_lmdb {root}/ {path} {options.out / split}_lmdb")
 
@@ -264,7 +263,7 @@ def _views(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None
         root = Path(os.path.commonpath([folder.resolve() for folder in options.folders]))
         runs = folder_runs(options.folders, root)
     batches = Batches(options.batches, options.size, options.per_track, options.apart, options.max_gap, options.other)
-    path = write_views(runs, batches, options.view_size, root, options.out, options.seed)
+    path = write_views(runs, batches, options.view_size, root, options.out, options.seed, bar)
     print(f"{path}: {options.batches} batches of {options.size} pairs")
     print(f"tools/convert_pairs_lmdb {path.parent}/ {path} {options.out}_lmdb")
 

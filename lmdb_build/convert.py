@@ -12,13 +12,15 @@ import sys
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from tqdm.contrib.logging import logging_redirect_tqdm
 
-from lmdb_build.writer import Entry, Options, image_key, pair_key, read_pairs, read_single_list, write_databases
+from lmdb_build.bar import bar
+from lmdb_build.databases import Entry, Options, image_key, pair_key, read_pairs, read_single_list, write_databases
 from loopclosure.errors import InputError
 from netspec import log
 from netspec.data.database import BACKENDS, open_reader
-from netspec.data.draws import permutation
 from netspec.data.mean import channel_means, compute_mean, write_mean
+from netspec.data.random_words import permutation
 from netspec.errors import SpecError, Where
 
 SWITCHES = ("gray", "shuffle", "check_size", "encoded")
@@ -76,7 +78,7 @@ def _convert(
         entries = [entries[i] for i in order]
     what = "images" if key is image_key else "pairs"
     log.info("convert_imageset.cpp:89", f"A total of {len(entries)} {what}.")
-    write_databases(entries, args.ROOTFOLDER, paths, options, key, args.backend, args.check_size, args.workers)
+    write_databases(entries, args.ROOTFOLDER, paths, options, key, args.backend, args.check_size, args.workers, bar)
 
 
 def _options(args: argparse.Namespace) -> Options:
@@ -154,7 +156,8 @@ def _run(command: Callable[[Sequence[str]], None], arguments: Sequence[str] | No
     log.logger.addHandler(handler)
     log.logger.setLevel(logging.INFO)
     try:
-        command(sys.argv[1:] if arguments is None else arguments)
+        with logging_redirect_tqdm([log.logger]):
+            command(sys.argv[1:] if arguments is None else arguments)
     except (SpecError, InputError) as fault:
         print(fault, file=sys.stderr)
         return 1

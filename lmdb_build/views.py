@@ -14,14 +14,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from lmdb_build.pair_list import write_pair_list
-from lmdb_build.pair_warp import JPEG_QUALITY
+from lmdb_build.pairs.list_file import write_pair_list
+from lmdb_build.pairs.runs import Indices, Runs
+from lmdb_build.pairs.warp import JPEG_QUALITY
 from loopclosure.errors import InputError
-from loopclosure.frames import read_image
-
-Indices = NDArray[np.intp]
+from loopclosure.places.frames import read_image
+from loopclosure.progress import Progress, silent
 
 # What changes between two views, drawn anew for each.
 ZOOM = 2.0  # the part that is seen has 1 to 1/2 of the image's height
@@ -32,20 +31,6 @@ CORNER = 0.08  # each corner is moved by up to this share of the part's size: pe
 GAMMA = 0.3  # standard deviation of its logarithm
 CONTRAST, BRIGHTNESS, TINT, NOISE = 0.2, 20.0, 0.08, 4.0  # standard deviations; of grey levels, but for the logarithms
 BLURRED, BLUR = 0.3, (0.4, 1.5)  # how many views, and by how many pixels
-
-
-@dataclass(frozen=True)
-class Runs:
-    """M images of several runs of a camera.
-
-    names   M names below the root folder
-    tracks  (M,) the number of the run
-    stamps  (M,) where along it: seconds, or the image's number
-    """
-
-    names: list[str]
-    tracks: Indices
-    stamps: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -162,7 +147,15 @@ def cut_view(
     return np.clip(np.round(light), 0, 255).astype(np.uint8)
 
 
-def write_views(runs: Runs, batches: Batches, size: tuple[int, int], root: Path, folder: Path, seed: int) -> Path:
+def write_views(
+    runs: Runs,
+    batches: Batches,
+    size: tuple[int, int],
+    root: Path,
+    folder: Path,
+    seed: int,
+    progress: Progress = silent,
+) -> Path:
     """Write two views of ``size`` (width, height) for each pair below ``folder``, and the list ``folder``.txt.
 
     Both views of a pair are mirrored, or neither. Raises InputError where batches cannot be made, or an image not be
@@ -173,7 +166,7 @@ def write_views(runs: Runs, batches: Batches, size: tuple[int, int], root: Path,
     first, second, same = choose_views(runs, batches, np.random.default_rng([seed, 0]))
     folder.mkdir(parents=True, exist_ok=True)
     listed = []
-    for number, pair in enumerate(tqdm(zip(first, second, strict=True), total=len(first), unit="pair", disable=None)):
+    for number, pair in enumerate(progress(zip(first, second, strict=True), "views", len(first))):
         rng = np.random.default_rng([seed, 1, number])
         mirrored, about = rng.random() < 0.5, rng.uniform(0, 1, 2)
         names = [f"{folder.name}/{number:06d}_{side}.jpg" for side in "ab"]

@@ -12,17 +12,20 @@ from typing import TypeVar
 import numpy as np
 from tqdm import tqdm
 
-from loopclosure import datasets, detect, evaluate, loop_export
-from loopclosure.detector import DetectorSettings, LoopDetector
+from loopclosure import evaluate
+from loopclosure.descriptors.feature_file import read_features
+from loopclosure.descriptors.similarity import METRICS, top_k, write_similarity, write_top_k
+from loopclosure.detector import export as loop_export
+from loopclosure.detector import run as detect
+from loopclosure.detector.detector import DetectorSettings, LoopDetector
+from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
-from loopclosure.feature_method import WhitenBy
-from loopclosure.features import read_features
-from loopclosure.frames import Selection, image_paths
-from loopclosure.methods import METHODS, Setting
-from loopclosure.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.similarity import METRICS, top_k, write_similarity, write_top_k
-from loopclosure.truth import Exclusion
-from loopclosure.verification import GeometricCheck
+from loopclosure.methods.base import METHODS, Setting
+from loopclosure.methods.features import WhitenBy
+from loopclosure.places import datasets
+from loopclosure.places.frames import Selection, image_paths
+from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
+from loopclosure.places.truth import Exclusion
 
 Item = TypeVar("Item")
 # Which options belong to which data set: given with another one they would be ignored, so they are refused.
@@ -112,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     how = p.add_mutually_exclusive_group()
     how.add_argument(
         "--describe",
-        default="loopclosure.baselines.thumbnails:Thumbnailer",
+        default="loopclosure.descriptors.thumbnails:Thumbnailer",
         metavar="MODULE:FUNCTION",
         help="image (H, W, 3) BGR -> descriptor (default: %(default)s)",
     )
@@ -233,8 +236,8 @@ def _data_set(a: argparse.Namespace) -> datasets.DataSet:
 
 def _evaluate(a: argparse.Namespace) -> None:
     # Drawing takes seconds to import, which the other commands need not wait for.
-    from loopclosure.report import write_report
-    from loopclosure.report_files import figures_text
+    from loopclosure.report.files import figures_text
+    from loopclosure.report.page import write_report
 
     data = _data_set(a)
     setting = Setting(data.exclude_frames, a.seed)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from loopclosure.datasets import DataSet
 from loopclosure.errors import InputError
-from loopclosure.methods import Method, Progress, Setting, make_method, silent
+from loopclosure.methods.base import Method, Setting, make_method
+from loopclosure.places.datasets import DataSet
 from loopclosure.precision_recall import BestMatches, PrecisionRecall, all_pairs, best_match, best_matches, recall_at_k
+from loopclosure.progress import Progress, silent
 
 RECALL_AT = (1, 5, 10)
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.truth import Truth
+from loopclosure.places.truth import Truth
 
 ALL_PAIRS = "all pairs"
 BEST_MATCH = "best match of each query"

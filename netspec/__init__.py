@@ -6,32 +6,37 @@ The public names are loaded when they are first used, so that ``import netspec.p
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from typing import TYPE_CHECKING, Any
 
 from netspec.errors import SpecError
 
 if TYPE_CHECKING:
     from netspec.dialects import use_dialect
-    from netspec.net import Net, load_net
+    from netspec.net.build import load_net
+    from netspec.net.net import Net
+    from netspec.net.weights import load_weights, save_weights
     from netspec.solver.solver import Solver, load_solver
-    from netspec.weights import load_weights, save_weights
 
 _HOMES = {
     "use_dialect": "netspec.dialects",
-    "Net": "netspec.net",
-    "load_net": "netspec.net",
+    "Net": "netspec.net.net",
+    "load_net": "netspec.net.build",
     "Solver": "netspec.solver.solver",
     "load_solver": "netspec.solver.solver",
-    "load_weights": "netspec.weights",
-    "save_weights": "netspec.weights",
+    "load_weights": "netspec.net.weights",
+    "save_weights": "netspec.net.weights",
 }
 
 __all__ = ["Net", "Solver", "SpecError", "load_net", "load_solver", "load_weights", "save_weights", "use_dialect"]
 
 
+__path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the names they had before
+
+
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(importlib.import_module(_HOMES[name]), name)
-    if name in ("proto", "net", "data", "layers", "graph", "solver", "weights"):
+    if importlib.util.find_spec(f"netspec.{name}"):
         return importlib.import_module(f"netspec.{name}")
     raise AttributeError(f"module 'netspec' has no attribute {name!r}")

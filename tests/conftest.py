@@ -1,4 +1,4 @@
-"""What all tests share: one thread a process, so that runs in parallel stay quick, and a GPU that is none."""
+"""What all tests share: one thread a process, so that runs in parallel stay quick, and a fake GPU."""
 
 import pytest
 

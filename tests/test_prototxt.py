@@ -8,14 +8,14 @@ import pytest
 import torch
 
 import netspec
-from netspec.check import check_file
+from netspec.check.check import check_file
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
-from netspec.net import load_net
+from netspec.net.build import load_net
+from netspec.net.weights import load_weights, save_weights
 from netspec.proto.text import parse_net_text, read_net, read_solver
-from netspec.weights import load_weights, save_weights
+from paths import ROOT
 
-ROOT = Path(__file__).parents[1]
 NETS = ("siamese_8", "siamese_128", "siamese_resnet27_256", "siamese_resnet27_512")
 FOLDERS = [ROOT / "prototxt" / part / name for part in ("", "small") for name in NETS]
 SIDES = {"small": 64}

@@ -6,8 +6,9 @@ from pathlib import Path
 from lmdb_build.cli import main as lmdb_build
 from loopclosure.cli import main as loopclosure
 from netspec.cli import main as netspec
+from paths import ROOT
 
-WORDS = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_words_256"
+WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
 
 
 def test_the_words_net_is_ahead_of_thumbnails_on_an_unseen_walk(tmp_path: Path) -> None:

@@ -20,11 +20,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from loopclosure.errors import InputError
-from loopclosure.pair_report import read_runs, text_table, write_report
+from loopclosure.report.table_one import read_runs, text_table, write_report
+from netspec.check.training_log import read_test_scores
 from netspec.errors import SpecError, Where
 from netspec.graph.filter import filter_net, with_state
 from netspec.proto.text import parse_net, read_solver
-from netspec.training_log import read_test_scores
 
 SHOWN = re.compile(r"\] (Iteration \d+|    Test net output|Snapshotting to|Optimization Done)")
 PHASES = {"train": 0, "validation": 1}

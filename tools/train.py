@@ -6,6 +6,6 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from netspec.cli import train
+from netspec.cli import main
 
-sys.exit(train())
+sys.exit(main(["train", *sys.argv[1:]]))

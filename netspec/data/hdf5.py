@@ -13,8 +13,8 @@ import h5py
 import numpy as np
 
 from netspec import log
-from netspec.data.draws import permutation
 from netspec.data.images import list_lines
+from netspec.data.random_words import permutation
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
 

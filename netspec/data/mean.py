@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from netspec import blobs, log
+from netspec import log
+from netspec.data import blobs
 from netspec.data.database import Reader
 from netspec.data.datum import datum_to_array, parse_datum, times
 from netspec.errors import SpecError, Where

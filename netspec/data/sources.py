@@ -14,8 +14,8 @@ import numpy as np
 
 from netspec.data.database import Reader
 from netspec.data.datum import parse_datum, times
-from netspec.data.draws import permutation, words
 from netspec.data.images import ListedImage, read_image
+from netspec.data.random_words import permutation, words
 from netspec.data.transformer import Shape, Transformer
 from netspec.errors import SpecError, Where
 

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from netspec import log
+from netspec.data.blobs import Shape
 from netspec.data.datum import datum_to_array, times
-from netspec.data.draws import words
 from netspec.data.mean import read_mean
+from netspec.data.random_words import words
 from netspec.errors import SpecError, Where
-
-Shape = tuple[int, ...]
-TRAIN = 0  # caffe.proto: enum Phase
+from netspec.proto.schema import TRAIN
 
 
 class Transformer:

@@ -17,8 +17,8 @@ import numpy as np
 
 from netspec import log
 from netspec.data.datum import decode_pixels, planar
-from netspec.data.draws import words
 from netspec.data.mean import read_mean
+from netspec.data.random_words import words
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
 

@@ -35,8 +35,9 @@ To write one, put this into a file, say ``doubling.py``, and pass ``--plugin dou
         def forward(self, data):
             return data * value(self.param, "times_param").factor
 
-``DECLARATIONS`` is in the language of caffe.proto (see netspec/proto/dialect.py: messages as they stand in the fork,
-new fields of Caffe's messages in ``extend``), one plain string. A layer is as Caffe's own are (netspec/layers/base.py);
+``DECLARATIONS`` is in the language of caffe.proto (netspec/proto/dialect/registry.py): messages as they stand in the
+fork, new fields of Caffe's messages in ``extend``; one plain string. A layer is as Caffe's own are
+(netspec/layers/base.py);
 ``@register`` has its type and the fields of LayerParameter that it reads: a net warns of those that nobody reads.
 ``@register("Dropout", ..., replaces=Dropout)`` puts a subclass in the place of one of Caffe's layers, to honour a
 field that the fork added to it. To offer a dialect with a package, name its module in that package's pyproject.toml::
@@ -54,8 +55,8 @@ import traceback
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
-from netspec.proto.dialect import activate, deactivate
-from netspec.proto.dialect_files import DialectFile, find_file, read_dialect
+from netspec.proto.dialect.files import DialectFile, find_file, read_dialect
+from netspec.proto.dialect.registry import activate, deactivate
 
 __all__ = ["use_dialect"]
 

@@ -13,9 +13,9 @@ import torch.nn.functional as F
 
 from netspec.layers import Layer, register
 from netspec.layers.activation import Activation
-from netspec.layers.base import TRAIN, Shape
-from netspec.layers.vision_convolution import Convolution
-from netspec.proto.schema import value
+from netspec.layers.base import Shape
+from netspec.layers.vision.convolution import Convolution
+from netspec.proto.schema import TRAIN, value
 
 DECLARATIONS = """
 message InterpParameter {

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 
 from netspec.layers import Layer, common, register
 from netspec.layers.base import Shape
-from netspec.layers.loss_base import Loss
+from netspec.layers.loss.base import Loss
 from netspec.proto.schema import value
 
 DECLARATIONS = """

@@ -1,20 +1,11 @@
 """Caffe's layers; importing this package registers them all."""
 
-from netspec.layers import (  # noqa: F401
-    activation,
-    common,
-    data,
-    data_memory,
-    loss,
-    normalization,
-    python,
-    recurrent,
-    utility,
-    utility_shape,
-    vision_convolution,
-    vision_pooling,
-)
+from netspec.layers import activation, common, normalization, recurrent  # noqa: F401
 from netspec.layers.base import Context, Layer, Random
+from netspec.layers.data import files, memory  # noqa: F401
+from netspec.layers.loss import losses  # noqa: F401
 from netspec.layers.registry import layer_class, layer_types, register
+from netspec.layers.utility import arithmetic, python, shape  # noqa: F401
+from netspec.layers.vision import convolution, pooling  # noqa: F401
 
 __all__ = ["Context", "Layer", "Random", "layer_class", "layer_types", "register"]

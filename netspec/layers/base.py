@@ -13,11 +13,10 @@ from typing import Any, ClassVar
 
 import torch
 
-from netspec import fillers
+from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
-
-Shape = tuple[int, ...]
-TRAIN, TEST = 0, 1  # caffe.proto: enum Phase
+from netspec.layers import fillers
+from netspec.proto.schema import TEST
 
 
 def shape_string(shape: Sequence[int]) -> str:
@@ -85,7 +84,7 @@ class Layer(torch.nn.Module):
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
     reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
     ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
-    gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (the bottom's), "top": see netspec/in_place.py
+    gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (of it), "top": see net/in_place.py
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
 
@@ -121,7 +120,7 @@ class Layer(torch.nn.Module):
     def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         """Return the bottom's gradient as Caffe computes it from what its memory holds at the time of backward.
 
-        Only for layers of one bottom and top whose ``gradient_reads`` is not empty: see netspec/in_place.py.
+        Only for layers of one bottom and top whose ``gradient_reads`` is not empty: see netspec/net/in_place.py.
         """
         raise NotImplementedError
 

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch.nn import functional as F
 
-from netspec.layers.base import TRAIN, Layer, Shape
-from netspec.layers.caffes_order import VectorProducts, in_caffes_order
+from netspec.exact.functions import VectorProducts, in_caffes_order
+from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.proto.schema import TRAIN
 
 
 @register("InnerProduct", "inner_product_param")

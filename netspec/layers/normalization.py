@@ -9,10 +9,11 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
-from netspec.arithmetic import root
-from netspec.layers.base import TEST, Layer, Shape
-from netspec.layers.caffes_order import PASSES, BatchNormalization, ChannelProducts, in_caffes_order
+from netspec.exact.blas import root
+from netspec.exact.functions import PASSES, BatchNormalization, ChannelProducts, in_caffes_order
+from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.proto.schema import TEST
 
 ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
 MAX_OFFSET = 8  # means, in standard deviations, up to which torch's CPU kernel is exact to 1e-6

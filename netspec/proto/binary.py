@@ -10,7 +10,7 @@ from google.protobuf.message import DecodeError, Message
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
-from netspec.proto.upgrade import upgrade_net
+from netspec.proto.upgrade.current import upgrade_net
 
 M = TypeVar("M", bound=Message)
 

@@ -13,11 +13,11 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 from google.protobuf.message import Message
 
 from netspec.errors import SpecError, Where, did_you_mean
-from netspec.proto import dialect
-from netspec.proto.dialect_files import announce_known
+from netspec.proto.dialect import registry as dialect
+from netspec.proto.dialect.files import announce_known
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
 from netspec.proto.schema import Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
-from netspec.proto.source_map import Node
+from netspec.proto.source_map import Place
 
 _RANGES: dict[int, tuple[int, int]] = {
     Declared.TYPE_INT32: (-(1 << 31), (1 << 31) - 1),
@@ -38,10 +38,10 @@ _OTHER_FILE: dict[str, tuple[Any, str]] = {
     "caffe.SolverParameter": (NetParameter, "net"),
 }
 
-Children = dict[str, list[Node]]
+Children = dict[str, list[Place]]
 
 
-def read_text(text: str, file: str, message: Message) -> Node:
+def read_text(text: str, file: str, message: Message) -> Place:
     """Read a text into an empty ``message``; return the places of its parts.
 
     Raises SpecError for unknown fields, values of the wrong type or out of range, singular fields given twice, missing
@@ -59,13 +59,13 @@ class _Reader:
         self._open: list[tuple[Message, Token]] = []  # the messages being read, each with the token that named it
         self.token = next(self._tokens)
 
-    def read(self, message: Message) -> Node:
+    def read(self, message: Message) -> Place:
         children: Children = {}
         self._open.append((message, self.token))
         while self.token.kind != END:
             self._field(message, children)
         self._check_required(message)
-        return Node(Where(self.lexer.file), _frozen(children))
+        return Place(Where(self.lexer.file), _frozen(children))
 
     # ---- Grammar ----
 
@@ -89,7 +89,7 @@ class _Reader:
             raise self._expected('":"', f'after "{name.text}"')
         if meaning is not None:
             field.set(message, field.descriptor.enum_type.values_by_name[meaning[self._boolean()]].number)
-            nodes.append(Node(self.lexer.where(name.start)))
+            nodes.append(Place(self.lexer.where(name.start)))
         elif field.repeated and self._at("["):
             self._list(field, message, nodes)
         else:
@@ -97,7 +97,7 @@ class _Reader:
         if self._at(",") or self._at(";"):
             self._next()
 
-    def _list(self, field: Field, message: Message, nodes: list[Node]) -> None:
+    def _list(self, field: Field, message: Message, nodes: list[Place]) -> None:
         self._next()
         if self._at("]"):
             self._next()
@@ -111,21 +111,21 @@ class _Reader:
                 raise self._expected('"," or "]"', f'in the list of "{field.name}"')
             self._next()
 
-    def _value(self, field: Field, message: Message, place: Token) -> Node:
+    def _value(self, field: Field, message: Message, place: Token) -> Place:
         where = self.lexer.where(place.start)
         if field.type == Declared.TYPE_MESSAGE:
             inner = field.get(message)
             inner = inner.add() if field.repeated else inner
             inner.SetInParent()
-            return Node(where, self._message(inner, place, field.name))
+            return Place(where, self._message(inner, place, field.name))
         value = self._scalar(field)
         if field.repeated:
             field.get(message).append(value)
         else:
             field.set(message, value)
-        return Node(where)
+        return Place(where)
 
-    def _message(self, message: Message, place: Token, name: str) -> dict[str, tuple[Node, ...]]:
+    def _message(self, message: Message, place: Token, name: str) -> dict[str, tuple[Place, ...]]:
         if not (self._at("{") or self._at("<")):
             raise self._expected('"{"', f'after "{name}"')
         closing = "}" if self._next().text == "{" else ">"
@@ -311,5 +311,5 @@ class _Reader:
         return fault + close
 
 
-def _frozen(children: Children) -> dict[str, tuple[Node, ...]]:
+def _frozen(children: Children) -> dict[str, tuple[Place, ...]]:
     return {name: tuple(nodes) for name, nodes in children.items()}

@@ -17,9 +17,12 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
 PACKAGE = "caffe"
+TRAIN, TEST = 0, 1  # enum Phase
+PHASES = {"TRAIN": TRAIN, "TEST": TEST}
+PHASE_NAMES = ("TRAIN", "TEST")
 _LAST_NUMBER = 1 << 29  # field numbers end before this
 
-#: The pool; :mod:`netspec.proto.dialect` adds the messages and fields of forks to it.
+#: The pool; :mod:`netspec.proto.dialect.registry` adds the messages and fields of forks to it.
 pool = descriptor_pool.DescriptorPool()
 _declarations: dict[str, descriptor_pb2.DescriptorProto] = {}  # by the message's full name
 

@@ -9,11 +9,11 @@ from netspec.errors import Where
 
 
 @dataclass(frozen=True)
-class Node:
+class Place:
     """Position of one message in its file and, by field name, of each of its fields' values, in order."""
 
     where: Where
-    fields: Mapping[str, tuple[Node, ...]] = field(default_factory=dict)
+    fields: Mapping[str, tuple[Place, ...]] = field(default_factory=dict)
 
     def find(self, *path: str | int) -> Where:
         """Return the place of ``path``, e.g. ``("convolution_param", "pad", 1)``, or of its nearest known ancestor.
@@ -37,21 +37,21 @@ class SourceMap:
     """``layers[i]`` says where layer ``i`` of the NetParameter beside it came from."""
 
     file: str
-    net: Node
-    layers: tuple[Node, ...] = ()
+    net: Place
+    layers: tuple[Place, ...] = ()
 
     @staticmethod
-    def of(net: Node) -> SourceMap:
+    def of(net: Place) -> SourceMap:
         """Return the map of a net just read, whose layers are in ``layer``, or of an old one, in ``layers``."""
         return SourceMap(net.where.file, net, (*net.fields.get("layer", ()), *net.fields.get("layers", ())))
 
     @staticmethod
     def unknown(file: str, count: int) -> SourceMap:
         """A map for a net that did not come from text (a binary file, a message made in Python)."""
-        node = Node(Where(file))
+        node = Place(Where(file))
         return SourceMap(file, node, (node,) * count)
 
-    def as_net(self) -> Node:
+    def as_net(self) -> Place:
         """Return the places of the net with those of its layers as they are now; see :meth:`of`."""
         others = {name: nodes for name, nodes in self.net.fields.items() if name not in ("layer", "layers")}
         return replace(self.net, fields={**others, "layer": self.layers})
@@ -60,6 +60,6 @@ class SourceMap:
         """Return the place of a field of layer ``index``, labelled with the layer's name and type."""
         return replace(self.layers[index].find(*path), layer=layer, type=type)
 
-    def with_layers(self, layers: Iterable[Node]) -> SourceMap:
+    def with_layers(self, layers: Iterable[Place]) -> SourceMap:
         """Return the map of a net whose layers came from ``layers``, in order."""
         return replace(self, layers=tuple(layers))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
-from netspec.proto import upgrade as upgrades
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter
-from netspec.proto.source_map import Node, SourceMap
+from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.upgrade import current as upgrades
 from netspec.proto.writer import write_text
 
 __all__ = [
@@ -44,7 +44,7 @@ def parse_net_text(text: str, file: str, upgrade: bool = True) -> tuple[NetParam
     return upgrades.upgrade_net(net, source) if upgrade else (net, source)
 
 
-def parse_solver(path: str | Path, upgrade: bool = True) -> tuple[SolverParameter, Node]:
+def parse_solver(path: str | Path, upgrade: bool = True) -> tuple[SolverParameter, Place]:
     """Return the solver of a .prototxt and where its parts stand. Raises SpecError.
 
     The nets in it are upgraded too; ``SourceMap.of(node.fields["net_param"][0])`` is the map of one.
@@ -52,7 +52,7 @@ def parse_solver(path: str | Path, upgrade: bool = True) -> tuple[SolverParamete
     return parse_solver_text(_text_of(path), str(path), upgrade)
 
 
-def parse_solver_text(text: str, file: str, upgrade: bool = True) -> tuple[SolverParameter, Node]:
+def parse_solver_text(text: str, file: str, upgrade: bool = True) -> tuple[SolverParameter, Place]:
     """Return the solver that a text describes and where its parts stand; ``file`` is what errors call it."""
     solver = SolverParameter()
     node = read_text(text, file, solver)

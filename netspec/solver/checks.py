@@ -7,7 +7,7 @@ from typing import Any
 
 from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
-from netspec.proto.source_map import Node
+from netspec.proto.source_map import Place
 from netspec.solver.lr_policy import check_policy
 from netspec.solver.update import find_rule
 
@@ -16,7 +16,7 @@ _AT_LEAST_ONE = ("average_loss", "iter_size")
 _NOT_NEGATIVE = ("max_iter", "display", "test_interval", "snapshot")
 
 
-def check_settings(param: Any, node: Node, report: Report = raise_fault) -> None:
+def check_settings(param: Any, node: Place, report: Report = raise_fault) -> None:
     """Report every fault of the solver's own settings; the nets have theirs."""
     for check in (find_rule, check_policy, _check_regularization):
         try:
@@ -34,7 +34,7 @@ def check_settings(param: Any, node: Node, report: Report = raise_fault) -> None
         report(SpecError("snapshot is given but snapshot_prefix is not", node.find("snapshot")))
 
 
-def check_writable(param: Any, node: Node) -> None:
+def check_writable(param: Any, node: Place) -> None:
     """Refuse a snapshot_prefix that cannot be written to, by writing there (Caffe: CheckSnapshotWritePermissions)."""
     probe = Path(f"{param.snapshot_prefix}_iter_0.tempfile")
     try:
@@ -47,7 +47,7 @@ def check_writable(param: Any, node: Node) -> None:
         ) from None
 
 
-def _check_regularization(param: Any, node: Node) -> None:
+def _check_regularization(param: Any, node: Place) -> None:
     if param.regularization_type not in REGULARIZATIONS:
         message = f'unknown regularization_type "{param.regularization_type}", expected {" or ".join(REGULARIZATIONS)}'
         raise SpecError(message, node.find("regularization_type"))

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from netspec import log
-from netspec.net import Net
+from netspec.net.net import Net
 
 
 @contextmanager

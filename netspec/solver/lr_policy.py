@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec.arithmetic import power
 from netspec.errors import SpecError, did_you_mean
-from netspec.proto.source_map import Node
+from netspec.exact.blas import power
+from netspec.proto.source_map import Place
 
 Rate = Callable[[Any, int, int], Any]
 
@@ -50,7 +50,7 @@ POLICIES: dict[str, Policy] = {
 }
 
 
-def check_policy(param: Any, node: Node) -> None:
+def check_policy(param: Any, node: Place) -> None:
     """Refuse an unknown policy, or one without the fields it needs, before the first iteration.
 
     Caffe refuses a stepsize of 0 and a negative gamma only when it comes to them, and lets a forgotten gamma or

@@ -13,7 +13,7 @@ from typing import Any
 from netspec.errors import SpecError
 from netspec.graph.filter import merged_state
 from netspec.proto.schema import NetParameter, NetState, SolverParameter
-from netspec.proto.source_map import Node, SourceMap
+from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import parse_net
 
 TRAIN_FIELDS = ("net", "net_param", "train_net", "train_net_param")
@@ -30,7 +30,7 @@ class SolverNet:
     source: SourceMap
 
 
-def solver_nets(param: Any, node: Node) -> list[SolverNet]:
+def solver_nets(param: Any, node: Place) -> list[SolverNet]:
     """Return the training net and the test nets. Raises SpecError where the solver does not say clearly which."""
     return [train_net(param, node), *test_nets(param, node)]
 
@@ -45,7 +45,7 @@ def with_train_state(param: Any, level: int | None, stages: Iterable[str]) -> So
     return stated
 
 
-def train_net(param: Any, node: Node) -> SolverNet:
+def train_net(param: Any, node: Place) -> SolverNet:
     """Return the net to train: exactly one of the four fields gives it."""
     found = [name for name in TRAIN_FIELDS if param.HasField(name)]
     expected = f"expected exactly one of {', '.join(TRAIN_FIELDS)}"
@@ -58,7 +58,7 @@ def train_net(param: Any, node: Node) -> SolverNet:
     return SolverNet("train net", origin, _in_state(net, state), source)
 
 
-def test_nets(param: Any, node: Node) -> list[SolverNet]:
+def test_nets(param: Any, node: Place) -> list[SolverNet]:
     """Return the nets to test, in Caffe's order: each test_net_param, each test_net, then the general net for every
     further test_iter.
     """
@@ -88,7 +88,7 @@ def test_nets(param: Any, node: Node) -> list[SolverNet]:
     return nets
 
 
-def _read(param: Any, node: Node, name: str, index: int | None = None) -> tuple[str, NetParameter, SourceMap]:
+def _read(param: Any, node: Place, name: str, index: int | None = None) -> tuple[str, NetParameter, SourceMap]:
     """Return where a net came from, the net and its map: the field holds it, or the path of its file."""
     value = getattr(param, name) if index is None else getattr(param, name)[index]
     place = (name,) if index is None else (name, index)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import torch
 
-from netspec.net import Net
+from netspec.net.net import Net
 
 
 class Replicas:

@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from netspec import blobs
+from netspec.data import blobs
 from netspec.errors import SpecError, Where
 from netspec.proto.binary import read_binary
 from netspec.proto.schema import SolverState

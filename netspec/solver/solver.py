@@ -17,11 +17,14 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.arithmetic import adding_to_grad
 from netspec.errors import SpecError, Where
-from netspec.net import BuildOptions, Net, build_net
+from netspec.exact.blas import adding_to_grad
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import SolverParameter
-from netspec.proto.source_map import Node
+from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
 from netspec.solver.checks import check_settings, check_writable
@@ -29,7 +32,6 @@ from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
-from netspec.weights import load_weights, save_weights
 
 Scores = dict[str, list[float]]
 _CREATING = {
@@ -80,7 +82,7 @@ def load_solver(
     return solver
 
 
-def choose_device(param: Any, node: Node) -> torch.device:
+def choose_device(param: Any, node: Place) -> torch.device:
     """Return the device that solver_mode and device_id ask for; the CPU, with a warning, where there is no GPU."""
     if param.solver_mode == SolverParameter.SolverMode.Value("CPU"):
         return torch.device("cpu")
@@ -107,7 +109,7 @@ class Solver:
     def __init__(
         self,
         param: Any,
-        node: Node | None = None,
+        node: Place | None = None,
         *,
         device: torch.device | None = None,
         others: Sequence[torch.device] = (),
@@ -121,7 +123,7 @@ class Solver:
         asked between iterations, also those of a test: "stop" ends the training, "snapshot" takes one. ``clock`` gives
         the seconds behind "iter/s".
         """
-        node = node or Node(Where("<solver>"))
+        node = node or Place(Where("<solver>"))
         log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
         check_settings(param, node)
         if param.snapshot:

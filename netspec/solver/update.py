@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec.arithmetic import power, sum_of_squares
 from netspec.errors import SpecError, did_you_mean
-from netspec.proto.source_map import Node
+from netspec.exact.blas import power, sum_of_squares
+from netspec.proto.source_map import Place
 
 Tensors = list[torch.Tensor] | tuple[torch.Tensor, ...]
 
@@ -139,7 +139,7 @@ RULES: dict[str, Rule] = {
 }
 
 
-def find_rule(param: Any, node: Node) -> Rule:
+def find_rule(param: Any, node: Place) -> Rule:
     """Return the rule of ``type``, in any case of letters; refuse what the constructors of Caffe's solvers refuse."""
     name = {known.lower(): known for known in RULES}.get(param.type.lower())
     if name is None:

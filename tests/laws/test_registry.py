@@ -14,13 +14,13 @@ from google.protobuf import text_format
 
 from netspec.errors import SpecError, Where
 from netspec.layers import Context, Layer, Random, layer_class, layer_types
-from netspec.layers.data_memory import MemoryData
+from netspec.layers.data.memory import MemoryData
 from netspec.proto.schema import LayerParameter
+from paths import GOLDEN
 from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 Shape = tuple[int, ...]
 TRAIN, TEST = 0, 1
-GOLDEN = Path(__file__).parents[1] / "golden"
 MAPS = (2, 4, 5, 6)
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from lmdb_build.cli import main
-from lmdb_build.pair_list import read_pair_list
-from lmdb_build.views import Batches, Runs, choose_views, cut_view
+from lmdb_build.pairs.list_file import read_pair_list
+from lmdb_build.pairs.runs import Runs
+from lmdb_build.views import Batches, choose_views, cut_view
 from loopclosure.errors import InputError
 
 

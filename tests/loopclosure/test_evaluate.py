@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopclosure.datasets import load_tum
 from loopclosure.errors import InputError
 from loopclosure.evaluate import evaluate, figures, named_method
-from loopclosure.feature_method import FeatureMethod
-from loopclosure.methods import METHODS, MethodResult, Setting, make_method
+from loopclosure.methods.base import METHODS, MethodResult, Setting, make_method
+from loopclosure.methods.features import FeatureMethod
+from loopclosure.places.datasets import load_tum
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 
 

@@ -5,6 +5,7 @@ import pytest
 from sklearn.metrics import average_precision_score, precision_recall_curve
 
 from loopclosure.errors import InputError
+from loopclosure.places.truth import Exclusion, sequence_truth, traverse_truth
 from loopclosure.precision_recall import (
     ALL_PAIRS,
     BEST_MATCH,
@@ -14,7 +15,6 @@ from loopclosure.precision_recall import (
     curve,
     recall_at_k,
 )
-from loopclosure.truth import Exclusion, sequence_truth, traverse_truth
 
 # The worked example: rows are the data base's five places, columns the four queries.
 SCORES = np.array(

@@ -11,10 +11,11 @@ import threadpoolctl
 
 from netspec.cli import main
 from netspec.graph.filter import with_state
-from netspec.net import BuildOptions, Net, build_net
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
 from netspec.proto.text import parse_net_text
-
-GOLDEN = Path(__file__).parents[1] / "golden"
+from paths import GOLDEN
 
 
 @pytest.fixture(scope="session")
@@ -92,9 +93,9 @@ def run(work_in: Callable[..., Path], capfd: pytest.CaptureFixture[str]) -> Call
     """``run(*words)``: one command, in a folder with a golden training and its pairs."""
     work_in("train/sgd_step")
 
-    def run_command(*words: object, command: Callable[[list[str]], int] = main) -> Result:
+    def run_command(*words: object) -> Result:
         capfd.readouterr()
-        status = command([str(word) for word in words])
+        status = main([str(word) for word in words])
         return Result(status, *capfd.readouterr())
 
     return run_command

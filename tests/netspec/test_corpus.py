@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from netspec.check import as_json, check_file, is_solver
+from netspec.check.check import check_file, is_solver
+from netspec.check.table import as_json
 from netspec.proto.text import parse_net, parse_solver
-from shared_data import SHARED
+from paths import SHARED
 
 CORPUS = SHARED / "corpus"
 FILES = sorted(str(path.relative_to(CORPUS)) for path in CORPUS.rglob("*.prototxt"))  # none where it is absent

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.describe import Describer
+from netspec.features.describer import Describer
 from netspec.solver.solver import load_solver
 from pretend_gpu import NAME, POSSIBLE, PretendTensor, pretended_gpu
 

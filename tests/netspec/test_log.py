@@ -11,8 +11,8 @@ import pytest
 
 from netspec import log
 from netspec.cli import main
+from paths import GOLDEN
 
-GOLDEN = Path(__file__).parents[1] / "golden"
 TRAIN = ["train", "--solver=sgd_step/solver.prototxt", "--weights=sgd_step/init.caffemodel"]
 RESUME = ["train", "--solver=sgd_step/solver.prototxt", "--snapshot=sgd_step/ref_iter_40.solverstate"]
 TEST = ["test", "--model=sgd_step/train_val.prototxt", "--weights=sgd_step/init.caffemodel", "--iterations=4"]

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from netspec.check.training_log import read_test_scores
 from netspec.errors import SpecError
-from netspec.training_log import read_test_scores
-
-ROOT = Path(__file__).parents[2]
-GOLDEN = ROOT / "tests" / "golden"
+from paths import GOLDEN, ROOT
 
 
 @pytest.fixture

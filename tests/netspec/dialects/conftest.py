@@ -9,8 +9,9 @@ import torch
 
 from netspec.dialects import use_dialect
 from netspec.layers import Context, Layer, Random, layer_class, registry
-from netspec.layers.base import TEST
-from netspec.proto import dialect, dialect_files
+from netspec.proto.dialect import files as dialect_files
+from netspec.proto.dialect import registry as dialect
+from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text
 from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 

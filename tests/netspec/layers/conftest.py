@@ -7,9 +7,9 @@ import torch
 from google.protobuf import text_format
 
 from netspec.errors import Where
-from netspec.layers import Context, Layer, Random, caffes_order, layer_class
-from netspec.layers.base import TEST
-from netspec.proto.schema import LayerParameter
+from netspec.exact import functions as caffes_order
+from netspec.layers import Context, Layer, Random, layer_class
+from netspec.proto.schema import TEST, LayerParameter
 
 
 @pytest.fixture(autouse=True)

@@ -4,15 +4,15 @@ import pytest
 
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import SolverParameter
-from netspec.proto.source_map import Node
+from netspec.proto.source_map import Place
 from netspec.solver.lr_policy import check_policy, learning_rate, next_step
 
-NODE = Node(
+NODE = Place(
     Where("s.prototxt"),
     {
-        "lr_policy": (Node(Where("s.prototxt", 3, 1)),),
-        "stepsize": (Node(Where("s.prototxt", 4, 1)),),
-        "gamma": (Node(Where("s.prototxt", 5, 1)),),
+        "lr_policy": (Place(Where("s.prototxt", 3, 1)),),
+        "stepsize": (Place(Where("s.prototxt", 4, 1)),),
+        "gamma": (Place(Where("s.prototxt", 5, 1)),),
     },
 )
 

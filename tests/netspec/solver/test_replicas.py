@@ -8,8 +8,8 @@ import torch
 
 from netspec.data.sources import Cursor
 from netspec.solver.solver import load_solver
+from paths import GOLDEN
 
-GOLDEN = Path(__file__).parents[2] / "golden"
 CPU = torch.device("cpu")
 
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
+from netspec.net.weights import load_weights
 from netspec.proto.schema import BlobProto, BlobShape, SolverState
 from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
 from netspec.solver.solver import Solver, load_solver
-from netspec.weights import load_weights
+from paths import GOLDEN
 
-GOLDEN = Path(__file__).parents[2] / "golden"
 STATES = sorted(path.relative_to(GOLDEN / "train") for path in GOLDEN.glob("train/*/*.solverstate"))
 
 

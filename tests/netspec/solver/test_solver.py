@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
+from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 from netspec.solver.snapshot import read_state
 from netspec.solver.solver import Solver, load_solver
-from netspec.weights import save_weights
 
 NET = """
 name: "tiny"

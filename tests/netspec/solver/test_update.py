@@ -5,10 +5,10 @@ import torch
 
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import SolverParameter
-from netspec.proto.source_map import Node
+from netspec.proto.source_map import Place
 from netspec.solver.update import RULES, Tensors, clip, find_rule, normalize, regularize
 
-NOWHERE = Node(Where("s.prototxt"))
+NOWHERE = Place(Where("s.prototxt"))
 SHAPES = [(3, 2), (4,)]
 
 

@@ -1,0 +1,199 @@
+"""Lists of images, single or in pairs, to databases of Datums.
+
+A pair becomes one Datum, both images stacked along the channels: six for colour (blue, green, red of the first, then
+of the second), two for grey. An encoded Datum can hold but one image, so encoded pairs become two databases in the same
+order.
+
+Caffe: tools/convert_imageset.cpp, examples/siamese/convert_mnist_siamese_data.cpp
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from lmdb_build.pairs.list_file import read_pair_list
+from loopclosure.progress import Progress, silent
+from netspec import log
+from netspec.data.database import Writer
+from netspec.data.datum import array_to_datum, decode_image, encoded_datum, times
+from netspec.data.images import read_image, read_image_list
+from netspec.errors import SpecError, Where
+
+S = TypeVar("S")
+T = TypeVar("T")
+_AHEAD = 8  # entries in hand for each worker
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One record to be: the image or the two images it is made of, its label, its line in the list."""
+
+    images: tuple[str, ...]
+    label: int
+    where: Where
+
+
+@dataclass(frozen=True)
+class Options:
+    """How images become Datums.
+
+    ``size`` is (height, width), None for the files' own. ``encoding`` None stores pixels; "" stores the format that the
+    file's name ends with, any other text that format ("png", "jpg").
+    """
+
+    color: bool = True
+    size: tuple[int, int] | None = None
+    encoding: str | None = None
+
+
+def read_pairs(path: str) -> list[Entry]:
+    """Return the entries of a list of pairs; see lmdb_build/pairs/list_file.py. Raises InputError for a faulty line."""
+    return [
+        Entry((pair.first, pair.second), pair.label, Where(path, pair.line, 1)) for pair in read_pair_list(Path(path))
+    ]
+
+
+def read_single_list(path: str) -> list[Entry]:
+    """Read lines of ``name label``, split at the last blank."""
+    return [Entry((image.name,), image.label, image.where) for image in read_image_list(path)]
+
+
+def pair_key(number: int, entry: Entry) -> str:
+    """Return the key of a pair, as convert_mnist_siamese_data writes it."""
+    return f"{number:08d}"
+
+
+def image_key(number: int, entry: Entry) -> str:
+    """Return the key of a single image, as convert_imageset writes it."""
+    return f"{number:08d}_{entry.images[0]}"
+
+
+def write_databases(
+    entries: Sequence[Entry],
+    root: str,
+    paths: Sequence[str],
+    options: Options,
+    key: Callable[[int, Entry], str],
+    backend: str = "lmdb",
+    check_size: bool = False,
+    workers: int | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Write entries, in order, into new databases, which appear once they are whole.
+
+    ``paths`` names one database, or, with encoded images, one for each image of an entry. ``root`` is put in front of
+    image names, with a slash between. Images are read by ``workers`` processes (None: one a core). Raises SpecError,
+    with the line in the list, for an image that is missing, unreadable, or does not go with its partner (with
+    ``check_size``: with all others).
+    """
+    assert len(paths) == (1 if options.encoding is None else len(entries[0].images))
+    work = partial(_records, root=root if root.endswith("/") or not root else root + "/", options=options)
+    first: tuple[int, ...] | None = None
+    with ExitStack() as stack:
+        results = stack.enter_context(_Workers(workers or os.cpu_count() or 1)).ordered(work, entries)
+        writers = [stack.enter_context(Writer(path, backend)) for path in paths]
+        for number, (records, shape) in enumerate(progress(results, "records", len(entries))):
+            entry = entries[number]
+            first = first or shape
+            if check_size and shape != first:
+                message = f"gives {times(shape)}, the first line {times(first)} (-check_size)"
+                raise SpecError(f'"{entry.images[0]}" {message}', entry.where)
+            for writer, record in zip(writers, records, strict=True):
+                writer.put(key(number, entry).encode(), record)
+            if (number + 1) % 1000 == 0:
+                log.info("convert_imageset.cpp:147", f"Processed {number + 1} files.")
+        for writer in writers:  # all before the first one appears
+            writer.commit()
+    if len(entries) % 1000:
+        log.info("convert_imageset.cpp:153", f"Processed {len(entries)} files.")
+
+
+def _records(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tuple[int, ...]]:
+    """Return an entry's serialised Datums, and the shape of what they hold."""
+    paths = [root + name for name in entry.images]
+    try:
+        if options.encoding is not None:
+            encoded = [_encode(path, entry.label, options) for path in paths]
+            return [record for record, _ in encoded], encoded[0][1]
+        images = [read_image(path, options.color, options.size) for path in paths]
+    except ValueError as fault:
+        raise SpecError(str(fault), entry.where) from None
+    shapes = [image.shape for image in images]
+    if shapes[0] != shapes[-1]:
+        message = f'"{paths[0]}" is {times(shapes[0])}, its partner "{paths[1]}" {times(shapes[1])}'
+        raise SpecError(f"{message}; give -resize_width and -resize_height", entry.where)
+    stacked = np.concatenate(images)
+    return [array_to_datum(stacked, entry.label).SerializeToString()], stacked.shape
+
+
+def _encode(path: str, label: int, options: Options) -> tuple[bytes, tuple[int, ...]]:
+    """Return one encoded Datum: the file as it is where it already holds what is asked for, as Caffe does.
+
+    (Caffe stores a colour file as it is also under -gray, and so keeps its colours.)
+    """
+    suffix = Path(path).suffix[1:].lower().replace("jpeg", "jpg")
+    encoding = (options.encoding or suffix).lower().replace("jpeg", "jpg")
+    if not encoding:
+        raise ValueError(f'image "{path}" has no ending that tells its format; give -encode_type')
+    image = read_image(path, options.color, options.size)
+    if encoding == suffix and not options.size:
+        file = Path(path).read_bytes()
+        if decode_image(file).shape[0] == image.shape[0]:
+            return encoded_datum(file, label).SerializeToString(), image.shape
+    try:
+        _, data = cv2.imencode(f".{encoding}", image.transpose(1, 2, 0))
+    except cv2.error:
+        raise ValueError(f'image "{path}" cannot be encoded as "{encoding}"; try -encode_type png') from None
+    return encoded_datum(data.tobytes(), label, image.shape).SerializeToString(), image.shape
+
+
+class _Workers:
+    """A pool of processes; a single worker is this process."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> _Workers:
+        if self._count > 1:
+            # Forked where the system can: a script read from standard input could not be imported by a fresh process.
+            method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
+            context = multiprocessing.get_context(method)
+            self._pool = ProcessPoolExecutor(self._count, context, initializer=_start_worker)
+            self._pool.submit(os.getpid)  # forks now, before the progress bar has a thread
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def ordered(self, work: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
+        """Yield the results in the order of the items; only a few are in hand at a time, so that memory stays flat."""
+        if self._pool is None:
+            yield from map(work, items)
+            return
+        pending: deque[Future[T]] = deque()
+        for item in items:
+            pending.append(self._pool.submit(work, item))
+            if len(pending) >= self._count * _AHEAD:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the pool
+    cv2.setNumThreads(0)

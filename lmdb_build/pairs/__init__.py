@@ -1,0 +1,1 @@
+"""Labeled pairs of images: which ones, and the lists that name them."""

@@ -1,0 +1,159 @@
+"""From a source of pairs to list files: split, choose, warp, write, and say what was chosen."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from lmdb_build.pairs.choose import SPLITS, Indices, Pairs, PairSource, choose_pairs, split_by_group, split_by_time
+from lmdb_build.pairs.hard_negatives import hard_negatives
+from lmdb_build.pairs.list_file import ROOT_FOLDER, write_pair_list
+from lmdb_build.pairs.report import kinds, report
+from lmdb_build.pairs.warp import write_warped
+from loopclosure.descriptors.feature_file import Features
+from loopclosure.errors import InputError
+from loopclosure.progress import Progress, silent
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be made of a source.
+
+    counts       how many pairs each split gets; one of 0 gets no images either
+    by           "time" or "group", what splits are cut along
+    shares       of the images (or groups) for each split
+    split_gap    least gap in time between two splits
+    named        the groups of a split, by name
+    features, hard_share  this share of the negatives is the nearest by these features
+    warp_share   this share of all pairs has a warped image
+    """
+
+    counts: Mapping[str, int]
+    seed: int = 1
+    by: str = "time"
+    shares: Mapping[str, float] = field(default_factory=lambda: dict(zip(SPLITS, (0.6, 0.2, 0.2), strict=True)))
+    split_gap: float = 0.0
+    named: Mapping[str, list[str]] = field(default_factory=dict)
+    at_most: bool = False
+    features: Features | None = None
+    hard_share: float = 0.5
+    warp_share: float = 0.0
+
+    def check(self) -> None:
+        """Raise InputError for numbers that make no plan."""
+        for split, count in self.counts.items():
+            if count < 0 or count % 2:
+                raise InputError(f"--{split}: half of the pairs are positive, so their number is even, not {count}")
+        if not any(self.counts.values()):
+            raise InputError("no pair is asked for; give --train, --val or --test a number")
+        for name in ("hard_share", "warp_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"--{name.replace('_', '-')} is 0 to 1, not {getattr(self, name)}")
+        if self.seed < 0:
+            raise InputError(f"a seed is 0 or more, not {self.seed}")
+        for split, share in self.shares.items():
+            if share < 0 or (self.counts.get(split) and not share):
+                raise InputError(f"the share of {split} is {share:g}; expected a number above 0")
+
+
+def build_lists(
+    source: PairSource,
+    plan: Plan,
+    root: Path,
+    out: Path,
+    say: Callable[[str], None],
+    warn: Callable[[str], None],
+    progress: Progress = silent,
+) -> dict[str, Path]:
+    """Write ``out``/train.txt, val.txt and test.txt as planned, and warped images below ``out``; return the lists.
+
+    ``say`` gets each split's report, ``warn`` each doubt about its labels. Raises InputError before anything is
+    written where a split has not enough pairs.
+    """
+    plan.check()
+    splits = split_images(source, plan)
+    chosen = {}
+    for split, images in splits.items():
+        rng = _stream(plan.seed, split)
+        hard = None
+        if plan.features is not None and len(images):
+            rows = plan.features.rows_of([Path(source.names[image]) for image in images])
+            hard = hard_negatives(source, images, rows, round(plan.counts[split] // 2 * plan.hard_share))
+        chosen[split] = choose_pairs(
+            source, images, plan.counts[split], rng, split, plan.at_most, plan.warp_share, hard
+        )
+    lists = {}
+    for split, pairs in chosen.items():
+        say(report(source, pairs, split, len(splits[split])))
+        for doubt in source.warnings(
+            pairs.first[~pairs.warped], pairs.second[~pairs.warped], pairs.labels[~pairs.warped]
+        ):
+            warn(f"{split}: {doubt}")
+        seconds = [source.names[index] for index in pairs.second]
+        if pairs.warped.any():
+            seconds = _write_warped(source, pairs, seconds, plan.seed, split, root, out, progress)
+        lists[split] = out / f"{split}.txt"
+        listed = zip((source.names[index] for index in pairs.first), seconds, pairs.labels.tolist(), strict=True)
+        write_pair_list(lists[split], listed, _head(source, plan, split, splits[split], pairs, root, out))
+    return lists
+
+
+def split_images(source: PairSource, plan: Plan) -> dict[str, Indices]:
+    """Return the images of each split that is to get pairs; no image is in two of them."""
+    shares = {split: plan.shares[split] for split in SPLITS if plan.counts.get(split)}
+    if plan.by == "time":
+        return split_by_time(source, shares, plan.split_gap)
+    return split_by_group(source, shares, plan.seed, plan.named)
+
+
+def _stream(seed: int, split: str, *more: int) -> np.random.Generator:
+    return np.random.default_rng([seed, 1 + SPLITS.index(split), *more])
+
+
+def _write_warped(
+    source: PairSource,
+    pairs: Pairs,
+    seconds: list[str],
+    seed: int,
+    split: str,
+    root: Path,
+    out: Path,
+    progress: Progress,
+) -> list[str]:
+    """Write the warped images; return the second images' names with theirs in place."""
+    folder = _below(out / f"{split}_warped", root)
+    names = list(seconds)
+    for number in progress(np.flatnonzero(pairs.warped), f"{split}: warping"):
+        original = PurePosixPath(seconds[number])
+        names[number] = f"{folder}/{number:06d}_{original.name}"
+        write_warped(root / original, root / names[number], _stream(seed, split, 1, int(number)))
+    return names
+
+
+def _below(path: Path, root: Path) -> str:
+    try:
+        return path.resolve().relative_to(root.resolve()).as_posix()
+    except ValueError:
+        raise InputError(f"warped images must lie below the root folder {root}; name another --root", path) from None
+
+
+def _head(
+    source: PairSource, plan: Plan, split: str, images: Indices, pairs: Pairs, root: Path, out: Path
+) -> dict[str, str]:
+    """Return the settings that make the list again."""
+    cut = f"time, {plan.split_gap:g} between splits" if plan.by == "time" else source.group_word
+    shares = ", ".join(f"{name} {plan.shares[name]:g}" for name in SPLITS if plan.counts.get(name))
+    head = dict(source.settings)
+    head[ROOT_FOLDER] = Path(os.path.relpath(root.resolve(), out.resolve())).as_posix()
+    head["split"] = f"{split}, by {cut}; shares: {shares}; {len(images)} images"
+    if plan.features is not None:
+        head["hard negatives"] = f"{plan.hard_share:g} of the negatives, by {plan.features.path.name}"
+    if plan.warp_share:
+        head["warped"] = f"{plan.warp_share:g} of the pairs"
+    head["pairs"] = "; ".join(f"{kind}: {number}" for kind, number in kinds(source, pairs).items())
+    head["seed"] = str(plan.seed)
+    return head

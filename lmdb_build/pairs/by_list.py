@@ -1,0 +1,248 @@
+"""Pairs that somebody listed: a mask of loops, equal names in two folders, tables, single images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as SequenceOf
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices
+from lmdb_build.pairs.table import as_number, cell, read_table, relative
+from loopclosure.errors import InputError
+from loopclosure.places.frames import image_paths
+from loopclosure.places.masks import read_truth_matrix
+
+CAMERAS = ("all", "left", "right", "both")
+
+
+class MaskSource:
+    """One run of images and a mask of loops, as of the FAB-MAP sets.
+
+    See :class:`lmdb_build.pairs.choose.PairSource`.
+    """
+
+    group_word = "run"
+
+    def __init__(self, mask: Path, images: Path, root: Path, min_gap: int | None = None, camera: str = "all") -> None:
+        """Read the mask (Q, Q) and the Q images of a folder, in natural order.
+
+        A mask marks no neighbours in time, though they show one place: pairs nearer than ``min_gap`` images are left
+        out; by default nearer than the nearest marked pair. Soft entries of the mask are left out too.
+        ``camera``: in the FAB-MAP sets left and right images alternate. ``left`` and ``right`` take one camera's,
+        ``both`` all of them but no pair of a left with a right one, which the mask marks though the two look to
+        opposite sides; ``all`` is for a run of a single camera.
+        """
+        hard, soft = read_truth_matrix(mask)
+        paths = image_paths(images)
+        if hard.shape != (len(paths), len(paths)):
+            raise InputError(f"is {hard.shape[0]} x {hard.shape[1]}, but {images} has {len(paths)} images", mask)
+        hard, soft = hard | hard.T, soft | soft.T
+        step = 2 if camera in ("left", "right") else 1
+        start = 1 if camera == "right" else 0
+        self._hard, self._soft = hard[start::step, start::step], soft[start::step, start::step]
+        self._sides = np.arange(len(self._hard)) % 2 if camera == "both" else np.zeros(len(self._hard), np.intp)
+        self.names = [relative(path, root) for path in paths[start::step]]
+        count = len(self.names)
+        self.tracks = self.groups = np.zeros(count, np.intp)
+        self.group_names = [images.name]
+        self.stamps = np.arange(count, dtype=np.float64)
+        marked = np.argwhere(np.triu(self._hard, 1))
+        if not len(marked):
+            raise InputError("marks no loop", mask)
+        self._min_gap = int((marked[:, 1] - marked[:, 0]).min()) if min_gap is None else min_gap
+        self._marked = marked
+        self.settings = {
+            "source": f"mask {mask.name} of {images.name}, camera {camera}",
+            "least gap": f"{self._min_gap} images",
+        }
+
+    def judge(self, first: Indices, second: Indices) -> NDArray[np.int8]:
+        """Label pairs (N,) as the mask does."""
+        labels = np.where(self._hard[first, second], POSITIVE, NEGATIVE).astype(np.int8)
+        labels[self._soft[first, second] & ~self._hard[first, second]] = LEFT_OUT
+        labels[np.abs(self.stamps[first] - self.stamps[second]) < self._min_gap] = LEFT_OUT
+        labels[self._sides[first] != self._sides[second]] = LEFT_OUT
+        return labels
+
+    def positives(self) -> Indices:
+        """All marked pairs (K, 2)."""
+        return self._marked
+
+    def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
+        """The gap in images."""
+        return {"gap [images]": np.abs(self.stamps[first] - self.stamps[second])}
+
+    def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
+        """Nothing: the mask is what is known."""
+        return []
+
+
+class PlaceSource:
+    """Images with a group each, and a list of positives: folders with equal names, tables, single images.
+
+    Images of different groups are negatives; two images of one group that are not listed are left out.
+    See :class:`lmdb_build.pairs.choose.PairSource`.
+    """
+
+    def __init__(
+        self,
+        names: list[str],
+        groups: SequenceOf[str],
+        positives: SequenceOf[tuple[int, int]],
+        settings: dict[str, str],
+        group_word: str = "place",
+        min_gap: float = 0.0,
+        sides: SequenceOf[int] | None = None,
+    ) -> None:
+        """Take images, the name of each one's group, and pairs of indices that are the same place.
+
+        min_gap  along the groups in the order given: images of different groups nearer than that are left out, since
+                 neighbouring places look alike
+        sides    where positives always join an image of one side (a folder, a season) with one of the other, so must
+                 negatives, or a net learns to tell sides apart instead of places: pairs of one side are left out
+        """
+        self.names, self.group_word, self.settings, self._min_gap = names, group_word, settings, min_gap
+        self.group_names = list(dict.fromkeys(groups))
+        numbers = {name: number for number, name in enumerate(self.group_names)}
+        self.groups = np.array([numbers[group] for group in groups], np.intp)
+        self.tracks = np.zeros(len(names), np.intp)
+        self.stamps = self.groups.astype(np.float64)
+        self._sides = None if sides is None else np.array(sides)
+        listed = np.sort(np.array(positives, np.intp).reshape(-1, 2), axis=1)
+        self._codes = np.unique(listed @ np.array([len(names), 1]))
+
+    def judge(self, first: Indices, second: Indices) -> NDArray[np.int8]:
+        """Label pairs (N,): listed ones positive, those of different groups negative."""
+        codes = np.minimum(first, second) * len(self.names) + np.maximum(first, second)
+        labels = np.full(len(first), LEFT_OUT, np.int8)
+        apart = np.abs(self.stamps[first] - self.stamps[second]) >= self._min_gap
+        labels[(self.groups[first] != self.groups[second]) & apart] = NEGATIVE
+        if self._sides is not None:
+            labels[self._sides[first] == self._sides[second]] = LEFT_OUT
+        labels[np.isin(codes, self._codes)] = POSITIVE
+        return labels
+
+    def positives(self) -> Indices:
+        """All listed pairs (K, 2)."""
+        return np.column_stack(np.divmod(self._codes, len(self.names)))
+
+    def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
+        """Nothing is measured."""
+        return {}
+
+    def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
+        """Nothing: the list is what is known."""
+        return []
+
+
+def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0) -> PlaceSource:
+    """Pair two folders: images of equal names are the same place (without the ending: a.png and a.jpg are equal).
+
+    Places are in natural order of their names, those nearer than ``min_gap`` to each other make no pair (frames of a
+    traverse). Only images with a partner are taken.
+    """
+    first, second = ({path.stem: path for path in image_paths(folder)} for folder in (folder_a, folder_b))
+    places = [stem for stem in first if stem in second]
+    if not places:
+        raise InputError(f"and {folder_b} have no image of equal name", folder_a)
+    names = [relative(folder[place], root) for folder in (first, second) for place in places]
+    unpaired = len(first) + len(second) - 2 * len(places)
+    settings = {
+        "source": f"equal names in {folder_a.name} and {folder_b.name}, {unpaired} unpaired",
+        "least gap": f"{min_gap} places",
+    }
+    positives = [(number, number + len(places)) for number in range(len(places))]
+    sides = np.repeat([0, 1], len(places)).tolist()
+    return PlaceSource(names, places * 2, positives, settings, min_gap=min_gap, sides=sides)
+
+
+def singles_source(folder: Path, root: Path) -> PlaceSource:
+    """Take each image of a folder (or list) for a place of its own; positives can only be made by warping."""
+    names = [relative(path, root) for path in image_paths(folder)]
+    return PlaceSource(names, names, [], {"source": f"single images of {folder.name}"}, "image")
+
+
+def table_source(table: Path, root: Path, group: str | None = None, index: Path | None = None) -> PlaceSource:
+    """Read a CSV table of positives: two columns with names of images, relative to the table's folder.
+
+    Negatives are images of different groups. A group is what stands in column ``group`` of ``index`` (a table with one
+    column of images, which may name more than the positives), or of the table itself; without ``group``, images that
+    are linked by positives are one place. Where no image stands in both columns (a query and a reference, say),
+    negatives too are made of one image of each.
+    """
+    lines, (column_a, column_b) = read_table(table, 2)
+    pairs = [(row[column_a], row[column_b]) for _, row in lines]
+    group_of: dict[str, str] = {}
+    if index is not None:
+        if group is None:
+            raise InputError("an index needs --group, the column whose values are other places", index)
+        rows, (column,) = read_table(index, 1)
+        group_of = {row[column]: cell(index, number, row, group) for number, row in rows}
+    elif group is not None:
+        for number, row in lines:
+            value = cell(table, number, row, group)
+            for image in (row[column_a], row[column_b]):
+                if group_of.setdefault(image, value) != value:
+                    raise InputError(
+                        f'{image} is of {group} "{group_of[image]}" above, here "{value}"', table, number, 1
+                    )
+    else:
+        group_of = _linked(pairs)
+    for (number, _), pair in zip(lines, pairs, strict=True):
+        for image in pair:
+            if image not in group_of:
+                raise InputError(f'image "{image}" is not in {index}', table, number, 1)
+    numbers = {image: number for number, image in enumerate(group_of)}
+    names = [relative(table.parent / image, root) for image in group_of]
+    settings = {"source": f"positives of {table.name}; negatives of different {group or 'places'}"}
+    positives = [(numbers[a], numbers[b]) for a, b in pairs]
+    of_second = {b for _, b in pairs}
+    two_sided = index is None and not of_second & {a for a, _ in pairs}
+    sides = [int(image in of_second) for image in group_of] if two_sided else None
+    return PlaceSource(names, list(group_of.values()), positives, settings, group or "place", sides=sides)
+
+
+def index_source(index: Path, root: Path, group: str, track: str, time: str, max_gap: float) -> PlaceSource:
+    """Read a CSV table of frames: neighbours in time are positives, frames of different groups negatives.
+
+    Positives are two frames with the same value in column ``track`` whose numbers in column ``time`` differ by at most
+    ``max_gap``.
+    """
+    rows, (column,) = read_table(index, 1)
+    tracks: dict[str, list[tuple[float, int]]] = {}
+    for number, (line, row) in enumerate(rows):
+        moment = as_number(index, line, row, time)
+        tracks.setdefault(cell(index, line, row, track), []).append((moment, number))
+    positives = []
+    for frames in tracks.values():
+        frames.sort()
+        for at, (moment, number) in enumerate(frames):
+            for later, other in frames[at + 1 :]:
+                if later - moment > max_gap:
+                    break
+                positives.append((number, other))
+    names = [relative(index.parent / row[column], root) for _, row in rows]
+    groups = [cell(index, line, row, group) for line, row in rows]
+    settings = {
+        "source": f"frames of {index.name}; negatives of different {group}",
+        "positive": f"at most {max_gap:g} in {time} apart, of one {track}",
+    }
+    return PlaceSource(names, groups, positives, settings, group)
+
+
+def _linked(pairs: list[tuple[str, str]]) -> dict[str, str]:
+    """Name each image's place by one image of those that it is linked with, over any number of pairs."""
+    parent: dict[str, str] = {}
+
+    def root_of(image: str) -> str:
+        parent.setdefault(image, image)
+        while parent[image] != image:
+            parent[image] = parent[parent[image]]
+            image = parent[image]
+        return image
+
+    for a, b in pairs:
+        parent[root_of(b)] = root_of(a)
+    return {image: root_of(image) for image in list(parent)}

@@ -1,0 +1,194 @@
+"""Pairs of posed frames: the paper's rule, and what is known about which sequences show one scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices
+from loopclosure.errors import InputError
+from loopclosure.places.same_place import (
+    MAX_ANGLE_DEG,
+    MAX_DISTANCE_M,
+    angles_deg,
+    distances_m,
+    same_place,
+    view_angles_deg,
+)
+from loopclosure.places.trajectory import Poses, Sequence
+
+# How the images of two sequences relate.
+SAME_SEQUENCE, ONE_FRAME, ONE_SCENE, OTHER_SCENE = range(4)
+NEGATIVES = ("same_sequence", "cross_sequence", "both")
+
+NEIGHBOUR_S = 3.0  # images less than this apart are neighbours in time, hardly two visits of a place
+NEAR_FACTOR = 2.0  # a negative pair within this factor of the rule's limits shows much the same
+TOO_MANY = 0.2
+
+
+@dataclass(frozen=True)
+class PoseRule:
+    """How posed pairs are labelled; the defaults are the paper's.
+
+    max_distance_m, max_angle_deg  nearer and less turned than these: the same place
+    min_gap_s          two images of one sequence nearer in time make no pair
+    negatives          from the ``same_sequence``, from ``cross_sequence`` pairs, or ``both``
+    clear_distance_m, clear_view_angle_deg  if given, a pair that shares a frame of reference is negative only if it
+                       is so far apart, or its viewing axes are so far turned; what lies between is left out
+    """
+
+    max_distance_m: float = MAX_DISTANCE_M
+    max_angle_deg: float = MAX_ANGLE_DEG
+    min_gap_s: float = 0.0
+    negatives: str = "both"
+    clear_distance_m: float | None = None
+    clear_view_angle_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """What is known about which sequences show the same scene, by their names.
+
+    same_scene   sets of sequences of one scene without a common frame of reference: pairs across them are left out
+    same_frame   sets of sequences of one scene whose poses share a frame: pairs across them are judged by pose
+    all_others_differ  whatever is in no common set shows different scenes: nothing to warn about
+    """
+
+    same_scene: tuple[tuple[str, ...], ...] = ()
+    same_frame: tuple[tuple[str, ...], ...] = ()
+    all_others_differ: bool = False
+
+    def relations(self, names: SequenceOf[str]) -> NDArray[np.int8]:
+        """Return (S, S): how each two of the sequences relate. Raises InputError for a name that is not among them."""
+        table = np.full((len(names), len(names)), OTHER_SCENE, np.int8)
+        for sets, relation in ((self.same_scene, ONE_SCENE), (self.same_frame, ONE_FRAME)):
+            for members in sets:
+                for name in members:
+                    if name not in names:
+                        raise InputError(f'no sequence is called "{name}"; there are: {", ".join(names)}')
+                at = [names.index(name) for name in members]
+                table[np.ix_(at, at)] = relation
+        np.fill_diagonal(table, SAME_SEQUENCE)
+        return table
+
+
+class PoseSource:
+    """Sequences with poses: the paper's rule. See :class:`lmdb_build.pairs.choose.PairSource`."""
+
+    group_word = "sequence"
+
+    def __init__(
+        self,
+        sequences: SequenceOf[Sequence],
+        folders: SequenceOf[str],
+        rule: PoseRule = PoseRule(),
+        scenes: Scenes = Scenes(),
+    ) -> None:
+        """Take the sequences' frames together; ``folders`` are the sequences' folders, relative to the list's root."""
+        self.group_names = [sequence.name for sequence in sequences]
+        for name in self.group_names:
+            if self.group_names.count(name) > 1:
+                raise InputError(f'two sequences are called "{name}"; rename one of the folders')
+        self.names = [
+            f"{folder}/{frame.path}" if folder not in ("", ".") else frame.path
+            for folder, sequence in zip(folders, sequences, strict=True)
+            for frame in sequence.frames
+        ]
+        self.groups = self.tracks = np.repeat(np.arange(len(sequences)), [len(sequence) for sequence in sequences])
+        self.stamps = np.concatenate([sequence.stamps for sequence in sequences])
+        self.poses = Poses(
+            np.concatenate([sequence.positions for sequence in sequences]),
+            np.concatenate([sequence.quaternions for sequence in sequences]),
+        )
+        self.rule, self.scenes = rule, scenes
+        self._relations = scenes.relations(self.group_names)
+        clear = []
+        if rule.clear_distance_m is not None:
+            clear.append(f"{rule.clear_distance_m:g} m apart or more")
+        if rule.clear_view_angle_deg is not None:
+            clear.append(f"viewing axes {rule.clear_view_angle_deg:g} deg apart or more")
+        self.settings = {
+            "source": f"poses of {', '.join(self.group_names)}",
+            "positive": f"less than {rule.max_distance_m:g} m and less than {rule.max_angle_deg:g} deg apart",
+            "negative": f"{' or '.join(clear) or 'the others'}; {rule.negatives}",
+            "least time gap": f"{rule.min_gap_s:g} s",
+        }
+        for words, sets in (("one scene", scenes.same_scene), ("one frame of reference", scenes.same_frame)):
+            if sets:
+                self.settings[words] = "; ".join(" ".join(members) for members in sets)
+
+    def judge(self, first: Indices, second: Indices) -> NDArray[np.int8]:
+        """Label pairs (N,) by the rule."""
+        rule = self.rule
+        relation = self._relations[self.groups[first], self.groups[second]]
+        a, b = self.poses[first], self.poses[second]
+        comparable = relation <= ONE_FRAME
+        same = same_place(a, b, rule.max_distance_m, rule.max_angle_deg)
+        apart = ~same
+        if rule.clear_distance_m is not None or rule.clear_view_angle_deg is not None:
+            clear = np.zeros(len(first), bool)
+            if rule.clear_distance_m is not None:
+                clear |= distances_m(a, b) >= rule.clear_distance_m
+            if rule.clear_view_angle_deg is not None:
+                clear |= view_angles_deg(a, b) >= rule.clear_view_angle_deg
+            apart &= clear
+        wanted_origin = (relation == SAME_SEQUENCE) if rule.negatives == "same_sequence" else relation > SAME_SEQUENCE
+        if rule.negatives == "both":
+            wanted_origin = np.ones(len(first), bool)
+        labels = np.full(len(first), LEFT_OUT, np.int8)
+        labels[comparable & same] = POSITIVE
+        labels[((comparable & apart) | (relation == OTHER_SCENE)) & wanted_origin] = NEGATIVE
+        neighbours = np.abs(self.stamps[first] - self.stamps[second]) < rule.min_gap_s
+        labels[(relation == SAME_SEQUENCE) & neighbours] = LEFT_OUT
+        return labels
+
+    def positives(self) -> None:
+        """Positive pairs are not listed: they have to be searched."""
+        return None
+
+    def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
+        """Distance and angle where poses can be compared, time gap within a sequence."""
+        relation = self._relations[self.groups[first], self.groups[second]]
+        a, b = self.poses[first], self.poses[second]
+        comparable = relation <= ONE_FRAME
+        return {
+            "distance [m]": np.where(comparable, distances_m(a, b), np.nan),
+            "angle [deg]": np.where(comparable, angles_deg(a, b), np.nan),
+            "time gap [s]": np.where(
+                relation == SAME_SEQUENCE, np.abs(self.stamps[first] - self.stamps[second]), np.nan
+            ),
+        }
+
+    def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
+        """Say what may make labels false: undeclared scenes, neighbours as positives, negatives near the limits."""
+        found = []
+        relation = self._relations[self.groups[first], self.groups[second]]
+        across = (labels == NEGATIVE) & (relation == OTHER_SCENE)
+        if across.any() and not self.scenes.all_others_differ:
+            found.append(
+                f"{across.sum()} negatives are of different sequences that nobody said show different scenes; if they "
+                "show one room (as all of TUM's freiburg1 do), these labels are false: declare --same-scene or "
+                "--same-frame, or --different-scenes if there is nothing to declare"
+            )
+        measures = self.measures(first, second)
+        neighbours = np.mean(measures["time gap [s]"][labels == POSITIVE] < NEIGHBOUR_S) if POSITIVE in labels else 0.0
+        if neighbours > 0.5:
+            found.append(
+                f"{neighbours:.0%} of the positives are images less than {NEIGHBOUR_S:g} s apart, hardly two visits "
+                "of a place: --min-gap asks for more"
+            )
+        negative = (labels == NEGATIVE) & (relation <= ONE_FRAME)
+        near = (
+            (measures["distance [m]"] < NEAR_FACTOR * self.rule.max_distance_m)
+            & (measures["angle [deg]"] < NEAR_FACTOR * self.rule.max_angle_deg)
+            & negative
+        )
+        if negative.any() and near.sum() > TOO_MANY * negative.sum():
+            found.append(
+                f"{near.sum() / negative.sum():.0%} of the negatives judged by pose are within twice the limits of the "
+                "rule and show much the same: --clear-view-angle or --clear-distance leaves such pairs out"
+            )
+        return found

@@ -1,0 +1,1 @@
+"""A synthetic walk through a house, drawn from a seed."""

@@ -1,0 +1,202 @@
+"""A made-up walk through textured rooms, in the layout of the TUM RGB-D benchmark.
+
+The quick start and the tests have no data set to fetch: this is theirs. The camera is carried several times round a
+house (:mod:`lmdb_build.walk.house`), so that places are really seen again: each lap at another time of day, a little
+beside the last one, the head turned a little otherwise. Poses are exact and the geometry is true, so the paper's rule
+of the same place means here what it means with real images. Every picture follows from the seed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdb_build.walk.house import House, build_house
+from lmdb_build.walk.render import Camera, Light, Renderer
+from lmdb_build.walk.textures import Image
+from loopclosure.errors import InputError
+from loopclosure.places.trajectory import (
+    Frame,
+    Poses,
+    Trajectory,
+    quaternions_from_matrices,
+    rotation_matrices,
+    write_groundtruth,
+    write_rgb_list,
+)
+
+Array = NDArray[np.float64]
+
+SPEED_M_S = 1.2
+POSES_PER_IMAGE = 10
+EYE_HEIGHT_M = 1.5
+# On laps after the first: at most so far beside the way, and so much turned away from it.
+SIDE_STEP_M, TURN_DEG = 0.25, 5.0
+GLANCE_DEG = 22.0  # the head turns from side to side, in the same places on every lap
+NOISE = 3.0  # standard deviation of the sensor's noise, grey levels
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A walk to be taken: ``frames`` pictures of ``width`` x ``height`` pixels over ``laps`` rounds of a house,
+    the first at ``start_s`` seconds."""
+
+    frames: int = 400
+    width: int = 320
+    height: int = 240
+    laps: int = 3
+    rooms: int = 4
+    seed: int = 1
+    start_s: float = 1000.0
+
+    def check(self) -> None:
+        """Raise InputError for numbers that make no walk."""
+        limits = {"frames": (2, 1_000_000), "width": (32, 4096), "height": (32, 4096), "laps": (1, 1000)}
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"a walk's {name} must be {low} to {high}, not {getattr(self, name)}")
+        if not 4 <= self.rooms <= 40 or self.rooms % 2:
+            raise InputError(f"a house has an even number of rooms, 4 to 40, not {self.rooms}")
+        if self.seed < 0:
+            raise InputError(f"a seed is 0 or more, not {self.seed}")
+
+    @property
+    def camera(self) -> Camera:
+        """The camera, with the field of view of the benchmark's (525 pixels at a width of 640)."""
+        return Camera(self.width, self.height, 525 / 640 * self.width)
+
+
+def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
+    """Render ``walk`` into ``folder`` (rgb/, rgb.txt, groundtruth.txt, calibration.txt), yielding each picture's path.
+
+    Raises InputError where the numbers make no walk, or the folder holds a sequence already.
+    """
+    walk.check()
+    folder = Path(folder)
+    if (folder / "rgb.txt").exists():
+        raise InputError("holds a sequence already; name another folder or remove this one", folder)
+    (folder / "rgb").mkdir(parents=True, exist_ok=True)
+    house = build_house(walk.seed, walk.rooms)
+    carrier = _Carrier(house, walk)
+    step_s = float(carrier.duration_s) / walk.frames
+    times = step_s * np.arange(walk.frames, dtype=np.float64)
+    # Poses come faster than pictures and never at the same moment, as with motion capture.
+    pose_times = step_s * (np.arange(-POSES_PER_IMAGE, (walk.frames + 1) * POSES_PER_IMAGE) + 0.3) / POSES_PER_IMAGE
+    poses = carrier.poses(pose_times)
+    frames = [Frame(walk.start_s + time, f"rgb/{walk.start_s + time:.6f}.jpg") for time in times]
+    for frame, picture in zip(frames, _pictures(house, walk, carrier, times), strict=True):
+        path = folder / frame.path
+        if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 95]):
+            raise InputError("cannot be written", path)
+        yield path
+    camera = walk.camera
+    calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "
+    calibration += f"{camera.centre[0]:g} {camera.centre[1]:g} {camera.width} {camera.height}\n"
+    (folder / "calibration.txt").write_text(calibration, encoding="utf-8")
+    write_groundtruth(
+        folder / "groundtruth.txt", Trajectory(walk.start_s + pose_times, poses.positions, poses.quaternions)
+    )
+    write_rgb_list(folder / "rgb.txt", frames)  # last: with it the sequence is whole
+
+
+def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iterator[Image]:
+    rng = np.random.default_rng([walk.seed, 4])
+    noise = rng.normal(0, NOISE, (walk.height + 64, walk.width + 64, 3)).astype(np.int8)
+    poses = carrier.poses(times)
+    rotations = rotation_matrices(poses.quaternions)
+    laps = np.minimum(carrier.walked_m(times) // house.way_length_m, walk.laps - 1).astype(int)
+    renderer: Renderer | None = None
+    for index, (position, rotation) in enumerate(zip(poses.positions, rotations, strict=True)):
+        if renderer is None:
+            renderer = Renderer(house, walk.camera, lap_light(walk.seed, laps[index], walk.rooms))
+        elif laps[index] != laps[index - 1]:
+            renderer.relight(lap_light(walk.seed, laps[index], walk.rooms))
+        picture = cv2.GaussianBlur(renderer.draw(position, rotation), (3, 3), 0.5)
+        y, x = rng.integers(0, 64, 2)
+        yield cv2.add(picture, noise[y : y + walk.height, x : x + walk.width], dtype=cv2.CV_8U)
+
+
+def lap_light(seed: int, lap: int, rooms: int) -> Light:
+    """Return how a lap is lit: the first by day, later ones at random hours, some lamps on."""
+    rng = np.random.default_rng([seed, 3, lap])
+    day = 0.9 if lap == 0 else rng.uniform(0.25, 1.1)
+    warmth = rng.uniform(-0.12, 0.12)  # blue sky or evening sun
+    daylight = day * np.array([1 - warmth, 1, 1 + warmth])
+    on = rng.uniform(size=rooms) < 0.4 + 0.5 * (day < 0.6)
+    lamps = np.where(on, rng.uniform(0.5, 1.0, rooms), 0.05)[:, None] * np.array([0.78, 0.94, 1.05])
+    return Light(0.3 * daylight + 0.22, daylight, lamps)
+
+
+class _Carrier:
+    """Who carries the camera: where it is and where it looks at any time."""
+
+    def __init__(self, house: House, walk: Walk) -> None:
+        self.house = house
+        self.duration_s = walk.laps * house.way_length_m / SPEED_M_S
+        rng = np.random.default_rng([walk.seed, 5])
+        self._phases = rng.uniform(0, 2 * np.pi, 6)
+        self._glances = int(rng.integers(7, 12))
+        step = np.roll(house.way, -1, axis=0) - np.roll(house.way, 1, axis=0)
+        self._yaw = _smooth_angles(np.arctan2(step[:, 1], step[:, 0]), 0.35 / house.step_m)
+
+    def walked_m(self, times: Array) -> Array:
+        """Path length (N,) walked at ``times`` (N,), faster and slower by turns."""
+        sway = 0.3 * np.sin(2 * np.pi * times / 11 + self._phases[0]) - 0.3 * np.sin(self._phases[0])
+        return np.clip(SPEED_M_S * times + sway, 0, None)
+
+    def poses(self, times: Array) -> Poses:
+        """Return the camera's poses at ``times`` (N,) in seconds."""
+        walked = self.walked_m(times)
+        lap_m = self.house.way_length_m
+        at = walked / self.house.step_m % len(self.house.way)
+        x, y = _periodic(at, self.house.way[:, 0]), _periodic(at, self.house.way[:, 1])
+        # The way's direction turns round once or not at all in a lap: interpolate it as a vector.
+        along = np.arctan2(_periodic(at, np.sin(self._yaw)), _periodic(at, np.cos(self._yaw)))
+        later = np.clip(walked / lap_m - 0.9, 0, 0.1) / 0.1  # 0 on the first lap, 1 on the others
+        side = later * SIDE_STEP_M * _sway(walked, (7.3, 17.1), self._phases[1:3])
+        turn = later * TURN_DEG * _sway(walked, (9.7, 23.9), self._phases[3:5])
+        glance = GLANCE_DEG * np.sin(2 * np.pi * self._glances * walked / lap_m)
+        yaw = along + np.radians(turn + glance)
+        stride = 2 * np.pi * times * 1.8  # 1.8 steps a second
+        positions = np.column_stack(
+            [x - side * np.sin(along), y + side * np.cos(along), EYE_HEIGHT_M + 0.02 * np.sin(stride)]
+        )
+        roll, pitch = np.radians(0.8 * np.sin(stride / 2)), np.radians(6 + 0.6 * np.sin(stride + 1))
+        return Poses(positions, quaternions_from_matrices(_look(yaw, pitch, roll)))
+
+
+def _look(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """Camera-to-world rotations (N, 3, 3): ``yaw`` from +x towards +y, ``pitch`` downwards, ``roll`` clockwise."""
+    cos, sin, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
+    ahead = np.stack([cos * np.cos(pitch), sin * np.cos(pitch), -np.sin(pitch)], axis=-1)
+    right = np.stack([sin, -cos, zero], axis=-1)
+    down = np.cross(ahead, right)
+    cos_roll, sin_roll = np.cos(roll)[:, None], np.sin(roll)[:, None]
+    return np.stack([cos_roll * right + sin_roll * down, cos_roll * down - sin_roll * right, ahead], axis=-1)
+
+
+def _sway(walked: Array, periods_m: tuple[float, float], phases: Array) -> Array:
+    """A wandering between -1 and 1 whose periods fit no lap, so that each lap differs."""
+    return 0.6 * np.sin(2 * np.pi * walked / periods_m[0] + phases[0]) + 0.4 * np.sin(
+        2 * np.pi * walked / periods_m[1] + phases[1]
+    )
+
+
+def _periodic(at: Array, values: Array) -> Array:
+    """Interpolate a closed sequence of ``values`` (P,) at fractional indices (N,)."""
+    return np.interp(at, np.arange(len(values) + 1), np.append(values, values[0]))
+
+
+def _smooth_angles(angles: Array, sigma: float) -> Array:
+    """Smooth a closed sequence of directions (P,) in radians with a Gaussian of ``sigma`` samples."""
+    reach = np.arange(-int(4 * sigma), int(4 * sigma) + 1)
+    kernel = np.exp(-0.5 * (reach / sigma) ** 2)
+    vector = np.exp(1j * angles)
+    rolled = np.stack([np.roll(vector, offset) for offset in reach])
+    return np.angle(kernel @ rolled)

@@ -1,1 +1,0 @@
-"""The baselines that a learned descriptor has to beat: bag of words, FAB-MAP, grey thumbnails."""

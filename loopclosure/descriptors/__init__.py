@@ -1,0 +1,1 @@
+"""Descriptors of images: the files they come in, how alike two are, whitening."""

@@ -1,0 +1,240 @@
+"""Descriptors in, similarity out: whole matrices for the eye, the best few of each frame for everything longer.
+
+Scores are higher for what is more alike: the cosine similarity, or minus the Euclidean distance, which is what
+ContrastiveLoss trains. Products are taken in the precision of the descriptors. Euclidean distances come from
+|a|^2 + |b|^2 - 2 a.b about the references' mean, whose rounding is some eps * (|a|^2 + |b|^2) in the square: 1e-3 of
+the norm in float32, which only concerns frames that are almost the same.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.errors import InputError
+from loopclosure.places.truth import Exclusion
+from loopclosure.progress import Progress, silent
+
+METRICS = ("euclidean", "cosine")
+# 1024 x 16384 scores in float32 are 64 MiB, whatever the length of the sequence.
+BLOCK_ROWS = 1024
+BLOCK_COLUMNS = 16384
+
+
+@dataclass(frozen=True)
+class TopK:
+    """The best references of each query, best first; equal scores in the order of the references.
+
+    indices  (Q, k) int64, -1 where a query has fewer than k candidates
+    scores   (Q, k), higher = more alike, -inf there
+    """
+
+    indices: np.ndarray
+    scores: np.ndarray
+
+
+@dataclass(frozen=True)
+class Descriptors:
+    """Descriptors made ready for scoring in one metric.
+
+    rows     (N, D): of unit length for cosine (a descriptor of zeros stays one, alike to nothing); about ``mean`` for
+             Euclidean
+    squares  (N,) their squared lengths
+    """
+
+    metric: str
+    rows: np.ndarray
+    squares: np.ndarray
+    mean: np.ndarray
+
+    def scores(self, queries: Descriptors, rows: slice, columns: slice) -> np.ndarray:
+        """Return the scores of some of ``queries`` (rows) against some of these (columns)."""
+        products = queries.rows[rows] @ self.rows[columns].T
+        if self.metric == "cosine":
+            return products
+        products *= -2
+        products += queries.squares[rows, None]
+        products += self.squares[columns]
+        np.maximum(products, 0, out=products)
+        np.sqrt(products, out=products)
+        np.negative(products, out=products)
+        return products
+
+
+def prepare(features: np.ndarray, metric: str = "euclidean", mean: np.ndarray | None = None) -> Descriptors:
+    """Make descriptors (N, D) ready; ``mean`` (D,) is that of the references, their own by default.
+
+    Raises InputError for another shape, an unknown metric, a NaN or an infinity.
+    """
+    check_metric(metric)
+    features = np.asarray(features)
+    if features.ndim != 2 or features.shape[1] == 0:
+        raise InputError(f"descriptors have shape {features.shape}; expected (frames, dimensions)")
+    if features.dtype != np.float64:
+        features = features.astype(np.float32)
+    finite = np.all(np.isfinite(features), axis=1)
+    if not np.all(finite):
+        raise InputError(
+            f"the descriptor of frame {np.argmin(finite)} (from 0) has a NaN or an infinity; did the net diverge?"
+        )
+    center: np.ndarray = np.zeros(features.shape[1], features.dtype)
+    if mean is not None:
+        center = np.asarray(mean, features.dtype)
+    elif metric == "euclidean" and len(features):
+        center = features.mean(axis=0)
+    if len(center) != features.shape[1]:
+        raise InputError(
+            f"queries have {features.shape[1]} dimensions, references {len(center)}; both must come from the same net"
+        )
+    if metric == "cosine":
+        norms = np.linalg.norm(features, axis=1, keepdims=True)
+        rows = np.divide(features, norms, out=np.zeros_like(features), where=norms > 0)
+    else:
+        rows = features - center
+    return Descriptors(metric, rows, np.einsum("nd,nd->n", rows, rows), center)
+
+
+def check_metric(metric: str) -> None:
+    """Refuse a metric that is not one of METRICS."""
+    if metric not in METRICS:
+        raise InputError(f'unknown metric "{metric}"; known: {", ".join(METRICS)}')
+
+
+def similarity_matrix(
+    queries: np.ndarray, references: np.ndarray | None = None, metric: str = "euclidean", views: int = 1
+) -> np.ndarray:
+    """Return all scores (Q, R) at once; ``references`` None compares ``queries`` (Q, D) with themselves.
+
+    Where a descriptor is that of several ``views``, one after the other, two images are as alike as the two of their
+    views that are most alike.
+
+    100,000 frames would need 40 GB: take :func:`similarity_blocks` or :func:`top_k` for those.
+    """
+    if views == 1:
+        query, reference = _pair(queries, references, metric)
+        return reference.scores(query, slice(None), slice(None))
+    parts = [np.split(rows, views, axis=1) for rows in (queries, queries if references is None else references)]
+    return np.max([similarity_matrix(query, reference, metric) for query, reference in product(*parts)], axis=0)
+
+
+def similarity_blocks(
+    queries: np.ndarray, references: np.ndarray | None = None, metric: str = "euclidean", rows: int = BLOCK_ROWS
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield (first query, scores (rows, R)) from the first query to the last; the last block may have fewer rows."""
+    query, reference = _pair(queries, references, metric)
+    for start in range(0, len(query.rows), rows):
+        yield start, reference.scores(query, slice(start, start + rows), slice(None))
+
+
+def top_k(
+    queries: np.ndarray,
+    references: np.ndarray | None = None,
+    k: int = 10,
+    metric: str = "euclidean",
+    exclusion: Exclusion | None = None,
+    stamps: np.ndarray | None = None,
+) -> TopK:
+    """Find the ``k`` best references of each query, holding only a block of scores at any time.
+
+    ``references`` None searches one sequence for its own loops: frame i against the earlier frames j < i, less what
+    ``exclusion`` leaves out (by ``stamps`` (Q,) in seconds, where it speaks of seconds). With references every pair
+    is a candidate.
+    """
+    if k < 1:
+        raise InputError(f"the best {k} were asked for; expected 1 or more")
+    alone = references is None
+    if exclusion is not None and not alone:
+        raise InputError("an exclusion concerns one sequence; with references of their own nothing is near in time")
+    exclusion = exclusion or Exclusion()
+    query, reference = _pair(queries, references, metric)
+    k = min(k, len(reference.rows))
+    indices = np.full((len(query.rows), k), -1, dtype=np.int64)
+    scores = np.full((len(query.rows), k), -np.inf, dtype=query.rows.dtype)
+    for top in range(0, len(query.rows), BLOCK_ROWS):
+        rows = slice(top, min(top + BLOCK_ROWS, len(query.rows)))
+        # Frames after the last query of the block are no candidates of any of its queries.
+        end = min(rows.stop, len(reference.rows)) if alone else len(reference.rows)
+        for left in range(0, end, BLOCK_COLUMNS):
+            columns = slice(left, min(left + BLOCK_COLUMNS, end))
+            block = reference.scores(query, rows, columns)
+            if alone:
+                _mask_not_earlier(block, rows, columns, exclusion, stamps)
+            _merge(indices[rows], scores[rows], block, left)
+    return TopK(indices, scores)
+
+
+def write_similarity(
+    path: str | Path,
+    queries: np.ndarray,
+    references: np.ndarray | None = None,
+    metric: str = "euclidean",
+    progress: Progress = silent,
+) -> tuple[int, int]:
+    """Write all scores (Q, R) as an .npy of float32, block by block, whatever their number; return its shape."""
+    shape = (len(queries), len(queries) if references is None else len(references))
+    try:
+        matrix = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+    blocks = similarity_blocks(queries, references, metric)
+    for start, block in progress(blocks, "similarity", -(-shape[0] // BLOCK_ROWS)):
+        matrix[start : start + len(block)] = block
+    matrix.flush()
+    return shape
+
+
+def write_top_k(path: str | Path, found: TopK) -> None:
+    """Write the best references of each query as CSV: query, rank from 1, reference, score."""
+    try:
+        with Path(path).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["query", "rank", "reference", "score"])
+            for query, (indices, scores) in enumerate(zip(found.indices, found.scores, strict=True)):
+                for rank, (reference, score) in enumerate(zip(indices, scores, strict=True), start=1):
+                    if reference >= 0:
+                        writer.writerow([query, rank, reference, f"{score:.9g}"])
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+
+
+def _pair(queries: np.ndarray, references: np.ndarray | None, metric: str) -> tuple[Descriptors, Descriptors]:
+    if references is None:
+        both = prepare(queries, metric)
+        return both, both
+    reference = prepare(references, metric)
+    return prepare(queries, metric, reference.mean), reference
+
+
+def _mask_not_earlier(
+    block: np.ndarray, rows: slice, columns: slice, exclusion: Exclusion, stamps: np.ndarray | None
+) -> None:
+    """Set to -inf, in place, what is excluded or not earlier than its query."""
+    queries, references = np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop)
+    query_stamps, reference_stamps = (None, None) if stamps is None else (stamps[rows], stamps[columns])
+    block[exclusion.excludes(queries, references, query_stamps, reference_stamps)] = -np.inf
+    block[references[None, :] >= queries[:, None]] = -np.inf
+
+
+def _merge(indices: np.ndarray, scores: np.ndarray, block: np.ndarray, left: int) -> None:
+    """Merge a block of scores, whose first column is reference ``left``, into the best so far, in place."""
+    k = indices.shape[1]
+    if block.shape[1] > k:
+        chosen = np.argpartition(block, block.shape[1] - k, axis=1)[:, -k:]
+        # Of equal scores at the border argpartition takes any; the earliest are wanted, so that results repeat.
+        border = np.take_along_axis(block, chosen, axis=1).min(axis=1)
+        tied = (np.count_nonzero(block >= border[:, None], axis=1) > k) & ~np.isneginf(border)
+        for row in np.flatnonzero(tied):
+            chosen[row] = np.argsort(-block[row], kind="stable")[:k]
+    else:
+        chosen = np.broadcast_to(np.arange(block.shape[1]), block.shape)
+    candidates = np.concatenate([indices, chosen + left], axis=1)
+    values = np.concatenate([scores, np.take_along_axis(block, chosen, axis=1)], axis=1)
+    candidates[np.isneginf(values)] = -1
+    order = np.lexsort((candidates, -values), axis=1)[:, :k]
+    indices[:] = np.take_along_axis(candidates, order, axis=1)
+    scores[:] = np.take_along_axis(values, order, axis=1)

@@ -1,0 +1,378 @@
+"""Loop closure frame by frame, for use inside a running robot.
+
+    detector = LoopDetector(describe, exclude_recent=50, threshold=-0.4, consistency=3)
+    for image in camera:
+        result = detector.add(image)
+        if result.accepted is not None:
+            ...  # this frame shows the same place as frame result.accepted
+
+The search is exact: a product of all earlier descriptors with the new one. Its cost grows with the number of frames,
+all else stays: see :meth:`LoopDetector.add`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from loopclosure.descriptors.similarity import check_metric
+from loopclosure.detector.verification import GeometricCheck, LocalFeatures
+from loopclosure.errors import InputError
+from loopclosure.precision_recall import PrecisionRecall, curve
+
+Describe = Callable[[np.ndarray], np.ndarray]
+FIRST_CAPACITY = 256  # frames; doubled whenever it is full
+FORMAT = 1  # of the file that save writes
+
+
+@dataclass(frozen=True)
+class LoopResult:
+    """What adding one frame found.
+
+    query_id    the frame's number, from 0
+    candidates  (id, score) of the best earlier frames, best first, higher = more alike
+    accepted    the earlier frame that this one closes a loop with, or None
+    verdict     why: "accepted", "no candidate", "no threshold", "below threshold", "not consistent", "not verified"
+    score       of the accepted frame, or of the best candidate; -inf without one
+    inliers     point matches of the accepted candidate, or the most of any tried; None where none was tried
+    stamp       seconds, as given
+    """
+
+    query_id: int
+    candidates: list[tuple[int, float]]
+    accepted: int | None
+    verdict: str
+    score: float
+    inliers: int | None = None
+    stamp: float | None = None
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """How loops are decided.
+
+    metric              "euclidean" (score = minus the distance) or "cosine"
+    views               a descriptor is that of so many views of the image, one after the other; the score of two frames
+                        is that of their two views that are most alike
+    exclude_recent      frames i - exclude_recent .. i - 1 are no candidates of frame i
+    exclude_seconds     nor are frames less than so many seconds old
+    top_k               candidates looked at
+    threshold           a candidate needs score >= threshold; None: nothing is accepted (see ``calibrate``)
+    consistency         in each of so many frames before, a candidate must have led to this one: one within
+                        ``consistency_window`` frames of the next one's, so that places follow one another in time
+    consistency_window
+    """
+
+    metric: str = "euclidean"
+    views: int = 1
+    exclude_recent: int = 50
+    exclude_seconds: float = 0.0
+    top_k: int = 5
+    threshold: float | None = None
+    consistency: int = 0
+    consistency_window: int = 5
+
+    def __post_init__(self) -> None:
+        check_metric(self.metric)
+        for name, least in (
+            ("views", 1),
+            ("exclude_recent", 0),
+            ("exclude_seconds", 0),
+            ("top_k", 1),
+            ("consistency", 0),
+        ):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} is {getattr(self, name)}; expected {least} or more")
+        if self.consistency_window < 0:
+            raise InputError(f"consistency_window is {self.consistency_window}; expected 0 or more")
+
+
+@dataclass
+class _Frames:
+    """All frames so far, in arrays that double when they are full: ``count`` of the rows (views, D) are in use."""
+
+    count: int = 0
+    rows: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0), np.float32))
+    squares: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    stamps: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    local: list[LocalFeatures] = field(default_factory=list)
+
+    def append(self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None) -> None:
+        if self.count == 0:
+            self.rows = np.zeros((0, *row.shape), np.float32)
+            self.squares = np.zeros((0, len(row)), np.float32)
+        if self.count == len(self.rows):
+            capacity = max(FIRST_CAPACITY, 2 * len(self.rows))
+            for name in ("rows", "squares", "stamps", "poses"):
+                old = getattr(self, name)
+                new = np.empty((capacity, *old.shape[1:]), old.dtype)
+                new[: self.count] = old[: self.count]
+                setattr(self, name, new)
+        self.rows[self.count] = row
+        self.squares[self.count] = np.square(row).sum(1)
+        self.stamps[self.count] = np.nan if stamp is None else stamp
+        self.poses[self.count] = np.nan if pose is None else pose
+        self.count += 1
+
+
+class LoopDetector:
+    """Finds loops frame by frame; ``loops`` holds the results that were accepted, in order."""
+
+    def __init__(
+        self,
+        describe: Describe | None = None,
+        settings: DetectorSettings | None = None,
+        *,
+        check: GeometricCheck | None = None,
+        **changes: Any,
+    ) -> None:
+        """Make an empty detector.
+
+        describe  image (H, W, 3) uint8 BGR -> descriptor (D,), the same D each time, or (views D,); None: use
+                  ``add_descriptor``
+        settings  or its fields by name: ``LoopDetector(describe, exclude_recent=50, top_k=5, threshold=-0.4)``
+        check     verifies candidates by their geometry, best first; None: none is verified
+        """
+        given = asdict(settings or DetectorSettings())
+        unknown = set(changes) - set(given)
+        if unknown:
+            raise TypeError(f"LoopDetector has no setting {', '.join(sorted(unknown))}; known: {', '.join(given)}")
+        self.describe = describe
+        self.settings = DetectorSettings(**{**given, **changes})
+        self.check = check
+        self.loops: list[LoopResult] = []
+        self._frames = _Frames()
+        self._runs: list[tuple[int, int]] = []  # (candidate, frames in a row that led to it) of the last frame
+
+    def __len__(self) -> int:
+        return self._frames.count
+
+    @property
+    def stamps(self) -> np.ndarray:
+        """The stamps (N,) in seconds, NaN where a frame has none."""
+        return self._frames.stamps[: len(self)].copy()
+
+    @property
+    def poses(self) -> np.ndarray:
+        """The poses (N, 7), tx ty tz qx qy qz qw, NaN where a frame has none."""
+        return self._frames.poses[: len(self)].copy()
+
+    def add(
+        self, image: np.ndarray, stamp: float | None = None, pose: Sequence[float] | np.ndarray | None = None
+    ) -> LoopResult:
+        """Add the next frame, (H, W, 3) uint8 BGR, and say whether it closes a loop.
+
+        ``stamp`` in seconds; ``pose`` tx ty tz qx qy qz qw, camera-to-world: only kept, for the export.
+
+        It costs ``describe`` and one pass over all earlier descriptors, 4 D bytes a frame. Measured on one 2020s server
+        core, without ``describe``: frame 1,000 takes 0.04 ms and frame 10,000 takes 0.2 ms with D = 128; 0.07 and
+        1.4 to 1.8 ms with D = 512, which no longer fit the cache. So frame 10,000 costs at most twice what frame 1,000
+        costs where ``describe`` takes 2 ms or more (1.7 times at 2 ms, 1.3 at 5 ms, D = 512), as nets and SIFT do; with
+        thumbnails of 768 pixels, described in 0.15 ms, it costs ten times as much: 2.2 ms.
+        """
+        if self.describe is None:
+            raise InputError("this detector has no describe; give one, or use add_descriptor")
+        return self.add_descriptor(self.describe(image), stamp, pose, image)
+
+    def add_descriptor(
+        self,
+        descriptor: np.ndarray,
+        stamp: float | None = None,
+        pose: Sequence[float] | np.ndarray | None = None,
+        image: np.ndarray | None = None,
+    ) -> LoopResult:
+        """Add a frame whose descriptor (D,) is known already; ``image`` is needed for a geometric check alone."""
+        row = self._checked(descriptor, stamp)
+        position = _checked_pose(pose)
+        candidates = self._search(row, stamp)
+        local = None
+        if self.check is not None:
+            if image is None:
+                raise InputError("a geometric check needs the images")
+            local = self.check.describe(image)
+        result = self._decide(candidates, stamp, local)
+        self._frames.append(row, stamp, position)
+        if local is not None:
+            self._frames.local.append(local)
+        if result.accepted is not None:
+            self.loops.append(result)
+        return result
+
+    def calibrate(self, results: Sequence[LoopResult], same: np.ndarray, precision: float = 0.99) -> PrecisionRecall:
+        """Set the threshold from a validation run: the greatest recall with at least ``precision``.
+
+        results  what adding the frames of the validation run gave (the threshold is not used in it)
+        same     (N, N) bool: frames i and j < i show the same place
+        Returns the curve that the choice was made on: the best candidate of each frame. Consistency and a geometric
+        check, which come after the threshold, can only raise its precision. InputError where none is as precise.
+        """
+        scores = np.array([result.candidates[0][1] if result.candidates else -np.inf for result in results])
+        right = np.array([bool(r.candidates) and bool(same[r.query_id, r.candidates[0][0]]) for r in results], bool)
+        found = curve(scores, right, convention="best candidate of each frame")
+        threshold = found.threshold_for_precision(precision)
+        if threshold is None:
+            best = float(np.max(found.precision, initial=0.0))
+            raise InputError(
+                f"no threshold reaches a precision of {precision:g} on the validation run; the best is {best:.3g} "
+                f"({int(right.sum())} of {len(results)} best candidates are right)"
+            )
+        self.settings = DetectorSettings(**{**asdict(self.settings), "threshold": threshold})
+        return found
+
+    def save(self, path: str | Path) -> None:
+        """Write all of it but ``describe`` to an .npz, from which ``load`` goes on as if nothing had happened."""
+        count = len(self)
+        frames = self._frames
+        arrays = {name: getattr(frames, name)[:count] for name in ("stamps", "poses")}
+        arrays["rows"] = frames.rows[:count].reshape(count, -1) if count else np.zeros((0, 0), np.float32)
+        about = {
+            "format": FORMAT,
+            "settings": asdict(self.settings),
+            "check": None if self.check is None else asdict(self.check),
+            "runs": self._runs,
+            "loops": [asdict(loop) for loop in self.loops],
+        }
+        if self.check is not None:
+            arrays["points_of_frame"] = np.array([len(local.points) for local in frames.local], np.int64)
+            arrays["points"] = np.concatenate([np.zeros((0, 2), np.float32), *(f.points for f in frames.local)])
+            arrays["descriptors"] = np.concatenate(
+                [np.zeros((0, 128), np.uint8), *(f.descriptors for f in frames.local)]
+            )
+        path = Path(path)
+        try:
+            with path.open("wb") as stream:
+                np.savez(stream, about=np.array(json.dumps(about)), **arrays)
+        except OSError as error:
+            raise InputError(f"cannot be written ({error.strerror})", path) from error
+
+    @classmethod
+    def load(cls, path: str | Path, describe: Describe | None = None) -> LoopDetector:
+        """Read what ``save`` wrote; ``describe`` must be the one that it was made with."""
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            about = json.loads(str(arrays["about"]))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            reason = f"cannot be read ({error})" if Path(path).exists() else "no such file"
+            raise InputError(f"{reason}; expected a file that LoopDetector.save wrote", path) from error
+        if about["format"] != FORMAT:
+            raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
+        check = None if about["check"] is None else GeometricCheck(**about["check"])
+        detector = cls(describe, DetectorSettings(**about["settings"]), check=check)
+        count = len(arrays["rows"])
+        rows = arrays["rows"].reshape(count, detector.settings.views, -1) if count else np.zeros((0, 0, 0), np.float32)
+        frames = _Frames(count, rows, np.square(rows).sum(-1), arrays["stamps"], arrays["poses"])
+        if check is not None:
+            ends = np.cumsum(arrays["points_of_frame"])[:-1]
+            pieces = zip(np.split(arrays["points"], ends), np.split(arrays["descriptors"], ends), strict=True)
+            frames.local = [LocalFeatures(points, descriptors) for points, descriptors in pieces][: frames.count]
+        detector._frames = frames
+        detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
+        for loop in about["loops"]:
+            loop["candidates"] = [(int(number), float(score)) for number, score in loop["candidates"]]
+            detector.loops.append(LoopResult(**loop))
+        return detector
+
+    def _checked(self, descriptor: np.ndarray, stamp: float | None) -> np.ndarray:
+        """Return the row that is kept, (views, D): of unit length for cosine."""
+        row = np.asarray(descriptor, np.float32).reshape(-1)
+        frames, views = self._frames, self.settings.views
+        if frames.count and len(row) != frames.rows[0].size:
+            raise InputError(
+                f"frame {frames.count} has a descriptor of {len(row)} dimensions, those before {frames.rows[0].size}"
+            )
+        if len(row) % views:
+            raise InputError(f"frame {frames.count} has a descriptor of {len(row)} dimensions, not of {views} views")
+        row = row.reshape(views, -1)
+        if not row.size or not np.all(np.isfinite(row)):
+            raise InputError(f"the descriptor of frame {frames.count} is empty or not finite")
+        if self.settings.exclude_seconds and stamp is None:
+            raise InputError(
+                f"{self.settings.exclude_seconds:g} s are to be excluded, but frame {frames.count} has no stamp"
+            )
+        if stamp is not None and frames.count and stamp < frames.stamps[frames.count - 1]:
+            raise InputError(f"frame {frames.count} has stamp {stamp:.6f}, earlier than the one before it")
+        if self.settings.metric == "cosine":
+            lengths = np.linalg.norm(row, axis=1, keepdims=True)
+            row = row / np.where(lengths > 0, lengths, 1)
+        return row
+
+    def _search(self, row: np.ndarray, stamp: float | None) -> list[tuple[int, float]]:
+        frames, settings = self._frames, self.settings
+        end = max(0, frames.count - settings.exclude_recent)
+        if settings.exclude_seconds and stamp is not None:
+            end = min(end, int(np.searchsorted(frames.stamps[:end], stamp - settings.exclude_seconds, side="right")))
+        if end == 0:
+            return []
+        scores = frames.rows[:end].reshape(-1, row.shape[1]) @ row.T
+        if settings.metric == "euclidean":  # as the distances are ordered, so are these
+            scores *= 2
+            scores -= frames.squares[:end].reshape(-1, 1)
+            scores -= np.square(row).sum(1)
+        scores = scores.reshape(end, -1).max(axis=1)
+        k = min(settings.top_k, end)
+        best = np.argpartition(scores, end - k)[end - k :]
+        # The product is quick but rounds small distances badly: of the few that are reported they are taken anew.
+        if settings.metric == "euclidean":
+            apart = np.linalg.norm(frames.rows[best][:, :, None] - row, axis=-1)
+            values = -apart.reshape(k, -1).min(axis=1)
+        else:
+            values = scores[best]
+        order = np.lexsort((best, -values))
+        return [(int(best[i]), float(values[i])) for i in order]
+
+    def _decide(
+        self, candidates: list[tuple[int, float]], stamp: float | None, local: LocalFeatures | None
+    ) -> LoopResult:
+        """Threshold, then consistency, then geometry; remember what leads on to the next frame."""
+        settings = self.settings
+        query = len(self)
+        before = self._runs
+        self._runs = []
+        score = candidates[0][1] if candidates else float("-inf")
+
+        def result(
+            verdict: str, accepted: int | None = None, value: float = score, inliers: int | None = None
+        ) -> LoopResult:
+            return LoopResult(query, candidates, accepted, verdict, value, inliers, stamp)
+
+        if not candidates:
+            return result("no candidate")
+        if settings.threshold is None:
+            return result("no threshold")
+        likely = [(number, value) for number, value in candidates if value >= settings.threshold]
+        if not likely:
+            return result("below threshold")
+        for number, _ in likely:
+            led = [run for other, run in before if abs(other - number) <= settings.consistency_window]
+            self._runs.append((number, 1 + max(led, default=0)))
+        steady = [pair for pair, (_, run) in zip(likely, self._runs, strict=True) if run > settings.consistency]
+        if not steady:
+            return result("not consistent")
+        if self.check is None:
+            return result("accepted", *steady[0])
+        assert local is not None
+        most = 0
+        for number, value in steady:
+            inliers = self.check.inliers(local, self._frames.local[number])
+            if self.check.accepts(inliers):
+                return result("accepted", number, value, inliers)
+            most = max(most, inliers)
+        return result("not verified", inliers=most)
+
+
+def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | None:
+    if pose is None:
+        return None
+    values = np.asarray(pose, np.float64).reshape(-1)
+    if len(values) != 7 or not np.all(np.isfinite(values)) or not np.any(values[3:]):
+        raise InputError(f"a pose is {values}; expected tx ty tz qx qy qz qw")
+    values = values.copy()
+    values[3:] /= np.linalg.norm(values[3:])
+    return values

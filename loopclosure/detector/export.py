@@ -1,0 +1,112 @@
+"""Loops as files: a table, and edges for a pose-graph optimiser (g2o).
+
+A g2o file has lines ``VERTEX_SE3:QUAT id x y z qx qy qz qw`` and ``EDGE_SE3:QUAT i j`` with the pose of j in the frame
+of i, T_i^-1 T_j, and the 21 upper entries of the information matrix, row by row: translation first, then rotation.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loopclosure.detector.detector import LoopResult
+from loopclosure.errors import InputError
+
+RelativePose = Callable[[int, int], np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """How sure an edge is: standard deviations of its translation in metres and of its rotation in radians."""
+
+    translation_m: float
+    rotation_rad: float
+
+    def information(self) -> str:
+        """Return the upper triangle of the 6 x 6 information matrix, which is diagonal."""
+        diagonal = [self.translation_m**-2] * 3 + [self.rotation_rad**-2] * 3
+        matrix = np.diag(diagonal)
+        return " ".join(f"{matrix[i, j]:.9g}" for i in range(6) for j in range(i, 6))
+
+
+ODOMETRY_SIGMAS = Sigmas(0.05, 0.02)
+LOOP_SIGMAS = Sigmas(0.1, 0.05)
+
+
+def relative_pose(pose_a: np.ndarray, pose_b: np.ndarray) -> np.ndarray:
+    """Return the pose (7,) of b in the frame of a, T_a^-1 T_b; poses are tx ty tz qx qy qz qw, w not negative."""
+    rotation_a, rotation_b = Rotation.from_quat(pose_a[3:]), Rotation.from_quat(pose_b[3:])
+    quaternion = (rotation_a.inv() * rotation_b).as_quat()
+    step = rotation_a.inv().apply(pose_b[:3] - pose_a[:3])
+    return np.concatenate([step, quaternion if quaternion[3] >= 0 else -quaternion])
+
+
+def write_loops_csv(
+    path: str | Path,
+    loops: Sequence[LoopResult],
+    stamps: np.ndarray | None = None,
+    names: Sequence[str] | None = None,
+) -> None:
+    """Write one row a loop: query_id, match_id, score, inliers, their stamps (N,) in seconds and names (N) if known."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(
+            ["query_id", "match_id", "score", "inliers", "query_stamp", "match_stamp", "query_name", "match_name"]
+        )
+        for loop in loops:
+            assert loop.accepted is not None
+            ends = (loop.query_id, loop.accepted)
+            times = ["" if stamps is None or np.isnan(stamps[i]) else f"{stamps[i]:.6f}" for i in ends]
+            words = ["" if names is None else names[i] for i in ends]
+            inliers = "" if loop.inliers is None else loop.inliers
+            writer.writerow([*ends, f"{loop.score:.9g}", inliers, *times, *words])
+
+
+def write_g2o(
+    path: str | Path,
+    poses: np.ndarray,
+    loops: Sequence[LoopResult],
+    relative: RelativePose,
+    odometry: Sigmas = ODOMETRY_SIGMAS,
+    closure: Sigmas = LOOP_SIGMAS,
+) -> int:
+    """Write a pose graph; return how many loops were left out since their relative pose is not known.
+
+    poses     (N, 7) of the frames, tx ty tz qx qy qz qw, as the robot believes them; NaN where not known. They are the
+              vertices, and consecutive ones give the odometry edges.
+    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match, measured otherwise (from depth,
+              from a motion capture), or None. What is not measured is left out: the robot's own poses, whose drift the
+              loop is to correct, say nothing of it, and no transform is made up.
+    """
+    poses = np.asarray(poses, np.float64)
+    known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))
+    if not len(known):
+        raise InputError("no frame has a pose; a pose graph needs the poses of the frames")
+    lines = [f"VERTEX_SE3:QUAT {i} {_numbers(poses[i])}" for i in known]
+    for a, b in itertools.pairwise(known):
+        lines.append(f"EDGE_SE3:QUAT {a} {b} {_numbers(relative_pose(poses[a], poses[b]))} {odometry.information()}")
+    left_out = 0
+    with_pose = set(known.tolist())
+    for loop in loops:
+        assert loop.accepted is not None
+        step = relative(loop.query_id, loop.accepted)
+        if step is None or not {loop.query_id, loop.accepted} <= with_pose:
+            left_out += 1
+            continue
+        lines.append(f"EDGE_SE3:QUAT {loop.accepted} {loop.query_id} {_numbers(step)} {closure.information()}")
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    return left_out
+
+
+def _numbers(pose: np.ndarray) -> str:
+    return " ".join(f"{value:.9g}" for value in pose)

@@ -1,0 +1,228 @@
+"""The detector over a whole recording: a folder or list of images, a TUM sequence, a video; any code describes them."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from loopclosure.descriptors.feature_file import Features
+from loopclosure.descriptors.whitening import Whitening
+from loopclosure.detector.detector import Describe, LoopDetector, LoopResult
+from loopclosure.detector.export import RelativePose, relative_pose
+from loopclosure.errors import InputError
+from loopclosure.places.datasets import DataSet
+from loopclosure.places.frames import (
+    ALL_FRAMES,
+    VIDEO_SUFFIXES,
+    Selection,
+    image_paths,
+    read_image,
+    video_frames,
+    video_length,
+)
+from loopclosure.places.same_place import same_place
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Poses, associate, read_groundtruth, read_rgb_list
+from loopclosure.progress import Progress, silent
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Frames in order: image files, or ``numbers`` of a video's frames.
+
+    names   (N) of the frames
+    stamps  (N,) seconds, None where not known;  poses  (N, 7) tx ty tz qx qy qz qw, NaN or None where not known
+    """
+
+    source: Path
+    names: list[str]
+    images: list[Path] | None
+    numbers: np.ndarray
+    stamps: np.ndarray | None = None
+    poses: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def frames(self) -> Iterator[tuple[np.ndarray, float | None]]:
+        """Yield each image (H, W, 3) uint8 BGR and its stamp."""
+        if self.images is not None:
+            for i, path in enumerate(self.images):
+                yield read_image(path), None if self.stamps is None else float(self.stamps[i])
+            return
+        wanted = iter(self.numbers.tolist())
+        following = next(wanted, None)
+        for number, (seconds, image) in enumerate(video_frames(self.source)):
+            if number == following:
+                yield image, seconds
+                following = next(wanted, None)
+                if following is None:
+                    return
+
+
+def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Recording:
+    """Open a folder of images, a list of them, a TUM RGB-D sequence (with poses if it has them) or a video file."""
+    source = Path(source)
+    if source.suffix.lower() in VIDEO_SUFFIXES:
+        if not source.is_file():
+            raise InputError("no such video", source)
+        count = video_length(source)
+        if count is None:
+            raise InputError("does not say how many frames it has; save its frames as images", source)
+        numbers = selection.numbers(count)
+        return Recording(source, [f"frame {number}" for number in numbers], None, numbers)
+    images = image_paths(source)
+    taken = selection.numbers(len(images))
+    stamps = poses = None
+    if (source / "rgb.txt").is_file():
+        frames = read_rgb_list(source / "rgb.txt")
+        stamps = np.array([frames[i].stamp for i in taken])
+        if (source / "groundtruth.txt").is_file():
+            trajectory = read_groundtruth(source / "groundtruth.txt")
+            nearest = associate(stamps, trajectory, MAX_DIFFERENCE_S)
+            poses = np.hstack([trajectory.positions, trajectory.quaternions])[nearest]
+            poses[nearest < 0] = np.nan
+    images = [images[i] for i in taken]
+    root = source if source.is_dir() else source.parent
+    return Recording(source, [os.path.relpath(path, root) for path in images], images, taken, stamps, poses)
+
+
+def run_detector(
+    detector: LoopDetector,
+    recording: Recording,
+    features: Features | None = None,
+    progress: Progress = silent,
+    whitening: Whitening | None = None,
+) -> list[LoopResult]:
+    """Add every frame of a recording.
+
+    ``features``, with a descriptor of each image, replace ``describe``; ``whitening`` is of these alone: a
+    ``describe`` is given whitened (see :func:`whitened`).
+    """
+    rows = None
+    if features is not None:
+        if recording.images is None:
+            raise InputError("the frames of a video have no names to find features by; give --describe", features.path)
+        rows = features.rows_of(recording.images)
+        if whitening is not None:
+            rows = whitening.of_views(rows, detector.settings.views)
+    results = []
+    if rows is not None and detector.check is None:
+        for i, row in enumerate(progress(rows, "frames", len(rows))):
+            stamp = None if recording.stamps is None else float(recording.stamps[i])
+            results.append(detector.add_descriptor(row, stamp, _pose(recording, i)))
+        return results
+    for i, (image, stamp) in enumerate(progress(recording.frames(), "frames", len(recording))):
+        if rows is None:
+            results.append(detector.add(image, stamp, _pose(recording, i)))
+        else:
+            results.append(detector.add_descriptor(rows[i], stamp, _pose(recording, i), image))
+    return results
+
+
+def calibrate(
+    detector: LoopDetector,
+    data: DataSet,
+    precision: float,
+    features: Features | None = None,
+    progress: Progress = silent,
+    whitening: Whitening | None = None,
+) -> str:
+    """Set the threshold of ``detector`` on a validation sequence with its truth; return a sentence on what came out.
+
+    The validation run is a detector of its own with the same settings: ``detector`` stays empty. Candidates that are
+    near in time are excluded by the detector's settings, not by the data set's.
+    """
+    if data.reference_images is not None:
+        raise InputError(f"{data.name} is two traverses; a detector is calibrated on one sequence")
+    trial = LoopDetector(detector.describe, detector.settings)
+    images = data.query_images
+    recording = Recording(Path(data.name), [p.name for p in images], images, np.arange(len(images)), data.stamps)
+    results = run_detector(trial, recording, features, progress, whitening)
+    found = detector.calibrate(results, data.truth.soft, precision)
+    return (
+        f"threshold {detector.settings.threshold:.6g}: on {data.name} precision at least {precision:g} at recall "
+        f"{found.recall_at_precision(precision):.3f} of the {found.positives} frames whose best candidate is right"
+    )
+
+
+def from_poses(detector: LoopDetector) -> RelativePose:
+    """Return the relative poses of frames whose poses are measured in one frame of reference (motion capture)."""
+    poses = detector.poses
+
+    def relative(query: int, match: int) -> np.ndarray | None:
+        both = poses[[match, query]]
+        return relative_pose(*both) if np.all(np.isfinite(both)) else None
+
+    return relative
+
+
+def judged_by_poses(detector: LoopDetector) -> str:
+    """Say how many of the accepted loops are the same place by the paper's rule, of those whose two poses are known."""
+    poses = detector.poses
+    ends = np.array([(loop.query_id, loop.accepted) for loop in detector.loops], int).reshape(-1, 2)
+    known = ends[np.all(np.isfinite(poses[ends]), axis=(1, 2))]
+    a, b = (Poses(poses[column, :3], poses[column, 3:]) for column in known.T)
+    right = int(np.count_nonzero(same_place(a, b)))
+    return f"{right} of {len(known)} loops are the same place by their poses (2 m, 15 degrees)"
+
+
+def load_describe(specification: str, options: dict[str, str]) -> Describe:
+    """Return the ``describe`` that ``module:name`` means.
+
+    A function is it; a class is made an object with ``options`` as keywords, which must be callable; so is a function
+    where there are options. Modules are looked for in the working directory too.
+    """
+    module_name, colon, name = specification.partition(":")
+    if not colon or not name:
+        raise InputError(f'"{specification}" names no function; expected module:function')
+    sys.path.insert(0, os.getcwd())
+    try:
+        target: Any = importlib.import_module(module_name)
+    except ImportError as error:
+        raise InputError(f'cannot import "{module_name}" of --describe {specification}: {error}') from error
+    finally:
+        sys.path.pop(0)
+    for part in name.split("."):
+        if not hasattr(target, part):
+            raise InputError(f'"{module_name}" has no "{name}" (--describe {specification})')
+        target = getattr(target, part)
+    if options or isinstance(target, type):
+        try:
+            target = target(**{key: _value(text) for key, text in options.items()})
+        except TypeError as error:
+            raise InputError(f"--describe {specification}: {error}") from error
+    if not callable(target):
+        raise InputError(f"--describe {specification} is a {type(target).__name__}, which cannot be called")
+    return cast(Describe, target)
+
+
+def views_of(describe: Describe | None, features: Features | None) -> int:
+    """Return how many views of an image are described, by a ``describe`` with ``views`` or by features."""
+    return getattr(describe, "views", 1) if features is None else features.views
+
+
+def whitened(describe: Describe, whitening: Whitening, views: int) -> Describe:
+    """Return a ``describe`` whose descriptors (views D,) are those of another, whitened view by view."""
+    return lambda image: whitening.of_views(np.reshape(describe(image), (1, -1)), views)[0]
+
+
+def _value(text: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _pose(recording: Recording, i: int) -> np.ndarray | None:
+    if recording.poses is None or np.isnan(recording.poses[i, 0]):
+        return None
+    return recording.poses[i]

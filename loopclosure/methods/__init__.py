@@ -1,0 +1,1 @@
+"""What `--method` can name."""

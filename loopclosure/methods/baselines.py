@@ -1,0 +1,203 @@
+"""The baselines as methods of the judge: ``fabmap``, ``bow`` and ``thumbnails`` on the command line.
+
+Their argument is a comma-separated list of ``setting=value``; the settings are the fields of the classes below and of
+those they name. ``fabmap:model=words.npz,score=posterior`` keeps its vocabulary in a file and reads it the next time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.descriptors.thumbnails import Thumbnailer, differences
+from loopclosure.errors import InputError
+from loopclosure.methods.base import Method, MethodResult, Setting, refuse_overlap
+from loopclosure.methods.settings import configure
+from loopclosure.places.frames import read_grey
+from loopclosure.progress import Progress, timed
+from loopclosure.words.bag_of_words import BagOfWords, check_metric
+from loopclosure.words.fabmap import FabMapModel, FabMapSettings, score_sequence, score_sets
+from loopclosure.words.vocabulary import Extractor
+from loopclosure.words.word_model import TRAINING_STAGES, Training, WordModel, train
+
+
+@dataclass(frozen=True)
+class Words:
+    """Where the words of images come from: trained, or read from ``model`` (written there when it does not exist)."""
+
+    training: Training = field(default_factory=Training)
+    model: str = ""
+
+    def learn(
+        self, train_images: list[Path], test_images: list[Path], progress: Progress, seconds: dict[str, float]
+    ) -> tuple[WordModel, list[str]]:
+        """Return the model and notes on it; refuse one that was trained on a test image."""
+        path = Path(self.model)
+        if self.model and path.exists():
+            model = WordModel.load(path)
+            source = f"read from {path}"
+        else:
+            refuse_overlap(train_images, test_images)
+            model = train(train_images, self.training, progress, seconds)
+            source = f"written to {path}" if self.model else "made for this run"
+            if self.model:
+                model.save(path)
+        refuse_overlap(model.training_images, test_images, self.model)
+        present = (model.training_words > 0).mean(axis=0)
+        return model, [
+            f"vocabulary ({source}): {model.vocabulary.made}; {model.vocabulary.extractor}",
+            f"a word occurs in {100 * present.mean():.1f} % of the training images on average, "
+            f"{int((present > 0.3).sum())} of {len(present)} in more than 30 %",
+        ]
+
+
+@dataclass
+class _WordsOfImages:
+    """The part that methods on words have in common."""
+
+    words: Words = field(default_factory=Words)
+
+    def _count(
+        self,
+        query_images: list[Path],
+        reference_images: list[Path] | None,
+        train_images: list[Path],
+        progress: Progress,
+        seconds: dict[str, float],
+    ) -> tuple[WordModel, np.ndarray, np.ndarray | None, list[str]]:
+        """Return the model, the words of queries and references, and notes."""
+        tested = query_images + (reference_images or [])
+        model, notes = self.words.learn(train_images, tested, progress, seconds)
+        counts = model.words(tested, progress, seconds)
+        empty = int((counts.sum(axis=1) == 0).sum())
+        if empty:
+            notes.append(f"{empty} of {len(tested)} images have no feature at all: places without words")
+        references = None if reference_images is None else counts[len(query_images) :]
+        return model, counts[: len(query_images)], references, notes
+
+
+@dataclass
+class FabMapMethod(_WordsOfImages):
+    """FAB-MAP; ``scored`` is "log_odds" (evidence against a new place) or "posterior"."""
+
+    settings: FabMapSettings = field(default_factory=FabMapSettings)
+    scored: str = "log_odds"
+    name: str = "fabmap"
+
+    def __post_init__(self) -> None:
+        if self.scored not in ("log_odds", "posterior"):
+            raise InputError(f'FAB-MAP\'s score is "log_odds" or "posterior", not "{self.scored}"')
+
+    def score(
+        self,
+        query_images: list[Path],
+        reference_images: list[Path] | None,
+        train_images: list[Path],
+        progress: Progress,
+    ) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says."""
+        seconds: dict[str, float] = {}
+        model, queries, references, notes = self._count(query_images, reference_images, train_images, progress, seconds)
+        with timed(seconds, "likelihoods"):
+            fabmap = FabMapModel(model.tree, model.training_words, self.settings)
+            if references is None:
+                scores = score_sequence(fabmap, queries)
+            else:
+                scores = score_sets(fabmap, queries, references)
+        notes.append(f"FAB-MAP {self.settings.version}, score: {self.scored}; {self.settings}")
+        chosen = scores.log_odds if self.scored == "log_odds" else scores.posterior
+        return MethodResult(chosen, seconds, notes, TRAINING_STAGES)
+
+
+@dataclass
+class BagOfWordsMethod(_WordsOfImages):
+    """Bag of words with tf-idf; ``metric`` as in :class:`BagOfWords`."""
+
+    metric: str = "l1"
+    name: str = "bow"
+
+    def __post_init__(self) -> None:
+        check_metric(self.metric)
+
+    def score(
+        self,
+        query_images: list[Path],
+        reference_images: list[Path] | None,
+        train_images: list[Path],
+        progress: Progress,
+    ) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says."""
+        seconds: dict[str, float] = {}
+        model, queries, references, notes = self._count(query_images, reference_images, train_images, progress, seconds)
+        with timed(seconds, "similarity"):
+            bag = BagOfWords.learn(model.training_words, self.metric)
+            scores = bag.similarity(queries, queries if references is None else references)
+        notes.append(f"tf-idf, {self.metric}")
+        return MethodResult(scores, seconds, notes, TRAINING_STAGES)
+
+
+@dataclass
+class ThumbnailMethod:
+    """Thumbnails, the mean absolute difference with its sign changed."""
+
+    thumbnailer: Thumbnailer = field(default_factory=Thumbnailer)
+    name: str = "thumbnails"
+
+    def score(
+        self,
+        query_images: list[Path],
+        reference_images: list[Path] | None,
+        train_images: list[Path],
+        progress: Progress,
+    ) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says."""
+        seconds: dict[str, float] = {}
+        tested = query_images + (reference_images or [])
+        small = np.zeros((len(tested), self.thumbnailer.height, self.thumbnailer.width), np.float32)
+        for i, path in enumerate(progress(tested, "thumbnails", len(tested))):
+            with timed(seconds, "thumbnails"):
+                small[i] = self.thumbnailer(read_grey(path))
+        with timed(seconds, "differences"):
+            queries = small[: len(query_images)]
+            scores = -differences(queries, queries if reference_images is None else small[len(query_images) :])
+        return MethodResult(scores, seconds, [f"mean absolute difference of grey thumbnails; {self.thumbnailer}"])
+
+
+def fabmap(argument: str, setting: Setting, inner: Method | None) -> FabMapMethod:
+    """Build ``fabmap[:setting=value,...]``."""
+    refuse_inner("fabmap", inner)
+    method, words, training, extractor, settings = configure(
+        "fabmap",
+        argument,
+        FabMapMethod(),
+        Words(),
+        Training(seed=setting.seed),
+        Extractor(),
+        FabMapSettings(recent=setting.exclude_frames, seed=setting.seed),
+    )
+    words = replace(words, training=replace(training, extractor=extractor))
+    return replace(method, words=words, settings=settings)
+
+
+def bag_of_words(argument: str, setting: Setting, inner: Method | None) -> BagOfWordsMethod:
+    """Build ``bow[:setting=value,...]``."""
+    refuse_inner("bow", inner)
+    method, words, training, extractor = configure(
+        "bow", argument, BagOfWordsMethod(), Words(), Training(seed=setting.seed), Extractor()
+    )
+    return replace(method, words=replace(words, training=replace(training, extractor=extractor)))
+
+
+def thumbnails(argument: str, setting: Setting, inner: Method | None) -> ThumbnailMethod:
+    """Build ``thumbnails[:setting=value,...]``."""
+    refuse_inner("thumbnails", inner)
+    method, thumbnailer = configure("thumbnails", argument, ThumbnailMethod(), Thumbnailer())
+    return replace(method, thumbnailer=thumbnailer)
+
+
+def refuse_inner(method: str, inner: Method | None) -> None:
+    """Raise InputError when a method that looks at images is written as refining another."""
+    if inner is not None:
+        raise InputError(f"{method}+{inner.name}: {method} works on images, not on the scores of another method")

@@ -1,0 +1,237 @@
+"""SeqSLAM: places recognised by sequences of images rather than by single ones (Milford and Wyeth, ICRA 2012).
+
+Everything is a matrix (Q, R) of queries against references, each in the order of its drive; lower is more alike until
+the method at the end, whose scores are higher for more alike. It works on any matrix of distances: on SeqSLAM's own
+differences of thumbnails, and on those of learned features ("seqslam+features:...").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.descriptors.thumbnails import Thumbnailer
+from loopclosure.errors import InputError
+from loopclosure.methods.base import Method, MethodResult, Setting
+from loopclosure.methods.baselines import ThumbnailMethod
+from loopclosure.methods.settings import configure
+from loopclosure.progress import Progress, timed
+
+DIRECTIONS = ("forward", "both")
+ANCHORS = ("centre", "start")
+EDGES = ("shorten", "drop")
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """How sequences are searched; lengths, windows and velocities are OpenSeqSLAM's.
+
+    length         steps of a trajectory (it has length + 1 images), half of them before the query, half after
+    slowest        velocities, in reference frames a query frame
+    fastest
+    velocity_step
+    contrast       local contrast: references i - contrast/2 .. i + contrast/2 are the neighbourhood; 0 leaves it out
+    directions     "forward", or "both": the references may also be passed the other way round
+    anchor         "centre" of the trajectory is the reference it stands for, or, as in OpenSeqSLAM, "start" + length/2
+    edges          where a trajectory leaves the matrix: "drop" it (OpenSeqSLAM), or "shorten" it, to half at the least
+    """
+
+    length: int = 10
+    slowest: float = 0.8
+    fastest: float = 1.2
+    velocity_step: float = 0.1
+    contrast: int = 10
+    directions: str = "forward"
+    anchor: str = "centre"
+    edges: str = "shorten"
+
+    def __post_init__(self) -> None:
+        for value, choices, name in (
+            (self.directions, DIRECTIONS, "directions"),
+            (self.anchor, ANCHORS, "anchor"),
+            (self.edges, EDGES, "edges"),
+        ):
+            if value not in choices:
+                raise InputError(f'{name} of SeqSLAM: "{value}" is none of {", ".join(choices)}')
+        if self.length < 1 or self.contrast < 0:
+            raise InputError(f"SeqSLAM needs length >= 1 and contrast >= 0, got {self.length} and {self.contrast}")
+        if not 0.0 < self.slowest <= self.fastest or self.velocity_step <= 0.0:
+            raise InputError(
+                f"SeqSLAM needs 0 < slowest <= fastest and a positive step, got {self.slowest:g}, {self.fastest:g}, "
+                f"{self.velocity_step:g}"
+            )
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """The velocities tried, reference frames a query frame."""
+        steps = int((self.fastest - self.slowest) / self.velocity_step + 1e-9)
+        return self.slowest + self.velocity_step * np.arange(steps + 1)
+
+    def offsets(self) -> np.ndarray:
+        """Return which reference each trajectory passes at each step, less the one it stands for: (T, length + 1)."""
+        steps = np.arange(self.length + 1)
+        half = self.length // 2
+        # The small term lets 1.2 * 5, which is just below 6 in binary, reach 6.
+        if self.anchor == "start":
+            paths = np.floor(np.outer(self.velocities, steps) + 1e-9).astype(int) - half
+        else:
+            paths = np.rint(np.outer(self.velocities, steps - half)).astype(int)
+        if self.directions == "both":
+            paths = np.concatenate([paths, -paths])
+        return np.unique(paths, axis=0)
+
+
+def enhance_contrast(distances: np.ndarray, window: int = 10, valid: np.ndarray | None = None) -> np.ndarray:
+    """Return the distances (Q, R), each less the mean of its neighbourhood among the references, over its deviation.
+
+    Neighbourhood: the references i - window/2 .. i + window/2 that exist and are ``valid`` (Q, R). Deviation with
+    n - 1; where all are alike the result is 0. The least of all is then subtracted. What is not valid is NaN.
+    """
+    valid = np.ones(distances.shape, bool) if valid is None else valid
+    if not valid.any():
+        return np.full(distances.shape, np.nan)
+    known = np.where(valid, distances, 0.0)
+    count, mean, squares = (np.zeros(distances.shape) for _ in range(3))
+    neighbours = list(_neighbours(distances.shape[1], window // 2))
+    for here, there in neighbours:
+        count[:, here] += valid[:, there]
+        mean[:, here] += known[:, there]
+    mean /= np.maximum(count, 1)
+    for here, there in neighbours:
+        squares[:, here] += np.where(valid[:, there], known[:, there] - mean[:, here], 0.0) ** 2
+    deviation = np.sqrt(squares / np.maximum(count - 1, 1))
+    differ = deviation > 1e-12 * np.abs(mean)  # the rounded mean of equal distances may leave a trace of a deviation
+    enhanced = np.divide(known - mean, deviation, out=np.zeros_like(known), where=differ)
+    enhanced[~valid] = np.nan
+    return enhanced - np.nanmin(enhanced)
+
+
+def _neighbours(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
+    """Return, for each shift up to ``reach``, the columns that have such a neighbour, and these neighbours."""
+    shifts = range(-min(reach, size - 1), min(reach, size - 1) + 1)
+    return [(slice(max(0, -s), size - max(0, s)), slice(max(0, s), size - max(0, -s))) for s in shifts]
+
+
+def trajectory_costs(distances: np.ndarray, settings: SequenceSettings) -> np.ndarray:
+    """Return the least mean distance along any trajectory through each query and reference: (Q, R).
+
+    NaN in ``distances`` (Q, R) lies outside the matrix. A cost is NaN where every trajectory leaves it too early.
+    """
+    queries, references = distances.shape
+    half = settings.length // 2
+    offsets = settings.offsets()
+    reach = int(np.abs(offsets).max())
+    needed = settings.length + 1 if settings.edges == "drop" else half + 1
+    margins = ((half, settings.length - half), (reach, reach))
+    inside = np.pad(np.isfinite(distances), margins)
+    padded = np.pad(np.where(np.isfinite(distances), distances, 0.0), margins)
+    best = np.full((queries, references), np.inf)
+    for path in offsets:
+        total = np.zeros((queries, references))
+        count = np.zeros((queries, references), np.int32)
+        for step, offset in enumerate(path):
+            window = np.s_[step : step + queries, reach + offset : reach + offset + references]
+            total += padded[window]
+            count += inside[window]
+        enough = count >= needed
+        best[enough] = np.minimum(best[enough], total[enough] / count[enough])
+    return np.where(np.isfinite(best), best, np.nan)
+
+
+def best_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Return each query's reference of least cost (Q,), -1 where none, and how unrivalled it is (Q,).
+
+    The second is the ratio of that cost to the least one more than ``window`` / 2 references away, in [0, 1], smaller =
+    surer (OpenSeqSLAM accepts below 0.9); NaN where there is no match or no rival.
+    """
+    finite = np.where(np.isnan(costs), np.inf, costs)
+    match = np.argmin(finite, axis=1)
+    rows = np.arange(len(costs))
+    least = finite[rows, match]
+    near = np.abs(np.arange(costs.shape[1])[None, :] - match[:, None]) <= window // 2
+    rival = np.where(near, np.inf, finite).min(axis=1)
+    judged = np.isfinite(least) & np.isfinite(rival)
+    ratio = np.full(len(costs), np.nan)
+    # Both can be 0 where two references fit exactly: no reason to prefer either.
+    ratio[judged] = np.divide(least[judged], rival[judged], out=np.ones(judged.sum()), where=rival[judged] > 0)
+    return np.where(np.isfinite(least), match, -1), ratio
+
+
+def earlier(frames: int, exclude: int) -> np.ndarray:
+    """Return which pairs (query, reference) of one sequence may be loops: reference < query - exclude, (n, n) bool."""
+    return np.tri(frames, frames, -1 - exclude, dtype=bool)
+
+
+@dataclass
+class SeqSlam:
+    """SeqSLAM on the scores of another method, its own thumbnails by default.
+
+    scored          "cost" of the best trajectory at each pair (sign changed), or "uniqueness": only each query's best
+                    match gets a score, 1 - its ratio to the next best (see :func:`best_matches`)
+    match_window    of the uniqueness
+    exclude_frames  in one sequence, references within so many frames of the query are no candidates
+    """
+
+    inner: Method
+    settings: SequenceSettings = field(default_factory=SequenceSettings)
+    scored: str = "cost"
+    match_window: int = 10
+    exclude_frames: int = 0
+    name: str = "seqslam"
+
+    def __post_init__(self) -> None:
+        if self.scored not in ("cost", "uniqueness"):
+            raise InputError(f'SeqSLAM\'s score is "cost" or "uniqueness", not "{self.scored}"')
+
+    def score(
+        self,
+        query_images: list[Path],
+        reference_images: list[Path] | None,
+        train_images: list[Path],
+        progress: Progress,
+    ) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says."""
+        found = self.inner.score(query_images, reference_images, train_images, progress)
+        seconds = dict(found.seconds)
+        with timed(seconds, "sequences"):
+            valid = np.isfinite(found.scores)
+            if reference_images is None:
+                valid &= earlier(len(query_images), self.exclude_frames)
+            distances = np.where(valid, -found.scores, np.nan)
+            if self.settings.contrast:
+                distances = enhance_contrast(distances, self.settings.contrast, valid)
+            elif self.scored == "uniqueness":  # a ratio needs costs that are not negative; log-odds have no such end
+                distances -= distances.min(where=valid, initial=0.0)
+            costs = np.where(valid, trajectory_costs(distances, self.settings), np.nan)
+            scores = -costs if self.scored == "cost" else self._unique(costs)
+        notes = [*found.notes, f"SeqSLAM, score: {self.scored}; {self.settings}"]
+        return MethodResult(scores, seconds, notes, found.once)
+
+    def _unique(self, costs: np.ndarray) -> np.ndarray:
+        match, ratio = best_matches(costs, self.match_window)
+        scores = np.full(costs.shape, np.nan)
+        judged = np.flatnonzero(np.isfinite(ratio))
+        scores[judged, match[judged]] = 1.0 - ratio[judged]
+        return scores
+
+
+def seqslam(argument: str, setting: Setting, inner: Method | None) -> SeqSlam:
+    """Build ``seqslam[:setting=value,...]`` on SeqSLAM's thumbnails, or ``seqslam+METHOD`` on another method's scores.
+
+    The second without contrast enhancement: it makes up for differences of thumbnails that mean little by themselves,
+    while the scores of a descriptor are comparable from query to query, which it would undo.
+    """
+    own = Thumbnailer(width=64, height=32, normalise="patch", patch=8)
+    method, settings, thumbnailer = configure(
+        "seqslam",
+        argument,
+        SeqSlam(ThumbnailMethod(own), exclude_frames=setting.exclude_frames),
+        SequenceSettings(),
+        own,
+    )
+    if inner is not None:
+        return replace(method, settings=replace(settings, contrast=0), inner=inner, name=f"seqslam+{inner.name}")
+    return replace(method, settings=settings, inner=ThumbnailMethod(thumbnailer))

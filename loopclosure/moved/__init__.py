@@ -1,0 +1,1 @@
+"""Old homes of names that users have written into their commands. They stay valid."""

@@ -1,0 +1,3 @@
+"""Was loopclosure.baselines.thumbnails."""
+
+from loopclosure.descriptors.thumbnails import Thumbnailer as Thumbnailer

@@ -1,0 +1,336 @@
+"""Sets of frames with their truth: TUM RGB-D, FAB-MAP, a folder with a mask, two traverses, pairs of places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from loopclosure.errors import InputError
+from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_image
+from loopclosure.places.masks import read_coordinates, read_place_pairs, read_truth_matrix
+from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
+from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
+
+CAMERAS = ("left", "right", "both", "joined")
+# Ten seconds are what TUM's 30 Hz sequences are commonly judged with; the other sets have no time.
+TUM_EXCLUSION = Exclusion(seconds=10.0)
+# New College's own mask has no loop nearer than 142 images (71 pairs of left and right).
+FABMAP_EXCLUSION = Exclusion(frames=50)
+FOLDER_EXCLUSION = Exclusion(frames=10)
+COMMON_NAMES = ("images", "image", "rgb", "samples", "query", "ref", "reference", "frames")
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """Frames and their truth.
+
+    query_images         Q paths
+    reference_images     R paths, or None for one sequence that meets its own places again
+    truth                (Q, R)
+    exclude_frames       no pair of the sequence further apart than this is excluded (SeqSLAM needs frames, not seconds)
+    stamps               (Q,) seconds, where known
+    positions            (Q, 3) metres or (Q, 2), where known: for the map
+    quaternions          (Q, 4) xyzw, where known
+    notes                what a reader of the figures should know: what was left out, what looks odd
+    """
+
+    name: str
+    query_images: list[Path]
+    reference_images: list[Path] | None
+    truth: Truth
+    exclude_frames: int = 0
+    stamps: np.ndarray | None = None
+    positions: np.ndarray | None = None
+    quaternions: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def references(self) -> list[Path]:
+        """Return the reference images: the queries themselves in one sequence."""
+        return self.query_images if self.reference_images is None else self.reference_images
+
+
+def load_tum(
+    folder: str | Path,
+    selection: Selection = ALL_FRAMES,
+    exclusion: Exclusion = TUM_EXCLUSION,
+    *,
+    max_distance_m: float = MAX_DISTANCE_M,
+    max_angle_deg: float = MAX_ANGLE_DEG,
+    soft_distance_m: float | None = None,
+    soft_angle_deg: float | None = None,
+    max_difference_s: float = MAX_DIFFERENCE_S,
+) -> DataSet:
+    """Load a TUM RGB-D sequence; truth by the paper's rule from its poses, with wider limits for soft truth if given.
+
+    Frames without a pose within ``max_difference_s`` are left out before ``selection`` counts.
+    """
+    sequence = read_tum_sequence(folder, max_difference_s)
+    taken = selection.numbers(len(sequence))
+    images = _existing([Path(folder) / sequence.frames[i].path for i in taken])
+    poses, stamps = sequence.poses[taken], sequence.stamps[taken]
+    hard = same_place_matrix(poses, poses, max_distance_m, max_angle_deg)
+    rule = f"same place: nearer than {max_distance_m:g} m and turned less than {max_angle_deg:g} degrees"
+    soft = None
+    if soft_distance_m is not None or soft_angle_deg is not None:
+        wide_m = max_distance_m if soft_distance_m is None else soft_distance_m
+        wide_deg = max_angle_deg if soft_angle_deg is None else soft_angle_deg
+        if wide_m < max_distance_m or wide_deg < max_angle_deg:
+            raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({rule})")
+        soft = same_place_matrix(poses, poses, wide_m, wide_deg)
+        rule += f" (soft: {wide_m:g} m, {wide_deg:g} degrees)"
+    notes = [f"frames without a pose, left out: {sequence.dropped}"] if sequence.dropped else []
+    truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
+    name = f"{sequence.name}{_selection_words(selection)}"
+    frames = _excluded_frames(exclusion, stamps)
+    return _checked(DataSet(name, images, None, truth, frames, stamps, poses.positions, poses.quaternions, notes), hard)
+
+
+def load_fabmap(
+    folder: str | Path,
+    truth_file: str | Path | None = None,
+    coordinates_file: str | Path | None = None,
+    camera: str = "both",
+    selection: Selection = ALL_FRAMES,
+    exclusion: Exclusion = FABMAP_EXCLUSION,
+    joined_folder: str | Path | None = None,
+) -> DataSet:
+    """Load a set in the form of FAB-MAP's New College and City Centre: numbered images of a left and a right camera.
+
+    Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
+    the coordinates (``*Coordinates.mat`` or ``.txt``) are looked for in the folder unless given.
+
+    camera   "left" or "right": the images of one; "both": all images, and pairs of a left with a right one are not
+             judged (the mask calls some the same place, though the two look to opposite sides); "joined": left and
+             right side by side as one image, written to ``joined_folder``, the same place if any of their views is
+    selection  counts images of one camera, or joined ones, or with "both" single ones
+    """
+    folder = Path(folder)
+    if camera not in CAMERAS:
+        raise InputError(f'unknown camera "{camera}"; known: {", ".join(CAMERAS)}')
+    images = image_paths(folder)
+    truth_path = Path(truth_file) if truth_file else _only_file(folder, ("*GroundTruth.mat",), "the mask of loops")
+    assert truth_path is not None
+    hard, soft, notes = _fold(truth_path, *read_truth_matrix(truth_path))
+    places = _sides(camera, len(images), len(hard), truth_path)
+    if camera == "joined" and len(hard) == len(images):
+        hard, soft = (_any_view(matrix) for matrix in (hard, soft))
+    elif len(hard) == len(images):
+        hard, soft = (matrix[np.ix_(places[:, 0], places[:, 0])] for matrix in (hard, soft))
+    taken = selection.numbers(len(places))
+    hard, soft, places = hard[np.ix_(taken, taken)], soft[np.ix_(taken, taken)], places[taken]
+    comparable = None
+    if camera == "both":
+        side = places[:, 0] % 2
+        comparable = side[:, None] == side[None, :]
+        notes.append("pairs of a left with a right image are not judged: the two cameras look to opposite sides")
+    if camera == "joined":
+        if joined_folder is None:
+            raise InputError("joined images have to be written somewhere; name a folder for them")
+        query_images = join_images([(images[a], images[b]) for a, b in places], Path(joined_folder))
+    else:
+        query_images = [images[place[0]] for place in places]
+    positions = _fabmap_positions(folder, coordinates_file, len(images), places)
+    rule = f"same place: as {truth_path.name} says"
+    truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=comparable)
+    words = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
+    name = f"{folder.resolve().name}, {words}{_selection_words(selection)}"
+    data = DataSet(name, query_images, None, truth, exclusion.frames, None, positions, None, notes)
+    return _checked(data, hard if comparable is None else hard & comparable)
+
+
+def load_folder(
+    images: str | Path,
+    truth_file: str | Path,
+    references: str | Path | None = None,
+    selection: Selection = ALL_FRAMES,
+    exclusion: Exclusion = FOLDER_EXCLUSION,
+) -> DataSet:
+    """Load images with a mask of their own: (N, N) of one sequence, or (Q, R) with ``references``, another folder.
+
+    With references ``selection`` concerns the queries, all references stay, and nothing is excluded.
+    """
+    queries = image_paths(images)
+    hard, soft = read_truth_matrix(truth_file)
+    name = f"{_folder_name(images)}{_selection_words(selection)}"
+    rule = f"same place: as {Path(truth_file).name} says"
+    if references is not None:
+        reference_images = image_paths(references)
+        if hard.shape != (len(queries), len(reference_images)):
+            turned = hard.shape == (len(reference_images), len(queries))
+            raise InputError(
+                f"is {hard.shape[0]} x {hard.shape[1]}, but there are {len(queries)} queries and "
+                f"{len(reference_images)} references{'; transpose it' if turned else ''}",
+                truth_file,
+            )
+        taken = selection.numbers(len(queries))
+        truth = traverse_truth(hard[taken], rule, soft=soft[taken])
+        return _checked(DataSet(name, [queries[i] for i in taken], reference_images, truth), truth.hard)
+    hard, soft, notes = _fold(Path(truth_file), hard, soft)
+    if len(hard) != len(queries):
+        raise InputError(f"is {len(hard)} x {len(hard)}, but there are {len(queries)} images in {images}", truth_file)
+    taken = selection.numbers(len(queries))
+    hard, soft = hard[np.ix_(taken, taken)], soft[np.ix_(taken, taken)]
+    truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=None)
+    data = DataSet(name, [queries[i] for i in taken], None, truth, exclusion.frames, notes=notes)
+    return _checked(data, hard)
+
+
+def load_traverses(
+    queries: str | Path,
+    references: str | Path,
+    tolerance: int = 0,
+    soft_tolerance: int | None = None,
+    selection: Selection = ALL_FRAMES,
+) -> DataSet:
+    """Load two traverses of one way whose frames of equal number show the same place (Nordland, corridor style).
+
+    ``tolerance``: frames i and j are the same place if |i - j| <= tolerance (counted before ``selection``, which takes
+    the same frames of both); ``soft_tolerance``, wider, for soft truth.
+    """
+    query_images, reference_images = image_paths(queries), image_paths(references)
+    if len(query_images) != len(reference_images):
+        raise InputError(
+            f"{len(query_images)} queries in {queries}, {len(reference_images)} references in {references}; "
+            "expected as many, since frame i of one is frame i of the other"
+        )
+    if tolerance < 0 or (soft_tolerance is not None and soft_tolerance < tolerance):
+        raise InputError(f"tolerance {tolerance}, soft tolerance {soft_tolerance}; expected 0 <= tolerance <= soft")
+    taken = selection.numbers(len(query_images))
+    apart = np.abs(np.subtract.outer(taken, taken))
+    rule = f"same place: at most {tolerance} frames apart" if tolerance else "same place: the frame of the same number"
+    soft = None if soft_tolerance is None else apart <= soft_tolerance
+    truth = traverse_truth(apart <= tolerance, rule, soft=soft)
+    name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_words(selection)}"
+    return DataSet(name, [query_images[i] for i in taken], [reference_images[i] for i in taken], truth)
+
+
+def load_place_pairs(folder: str | Path, selection: Selection = ALL_FRAMES) -> DataSet:
+    """Load places photographed twice: a folder with pairs.csv (place_id, query, ref); each query against all of ref."""
+    folder = Path(folder)
+    rows = read_place_pairs(folder / "pairs.csv")
+    rows = [rows[i] for i in selection.numbers(len(rows))]
+    places = np.array([place for place, _, _ in rows])
+    truth = traverse_truth(places[:, None] == places[None, :], "same place: the same place_id in pairs.csv")
+    name = f"{folder.resolve().name}{_selection_words(selection)}"
+    return DataSet(name, [query for _, query, _ in rows], [reference for _, _, reference in rows], truth)
+
+
+def join_images(pairs: SequenceOf[tuple[Path, Path]], folder: Path) -> list[Path]:
+    """Write left and right images side by side as PNG files into ``folder``; those already there are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    joined = []
+    for left, right in pairs:
+        path = folder / f"{left.stem}_{right.stem}.png"
+        if not path.is_file():
+            images = read_image(left), read_image(right)
+            if images[0].shape[0] != images[1].shape[0]:
+                raise InputError(f"is {images[1].shape[0]} pixels high, {left.name} {images[0].shape[0]}", right)
+            if not cv2.imwrite(str(path), np.hstack(images)):
+                raise InputError("cannot be written", path)
+        joined.append(path)
+    return joined
+
+
+def _fold(path: Path, hard: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Bring a square mask below the diagonal, where frame i stands against the earlier ones; say what was odd."""
+    if hard.shape[0] != hard.shape[1]:
+        raise InputError(f"is {hard.shape[0]} x {hard.shape[1]}; the mask of one sequence is square", path)
+    above = int(np.count_nonzero(np.triu(hard, 1)))
+    notes = []
+    if above and not np.array_equal(hard, hard.T):
+        notes.append(f"{path.name}: {above} entries above the diagonal were taken for loops of the later frame")
+    return np.tril(hard | hard.T, -1), np.tril(soft | soft.T, -1), notes
+
+
+def _sides(camera: str, images: int, size: int, path: Path) -> np.ndarray:
+    """Return the image numbers of each place: (places, 1), or (places, 2) left and right for joined images."""
+    if size != images and not (2 * size == images and camera != "both"):
+        halved = "; does the folder hold one camera's images only?" if size == 2 * images else ""
+        raise InputError(f"is {size} x {size}, but there are {images} images{halved}", path)
+    if camera == "both":
+        return np.arange(images)[:, None]
+    if images % 2:
+        raise InputError(f"{images} images cannot be pairs of a left and a right one")
+    left = np.arange(0, images, 2)
+    return {"left": left[:, None], "right": left[:, None] + 1, "joined": np.stack([left, left + 1], axis=1)}[camera]
+
+
+def _any_view(matrix: np.ndarray) -> np.ndarray:
+    """Reduce (2N, 2N) to (N, N): true where any of the four pairs of views is."""
+    half = len(matrix) // 2
+    return np.any(matrix.reshape(half, 2, half, 2), axis=(1, 3))
+
+
+def _fabmap_positions(
+    folder: Path, coordinates_file: str | Path | None, images: int, places: np.ndarray
+) -> np.ndarray | None:
+    path = Path(coordinates_file) if coordinates_file else _only_file(folder, ("*Coordinates.mat", "*Coordinates.txt"))
+    if path is None:
+        return None
+    coordinates = read_coordinates(path)
+    if len(coordinates) == images:
+        return coordinates[places[:, 0]]
+    if 2 * len(coordinates) == images:
+        return coordinates[places[:, 0] // 2]
+    raise InputError(f"has {len(coordinates)} rows, but there are {images} images", path)
+
+
+def _only_file(folder: Path, patterns: SequenceOf[str], needed: str = "") -> Path | None:
+    """Return the first file of the folder that fits a pattern; without one, None, or InputError where it is needed."""
+    for pattern in patterns:
+        found = sorted(folder.glob(pattern))
+        if found:
+            return found[0]
+    if needed:
+        raise InputError(f"has no {' or '.join(patterns)}, {needed}; name the file", folder)
+    return None
+
+
+def _folder_name(source: str | Path) -> str:
+    """Return the name of a folder, with its parent where many sets have one of that name."""
+    path = Path(source).resolve()
+    return f"{path.parent.name}/{path.name}" if path.name.lower() in COMMON_NAMES else path.name
+
+
+def _existing(images: list[Path]) -> list[Path]:
+    for path in images:
+        if not path.is_file():
+            raise InputError("no such image, though rgb.txt lists it", path)
+    return images
+
+
+def _excluded_frames(exclusion: Exclusion, stamps: np.ndarray) -> int:
+    """Return the least number of frames that covers the exclusion, seconds too."""
+    earliest = np.searchsorted(stamps, stamps - exclusion.seconds, side="right")
+    return max(exclusion.frames, int(np.max(np.arange(len(stamps)) - earliest)))
+
+
+def _selection_words(selection: Selection) -> str:
+    words = []
+    if selection.start not in (0, "0", "0%") or selection.stop is not None:
+        words.append(f"frames {selection.start} to {'the last' if selection.stop is None else selection.stop}")
+    if selection.stride > 1:
+        words.append(f"every {selection.stride}{ {2: 'nd', 3: 'rd'}.get(selection.stride, 'th') }")
+    if selection.limit is not None:
+        words.append(f"at most {selection.limit}")
+    return f" ({', '.join(words)})" if words else ""
+
+
+def _checked(data: DataSet, hard: np.ndarray) -> DataSet:
+    """Say how many loops the exclusion takes away, and refuse a set in which nothing is left to find."""
+    if data.reference_images is None:
+        whole = int(np.count_nonzero(np.tril(hard, -1)))
+        lost = whole - data.truth.positives
+        if lost:
+            data.notes.append(f"{lost} of {whole} pairs that show the same place are excluded as too near in time")
+    if not data.truth.positives:
+        raise InputError(
+            f"{data.name}: no judged pair shows the same place ({data.truth.sentence}); nothing can be found"
+        )
+    return data

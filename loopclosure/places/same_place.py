@@ -1,0 +1,80 @@
+"""The rule, once: when two poses are the same place. It labels training pairs and judges loop closures alike.
+
+The paper (section IV): the two cameras are less than 2 m apart and turned by less than 15 degrees against each other.
+Both poses must be in one frame of reference; which sequences share one is for the caller to know.
+
+Every function works on single poses and on arrays of them, element by element with numpy's broadcasting, and does the
+same arithmetic for a single pair as for a whole matrix, so that a label never depends on how it was computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopclosure.places.trajectory import Posed, Poses
+
+MAX_DISTANCE_M = 2.0
+MAX_ANGLE_DEG = 15.0
+
+
+def distances_m(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
+    """Distances (...) between the optical centres, in metres."""
+    step = pose_a.positions - pose_b.positions
+    return np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2 + step[..., 2] ** 2)
+
+
+def angles_deg(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
+    """Angles (...) of the rotations that turn one camera into the other, in degrees, 0 to 180."""
+    a, b = pose_a.quaternions, pose_b.quaternions
+    # q and -q are the same rotation: hence the absolute value. Rounding may leave it just above 1.
+    cosine = np.abs(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2] + a[..., 3] * b[..., 3])
+    return np.degrees(2 * np.arccos(np.minimum(cosine, 1.0)))
+
+
+def view_angles_deg(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
+    """Angles (...) between the viewing axes, in degrees: unlike :func:`angles_deg` blind to a roll about the axis."""
+    a, b = _viewing_axes(pose_a.quaternions), _viewing_axes(pose_b.quaternions)
+    cosine = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def same_place(
+    pose_a: Posed, pose_b: Posed, max_distance_m: float = MAX_DISTANCE_M, max_angle_deg: float = MAX_ANGLE_DEG
+) -> NDArray[np.bool_]:
+    """Tell for each pair (...) of poses whether it shows the same place: nearer and less turned than the two limits."""
+    return (distances_m(pose_a, pose_b) < max_distance_m) & (angles_deg(pose_a, pose_b) < max_angle_deg)
+
+
+def same_place_matrix(
+    pose_a: Posed, pose_b: Posed, max_distance_m: float = MAX_DISTANCE_M, max_angle_deg: float = MAX_ANGLE_DEG
+) -> NDArray[np.bool_]:
+    """Judge each of N poses against each of M: (N, M), one byte a pair; the working memory stays small."""
+    truth = np.empty((len(pose_a.positions), len(pose_b.positions)), bool)
+    for rows, block in same_place_blocks(pose_a, pose_b, max_distance_m, max_angle_deg):
+        truth[rows] = block
+    return truth
+
+
+def same_place_blocks(
+    pose_a: Posed,
+    pose_b: Posed,
+    max_distance_m: float = MAX_DISTANCE_M,
+    max_angle_deg: float = MAX_ANGLE_DEG,
+    pairs_at_once: int = 1_000_000,
+) -> Iterator[tuple[slice, NDArray[np.bool_]]]:
+    """Yield :func:`same_place_matrix` by blocks of rows, where N x M is too much to hold: (rows, (R, M) truth)."""
+    columns = Poses(pose_b.positions[None], pose_b.quaternions[None])
+    height = max(1, pairs_at_once // max(1, len(pose_b.positions)))
+    for start in range(0, len(pose_a.positions), height):
+        rows = slice(start, start + height)
+        block = Poses(pose_a.positions[rows, None], pose_a.quaternions[rows, None])
+        yield slice(start, start + len(block)), same_place(block, columns, max_distance_m, max_angle_deg)
+
+
+def _viewing_axes(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the cameras' +z axes (..., 3) in the world: the third column of each rotation matrix."""
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=-1)

@@ -1,0 +1,1 @@
+"""What came out, as a page, pictures, tables and files."""

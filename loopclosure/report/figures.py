@@ -1,0 +1,254 @@
+"""The pictures of the report: matrices, precision-recall curves, maps, matches; matplotlib figures, nothing written."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Colormap, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+
+from loopclosure.evaluate import Evaluation, Outcome
+from loopclosure.places.truth import Truth
+from loopclosure.precision_recall import BEST_MATCH, PrecisionRecall
+
+# Told apart by colour-blind readers too (Okabe and Ito).
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+FOUND, FALSE, MISSED = "#1a9641", "#d7191c", "#9e9e9e"
+NOT_JUDGED = "#ececec"
+SHOWN_CELLS = (
+    700  # a matrix with more rows or columns is drawn by the greatest of each block, or thin loops would vanish
+)
+COLUMNS = 4
+
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "legend.frameon": False,
+    "figure.dpi": 160,
+    "savefig.bbox": "tight",
+}
+
+
+def matrices(evaluation: Evaluation) -> Figure:
+    """Draw the truth and beside it the scores of every method (the paper's figures 5 and 6)."""
+    truth = evaluation.data.truth
+    panels = 1 + len(evaluation.outcomes)
+    with plt.rc_context(STYLE):
+        figure, axes = _grid(panels, 1.0 if truth.hard.shape[0] == truth.hard.shape[1] else 0.9)
+        shown = np.where(truth.hard, 2.0, np.where(truth.soft, 1.0, 0.0))
+        _draw_matrix(
+            axes[0], np.where(truth.judged, shown, np.nan), ListedColormap(["white", "#f4a582", "black"]), 0, 2
+        )
+        axes[0].set_title("ground truth")
+        for axis, outcome in zip(axes[1:], evaluation.outcomes, strict=True):
+            scores = np.where(truth.judged & np.isfinite(outcome.scores), outcome.scores, np.nan)
+            some = scores[np.isfinite(scores)]
+            low, high = np.percentile(some, [1, 99.5]) if len(some) else (0.0, 1.0)
+            _draw_matrix(axis, scores, plt.get_cmap("viridis"), float(low), float(high))
+            axis.set_title(outcome.name)
+        references = "earlier frame" if evaluation.data.reference_images is None else "reference"
+        for axis in axes:
+            axis.set_xlabel(references)
+        _label_left(axes, "frame" if references == "earlier frame" else "query")
+        _state_truth(figure, evaluation)
+        return figure
+
+
+def curves(evaluation: Evaluation) -> Figure:
+    """Draw the precision-recall curves of all methods, one panel for each convention."""
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
+        for axis, kind in zip(axes, ("pairs", "best"), strict=True):
+            convention = ""
+            for number, outcome in enumerate(evaluation.outcomes):
+                curve: PrecisionRecall = getattr(outcome, kind)
+                convention = curve.convention
+                _draw_curve(axis, curve, outcome.name, number)
+            if kind == "pairs":
+                curve = evaluation.outcomes[0].pairs
+                axis.axhline(curve.positives / max(curve.samples, 1), color="#888888", linewidth=0.7, linestyle=":")
+            axis.set_title(convention)
+            axis.set_xlabel("recall")
+            axis.set_ylabel("precision")
+            axis.set_xlim(-0.01, 1.01)
+            axis.set_ylim(0, 1.03)
+            axis.grid(color="#e6e6e6", linewidth=0.5)
+            axis.legend(title="average precision", fontsize=8, title_fontsize=8, loc="best", alignment="left")
+        _state_truth(figure, evaluation)
+        return figure
+
+
+def matches(evaluation: Evaluation) -> Figure:
+    """Draw for each method, frame against frame, the loops found, false and missed over the truth."""
+    with plt.rc_context(STYLE):
+        figure, axes = _grid(len(evaluation.outcomes), 1.0)
+        for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
+            _draw_matches(axis, outcome, evaluation.data.truth)
+            axis.set_title(outcome.name)
+        _label_left(axes, "query")
+        _loop_legend(figure)
+        _state_truth(figure, evaluation, BEST_MATCH)
+        return figure
+
+
+def has_map(evaluation: Evaluation) -> bool:
+    """Tell whether the loops can be drawn on a trajectory: one sequence, with positions."""
+    return evaluation.data.positions is not None and evaluation.data.reference_images is None
+
+
+def maps(evaluation: Evaluation) -> Figure:
+    """Draw for each method the loops found, false and missed as chords of the trajectory."""
+    positions = evaluation.data.positions
+    assert positions is not None
+    with plt.rc_context(STYLE):
+        figure, axes = _grid(len(evaluation.outcomes), 1.0)
+        for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
+            _draw_map(axis, outcome, evaluation.data.truth, positions)
+            axis.set_title(outcome.name)
+        _loop_legend(figure)
+        _state_truth(figure, evaluation, BEST_MATCH)
+        return figure
+
+
+def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split the queries at the best F1 of the best match of each query: numbers of found, false and missed ones.
+
+    A query with a loop whose match is wrong is both false and missed, and drawn as both.
+    """
+    accepted = (outcome.matches.reference >= 0) & (outcome.matches.score >= outcome.best.best_f1_threshold)
+    found = accepted & outcome.matches.right
+    false = accepted & ~outcome.matches.right & ~outcome.matches.ignored
+    missed = truth.queries_with_a_loop & ~found
+    return np.flatnonzero(found), np.flatnonzero(false), np.flatnonzero(missed)
+
+
+def best_true_references(outcome: Outcome, truth: Truth, queries: np.ndarray) -> np.ndarray:
+    """Return for each of these queries, which have a loop, the true reference that scored best."""
+    scores = np.where(truth.hard[queries] & truth.judged[queries], outcome.scores[queries], np.nan)
+    scores = np.where(np.isnan(scores), np.where(truth.hard[queries] & truth.judged[queries], -np.inf, np.nan), scores)
+    return np.nanargmax(scores, axis=1)
+
+
+def _draw_matrix(axis: Axes, values: np.ndarray, colours: Colormap, low: float, high: float) -> None:
+    rows, columns = values.shape
+    colours = colours.with_extremes(bad=NOT_JUDGED)
+    shown = _greatest_of_blocks(values, -(-max(rows, columns) // SHOWN_CELLS))
+    axis.imshow(
+        shown,
+        cmap=colours,
+        vmin=low,
+        vmax=max(high, low + 1e-12),
+        interpolation="nearest" if max(shown.shape) < 250 else "antialiased",
+        extent=(-0.5, columns - 0.5, rows - 0.5, -0.5),
+        interpolation_stage="rgba",
+    )
+    axis.spines[:].set_visible(True)
+    axis.tick_params(length=2, labelsize=7)
+
+
+def _greatest_of_blocks(values: np.ndarray, step: int) -> np.ndarray:
+    if step <= 1:
+        return values
+    rows, columns = (-(-n // step) * step for n in values.shape)
+    padded = np.full((rows, columns), np.nan)
+    padded[: values.shape[0], : values.shape[1]] = values
+    return np.fmax.reduce(np.fmax.reduce(padded.reshape(rows // step, step, columns // step, step), axis=3), axis=1)
+
+
+def _draw_curve(axis: Axes, curve: PrecisionRecall, name: str, number: int) -> None:
+    """Draw the steps whose area is the average precision, and a dot where precision leaves 1."""
+    colour = COLOURS[number % len(COLOURS)]
+    line = "-" if number < len(COLOURS) else "--"
+    recall, precision = np.append(0.0, curve.recall), np.append(curve.precision[:1], curve.precision)
+    recall = recall[: len(precision)]  # a method that says nothing has no point
+    area = f"{curve.average_precision:.3f}"
+    axis.plot(recall, precision, line, color=colour, linewidth=1.3, label=f"{area}  {name}", drawstyle="steps-pre")
+    if curve.recall_at_full_precision > 0:
+        axis.plot([curve.recall_at_full_precision], [1.0], "o", color=colour, markersize=4, clip_on=False)
+
+
+def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray) -> None:
+    spans = np.ptp(positions, axis=0)
+    across, along = sorted(np.argsort(-spans, kind="stable")[:2])
+    place = positions[:, [across, along]]
+    axis.plot(place[:, 0], place[:, 1], color="#303030", linewidth=0.6, zorder=1)
+    found, false, missed = decisions(outcome, truth)
+    lines = [
+        (missed, best_true_references(outcome, truth, missed), MISSED, 0.6),
+        (found, outcome.matches.reference[found], FOUND, 0.9),
+        (false, outcome.matches.reference[false], FALSE, 0.9),
+    ]
+    for order, (queries, references, colour, width) in enumerate(lines, start=2):
+        chords = np.stack([place[queries], place[references]], axis=1)
+        thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords are one blot
+        axis.add_collection(LineCollection(list(chords), colors=colour, linewidths=width * thin, zorder=order))
+        axis.plot(place[queries, 0], place[queries, 1], ".", color=colour, markersize=2.5, zorder=order)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel(f"{'xyz'[across]} [m]")
+    axis.set_ylabel(f"{'xyz'[along]} [m]")
+
+
+def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
+    found, false, missed = decisions(outcome, truth)
+    rows, columns = np.nonzero(truth.hard & truth.judged)
+    axis.plot(columns, rows, ".", color="#d8d8d8", markersize=3, zorder=1)
+    for order, (queries, references, colour) in enumerate(
+        [
+            (missed, best_true_references(outcome, truth, missed), MISSED),
+            (found, outcome.matches.reference[found], FOUND),
+            (false, outcome.matches.reference[false], FALSE),
+        ],
+        start=2,
+    ):
+        axis.plot(references, queries, ".", color=colour, markersize=4, zorder=order)
+    axis.set_xlim(-1, truth.hard.shape[1])
+    axis.set_ylim(truth.hard.shape[0], -1)
+    axis.set_xlabel("reference")
+
+
+def _loop_legend(figure: Figure) -> None:
+    colours = ((FOUND, "found"), (FALSE, "false"), (MISSED, "missed"))
+    lines = [Line2D([], [], color=colour, linewidth=2, label=label) for colour, label in colours]
+    figure.legend(handles=lines, loc="outside upper center", ncols=3)
+
+
+def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -> None:
+    """Print below the figure what it is judged by, so that it stands by itself."""
+    words = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.sentence}"
+    width = int(figure.get_figwidth() * 22)  # letters of this size that fit into the width
+    figure.supxlabel(textwrap.fill(words, width), fontsize=6.5, color="#777777")
+
+
+def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
+    """Make a figure of panels in even rows of at most COLUMNS; ``ratio`` is a panel's height over its width."""
+    rows = -(-panels // COLUMNS)
+    columns = -(-panels // rows)
+    width = 2.75 if columns > 2 else 3.4
+    size = (width * columns, width * ratio * rows + 0.35)
+    layout = ConstrainedLayoutEngine(h_pad=0.07)  # inches: a title stands clear of the panel above
+    figure, axes = plt.subplots(rows, columns, figsize=size, layout=layout, squeeze=False)
+    flat = list(axes.flat)
+    for axis in flat[panels:]:
+        axis.remove()
+    return figure, flat[:panels]
+
+
+def _label_left(axes: list[Axes], words: str) -> None:
+    """Label the vertical axis of the first panel of each row."""
+    for axis in axes:
+        place = axis.get_subplotspec()
+        if place is not None and place.is_first_col():
+            axis.set_ylabel(words)

@@ -1,0 +1,1 @@
+"""Visual words, and the methods that are built on them."""

@@ -1,0 +1,165 @@
+"""Visual words: local features of an image, the vocabulary they are sorted into, and how often each word occurs.
+
+A descriptor is a unit vector: SIFT (or, with ``root``, RootSIFT: the square roots of the histogram's shares,
+Arandjelovic and Zisserman, CVPR 2012), or the 256 bits of ORB as floats. An image without a single feature has no
+words; it is a place like any other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from loopclosure.errors import InputError
+from loopclosure.places.frames import grey
+
+# Rows at a time where a matrix of distances to all centres is needed: 4096 x 5000 words are 80 MB.
+BLOCK_ROWS = 4096
+KINDS = {"sift": 128, "orb": 256}
+
+
+@lru_cache(maxsize=8)
+def _detector(kind: str, max_features: int, contrast: float) -> Any:
+    if kind == "orb":
+        return cv2.ORB_create(nfeatures=max_features)  # pyright: ignore[reportAttributeAccessIssue]
+    sift = cv2.SIFT_create  # pyright: ignore[reportAttributeAccessIssue]
+    return sift(nfeatures=max_features, contrastThreshold=contrast)
+
+
+@dataclass(frozen=True)
+class Extractor:
+    """Local features of a grey image.
+
+    kind          "sift" or "orb"
+    max_features  the strongest so many of an image are kept
+    root          RootSIFT instead of SIFT
+    contrast      SIFT's contrast threshold (OpenCV's default); lower finds more in flat images
+    """
+
+    kind: str = "sift"
+    max_features: int = 400
+    root: bool = True
+    contrast: float = 0.04
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f'unknown kind of features "{self.kind}"; known: {", ".join(KINDS)}')
+        if self.max_features < 1:
+            raise InputError(f"max_features is {self.max_features}; at least one feature an image is needed")
+
+    @property
+    def size(self) -> int:
+        """Numbers in a descriptor."""
+        return KINDS[self.kind]
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Return the descriptors (n, size) float32 of an (H, W) or (H, W, 3) uint8 image; n may be 0."""
+        _, found = _detector(self.kind, self.max_features, self.contrast).detectAndCompute(grey(image), None)
+        if found is None or len(found) == 0:
+            return np.zeros((0, self.size), np.float32)
+        found = found[: self.max_features]  # SIFT returns more where the weakest have equal strength
+        if self.kind == "orb":
+            return np.unpackbits(found, axis=1).astype(np.float32)
+        tiny = np.float32(1e-12)
+        if self.root:
+            return np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), tiny))
+        return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), tiny)
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """The words: ``centres`` (v, d) float32, the extractor whose descriptors they sort, and how they were ``made``."""
+
+    centres: np.ndarray
+    extractor: Extractor
+    made: str = ""
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    def nearest(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return the word (n,) of each descriptor (n, d): its nearest centre."""
+        return nearest_centres(descriptors, self.centres)
+
+    def count(self, image: np.ndarray) -> np.ndarray:
+        """Return how often each word occurs in an (H, W) or (H, W, 3) uint8 image: (v,) int32."""
+        return self.count_descriptors(self.extractor(image))
+
+    def count_descriptors(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return how often each word occurs among descriptors (n, d): (v,) int32."""
+        return np.bincount(self.nearest(descriptors), minlength=len(self)).astype(np.int32)
+
+
+def nearest_centres(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Return the index (n,) of the centre (k, d) nearest to each descriptor (n, d) in Euclidean distance."""
+    half_norms = 0.5 * np.einsum("kd,kd->k", centres, centres)
+    nearest = np.empty(len(descriptors), np.intp)
+    for start in range(0, len(descriptors), BLOCK_ROWS):
+        block = descriptors[start : start + BLOCK_ROWS]
+        nearest[start : start + len(block)] = np.argmax(block @ centres.T - half_norms, axis=1)
+    return nearest
+
+
+def kmeans(descriptors: np.ndarray, words: int, seed: int = 0) -> np.ndarray:
+    """Return ``words`` centres (words, d) float32 of the descriptors (n, d) by mini-batch k-means."""
+    from sklearn.cluster import MiniBatchKMeans
+
+    if len(descriptors) < words:
+        raise InputError(
+            f"{len(descriptors)} descriptors cannot make {words} words; take more training images or fewer words"
+        )
+    clusters = MiniBatchKMeans(
+        words, batch_size=max(4096, 2 * words), max_iter=20, n_init="auto", random_state=seed, compute_labels=False
+    )
+    return np.asarray(clusters.fit(descriptors).cluster_centers_, np.float32)
+
+
+def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:
+    """Return the indices of the descriptors (n, d) that found a cluster: first pass of the sequential clustering.
+
+    In their order, each descriptor farther than ``radius`` from all founders before it becomes one.
+    """
+    chosen: list[int] = []
+    centres = np.empty((0, descriptors.shape[1]), descriptors.dtype)
+    for start in range(0, len(descriptors), BLOCK_ROWS):
+        block = descriptors[start : start + BLOCK_ROWS]
+        far = np.flatnonzero(_squared_distance_to_nearest(block, centres) > radius**2)
+        fresh: list[int] = []
+        while far.size:  # the first of those left founds a cluster and takes its neighbours with it
+            fresh.append(int(far[0]))
+            gaps = block[far] - block[far[0]]
+            far = far[np.einsum("nd,nd->n", gaps, gaps) > radius**2]
+        chosen += [start + index for index in fresh]
+        centres = np.concatenate([centres, block[fresh]])
+    return np.array(chosen, np.intp)
+
+
+def sequential_clusters(descriptors: np.ndarray, radius: float, seed: int | None = 0) -> np.ndarray:
+    """Return the centres (k, d) float32 of the modified sequential clustering (openFABMAP's BOWMSCTrainer).
+
+    The founders (see :func:`founders`) gather their nearest descriptors, and the means are the words. The outcome
+    depends on the order, so it is shuffled with ``seed``; None keeps the order given. Useful radii: 0.55 to 0.6 for
+    RootSIFT, 0.7 to 0.75 for SIFT, the root of the Hamming distance for ORB.
+    """
+    if len(descriptors) == 0:
+        raise InputError("no descriptors to cluster: the training images have no features")
+    if radius <= 0:
+        raise InputError(f"the radius of a cluster is {radius:g}; it must be positive")
+    if seed is not None:
+        descriptors = descriptors[np.random.default_rng(seed).permutation(len(descriptors))]
+    centres = descriptors[founders(descriptors, radius)]
+    nearest = nearest_centres(descriptors, centres)
+    sums = np.zeros(centres.shape, np.float64)
+    np.add.at(sums, nearest, descriptors)
+    return (sums / np.bincount(nearest, minlength=len(centres))[:, None]).astype(np.float32)
+
+
+def _squared_distance_to_nearest(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    if len(centres) == 0:
+        return np.full(len(descriptors), np.inf)
+    gaps = descriptors - centres[nearest_centres(descriptors, centres)]
+    return np.einsum("nd,nd->n", gaps, gaps)

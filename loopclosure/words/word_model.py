@@ -1,0 +1,139 @@
+"""What FAB-MAP and the bag of words learn beforehand, from images that are not tested, in one file to keep.
+
+A model file (.npz) holds the vocabulary, the words of the training images (FAB-MAP 2 samples its new place from them;
+the bag of words weighs words by them), the Chow-Liu tree, the extractor's settings and the training images' paths.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.errors import InputError
+from loopclosure.places.frames import read_grey
+from loopclosure.progress import Progress, silent, timed
+from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
+from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
+
+FORMAT = 1
+# The stages of ``train``: done once, whatever the number of tested images.
+TRAINING_STAGES = ("training features", "vocabulary", "training words", "tree")
+
+
+@dataclass(frozen=True)
+class WordModel:
+    """Vocabulary, ``training_words`` (n, v) counts of the training images, their paths, and the tree of the words."""
+
+    vocabulary: Vocabulary
+    training_words: np.ndarray
+    training_images: list[Path]
+    tree: WordTree
+
+    def words(
+        self, images: list[Path], progress: Progress = silent, seconds: dict[str, float] | None = None
+    ) -> np.ndarray:
+        """Return how often each word occurs in each image: (n, v) int32."""
+        seconds = {} if seconds is None else seconds
+        counts = np.zeros((len(images), len(self.vocabulary)), np.int32)
+        for i, path in enumerate(progress(images, "features", len(images))):
+            with timed(seconds, "features"):
+                descriptors = self.vocabulary.extractor(read_grey(path))
+            with timed(seconds, "words"):
+                counts[i] = self.vocabulary.count_descriptors(descriptors)
+        return counts
+
+    def save(self, path: Path) -> None:
+        """Write the model to ``path``, a .npz file."""
+        settings = {"format": FORMAT, "extractor": asdict(self.vocabulary.extractor), "made": self.vocabulary.made}
+        with open(path, "wb") as file:
+            np.savez_compressed(
+                file,
+                settings=json.dumps(settings),
+                centres=self.vocabulary.centres,
+                training_words=self.training_words,
+                training_images=np.array([str(image) for image in self.training_images], str),
+                parent=self.tree.parent,
+                marginal=self.tree.marginal,
+                given_present=self.tree.given_present,
+                given_absent=self.tree.given_absent,
+            )
+
+    @classmethod
+    def load(cls, path: Path) -> WordModel:
+        """Read a model that :meth:`save` wrote; InputError for any other file."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                settings = json.loads(str(file["settings"]))
+                if settings["format"] != FORMAT:
+                    raise InputError(f"a word model of format {settings['format']}; format {FORMAT} is known", path)
+                tree = WordTree(*(file[name] for name in ("parent", "marginal", "given_present", "given_absent")))
+                vocabulary = Vocabulary(file["centres"], Extractor(**settings["extractor"]), settings["made"])
+                images = [Path(image) for image in file["training_images"].tolist()]
+                return cls(vocabulary, file["training_words"], images, tree)
+        except InputError:
+            raise
+        except OSError as error:
+            raise InputError(f"cannot read the word model: {error.strerror or error}", path) from None
+        except (KeyError, TypeError, ValueError):
+            raise InputError("not a word model; make one by training", path) from None
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a word model is made.
+
+    words            of k-means; 0 clusters by ``radius`` instead
+    radius           of the modified sequential clustering, see :func:`sequential_clusters`
+    max_descriptors  so many of all images' descriptors are clustered, the same number of each image at most
+    lower_bound      see :func:`learn_tree`
+    seed             of everything drawn by lot
+    """
+
+    extractor: Extractor = field(default_factory=Extractor)
+    words: int = 2000
+    radius: float = 0.6
+    max_descriptors: int = 200_000
+    lower_bound: float = LOWER_BOUND
+    seed: int = 0
+
+
+def train(
+    images: Iterable[Path],
+    training: Training | None = None,
+    progress: Progress = silent,
+    seconds: dict[str, float] | None = None,
+) -> WordModel:
+    """Learn the words and their tree from images that will not be tested.
+
+    ``seconds`` gets the time of each stage. Without images, or without features in them: InputError.
+    """
+    training = training or Training()
+    seconds = {} if seconds is None else seconds
+    paths = [Path(image).resolve() for image in images]
+    if not paths:
+        raise InputError("a vocabulary needs training images (of other places than the tested ones), got none")
+    rng = np.random.default_rng(training.seed)
+    share = max(1, training.max_descriptors // len(paths))
+    found = []
+    for path in progress(paths, "training features", len(paths)):
+        with timed(seconds, "training features"):
+            found.append(training.extractor(read_grey(path)))
+    with timed(seconds, "vocabulary"):
+        sample = np.concatenate([d if len(d) <= share else rng.choice(d, share, replace=False) for d in found])
+        if training.words:
+            centres = kmeans(sample, training.words, training.seed)
+            how = f"k-means, {len(centres)} words"
+        else:
+            centres = sequential_clusters(sample, training.radius, training.seed)
+            how = f"sequential clustering, radius {training.radius:g}, {len(centres)} words"
+    made = f"{how} of {len(sample)} descriptors of {len(paths)} training images, seed {training.seed}"
+    vocabulary = Vocabulary(centres, training.extractor, made)
+    with timed(seconds, "training words"):
+        words = np.stack([vocabulary.count_descriptors(descriptors) for descriptors in found])
+    with timed(seconds, "tree"):
+        tree = learn_tree(words, training.lower_bound)
+    return WordModel(vocabulary, words, paths, tree)

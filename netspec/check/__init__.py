@@ -1,0 +1,1 @@
+"""What a net or a solver builds and measures, and what is likely wrong with it."""

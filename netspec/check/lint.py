@@ -1,0 +1,160 @@
+"""What is legal and yet likely a mistake: the warnings of ``netspec check``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from netspec.data.database import open_reader
+from netspec.errors import SpecError, Where
+from netspec.net.net import Net
+from netspec.proto.schema import TRAIN
+from netspec.proto.source_map import Place
+
+LMDB = 1  # caffe.proto: DataParameter.DB
+FAR = 0.1  # of the records may be missed, or met twice, by a test
+#: What of the settings of a rate policy, and of an update rule, each reads.
+POLICY_SETTINGS = {
+    "step": ("gamma", "stepsize"),
+    "exp": ("gamma",),
+    "inv": ("gamma", "power"),
+    "multistep": ("gamma", "stepvalue"),
+    "poly": ("power",),
+    "sigmoid": ("gamma", "stepsize"),
+}
+RULE_SETTINGS = {
+    "adagrad": ("delta",),
+    "rmsprop": ("delta", "rms_decay"),
+    "adadelta": ("delta",),
+    "adam": ("delta", "momentum2"),
+}
+
+
+def net_advice(net: Net) -> Iterator[str]:
+    """Yield a line for each thing in a built net that is likely wrong."""
+    yield from _towers(net)
+    yield from _losses(net)
+    yield from _unused(net)
+    yield from _bare_batch_norms(net)
+    yield from _namesakes(net)
+
+
+def solver_advice(solver: Any, node: Place, nets: list[Net]) -> Iterator[str]:
+    """Yield a line for each thing in a solver, with its built nets (training net first), that is likely wrong."""
+    if solver.snapshot > solver.max_iter:
+        yield f"{node.find('snapshot')}: snapshot {solver.snapshot} never fires in max_iter {solver.max_iter}"
+    elif not solver.snapshot and not solver.snapshot_after_train:
+        yield f"{node.where}: no snapshot is ever taken; set snapshot, or snapshot_after_train: true"
+    for name in _settings_without_effect(solver):
+        yield f"{node.find(name)}: {name} has no effect with type {solver.type} and lr_policy {solver.lr_policy}"
+    for k, net in enumerate(nets[1:]):
+        yield from _test_size(solver.test_iter[k], node.find("test_iter", k), net)
+
+
+def _settings_without_effect(solver: Any) -> Iterator[str]:
+    for table, chosen in ((POLICY_SETTINGS, solver.lr_policy), (RULE_SETTINGS, solver.type.lower())):
+        used = table.get(chosen, ())
+        for name in dict.fromkeys(name for names in table.values() for name in names):
+            given = len(getattr(solver, name)) if name == "stepvalue" else solver.HasField(name)
+            if given and name not in used:
+                yield name
+
+
+def missing_data(net: Any, kept: Any, source: Any) -> Iterator[str]:
+    """Yield a line where every data layer of ``net`` was filtered away and nothing feeds what is ``kept``."""
+    readers = [i for i, layer in enumerate(net.layer) if not layer.bottom and layer.type != "Input"]
+    fed = any(not layer.bottom for layer in kept.layer)
+    if readers and kept.layer and not fed:
+        layer = net.layer[readers[0]]
+        place = source.at(readers[0], layer=layer.name, type=layer.type)
+        yield f"{place}: no data layer is left in this phase; add one with include {{ phase: ... }}"
+
+
+def _towers(net: Net) -> Iterator[str]:
+    """A ContrastiveLoss compares two towers: whatever one of them learns, the other should share."""
+    producer = {v: i for i, node in enumerate(net.plan.nodes) for v in node.tops}
+
+    def upstream(v: int) -> set[int]:
+        found: set[int] = set()
+        pending = [v]
+        while pending:
+            i = producer[pending.pop()]
+            if i not in found:
+                found.add(i)
+                pending.extend(net.plan.nodes[i].bottoms)
+        return found
+
+    for node in net.plan.nodes:
+        if node.type != "ContrastiveLoss":
+            continue
+        first, second = (upstream(v) for v in node.bottoms[:2])
+        shared = {id(blob) for i in first for blob in net.layers[i].blobs}
+        for i in sorted(second - first):
+            count = sum(id(blob) not in shared for blob in net.layers[i].blobs)
+            if count:
+                total = len(net.layers[i].blobs)
+                yield (
+                    f"{_place(net, i)}: {count} of its {total} parameter blobs are not shared with the other tower of "
+                    f'"{node.name}"; give them the same param {{ name }}'
+                )
+
+
+def _losses(net: Net) -> Iterator[str]:
+    if net.phase != TRAIN:
+        return
+    for i, weights in enumerate(net.loss_weights):
+        if any(weights) and not net.backward_plan.layers[i]:
+            yield f"{_place(net, i)}: nothing that learns reaches this loss"
+
+
+def _unused(net: Net) -> Iterator[str]:
+    if not any(any(weights) for weights in net.loss_weights):
+        return  # a deploy net: its outputs are what it is for
+    weighted = net.output_loss_weights
+    for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
+        for v in node.tops:
+            name = net.plan.blobs[v]
+            if net.plan.outputs.get(name) == v and not weighted[name] and not layer.label_bottoms and not layer.is_loss:
+                yield f'{_place(net, i)}: blob "{name}" is used by nothing'
+
+
+def _bare_batch_norms(net: Net) -> Iterator[str]:
+    readers: dict[int, set[str]] = {}
+    for node in net.plan.nodes:
+        for v in node.bottoms:
+            readers.setdefault(v, set()).add(node.type)
+    for i, node in enumerate(net.plan.nodes):
+        if node.type == "BatchNorm" and "Scale" not in readers.get(node.tops[0], set()):
+            yield f"{_place(net, i)}: no Scale layer follows; Caffe's BatchNorm has no scale and shift of its own"
+
+
+def _namesakes(net: Net) -> Iterator[str]:
+    """Saved weights find their layer by its name."""
+    names: set[str] = set()
+    for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
+        if node.name in names and layer.blob_shapes:
+            yield f"{_place(net, i)}: an earlier layer has this name, and gets the weights that are loaded by it"
+        names.add(node.name)
+
+
+def _test_size(iterations: int, where: Where, net: Net) -> Iterator[str]:
+    """Compare the records that a test reads with those there are, where the database is at hand."""
+    for layer in net.layers:
+        source = layer.param.data_param.source
+        if not source:
+            continue
+        try:
+            backend = "lmdb" if layer.param.data_param.backend == LMDB else "leveldb"
+            reader = open_reader(source, backend, where)
+        except SpecError:
+            return
+        batch = layer.param.data_param.batch_size
+        records, read = len(reader), iterations * batch
+        if abs(read - records) > FAR * records:
+            yield f'{where}: test_iter {iterations} x batch {batch} = {read}, but "{source}" has {records} records'
+        return
+
+
+def _place(net: Net, i: int) -> Where:
+    node = net.plan.nodes[i]
+    return net.plan.source.at(i, layer=node.name, type=node.type)

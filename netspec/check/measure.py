@@ -1,0 +1,117 @@
+"""Runs of a whole net that only measure: ``caffe test`` and ``caffe time`` (Caffe: tools/caffe.cpp)."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+
+from netspec.log import info, number
+from netspec.net.net import Net
+
+
+def test_net(net: Net, iterations: int) -> dict[str, float | list[float]]:
+    """Run ``iterations`` batches; log each batch's outputs and their means, and return the means by output blob."""
+    info("caffe.cpp:281", f"Running for {iterations} iterations.")
+    totals: dict[str, list[float]] = {}
+    total_loss = 0.0
+    with torch.no_grad():
+        for batch in range(iterations):
+            loss, outputs = net.forward_loss()
+            total_loss += loss.item()
+            for name, blob in outputs.items():
+                scores = [float(score) for score in blob.reshape(-1).tolist()]
+                sums = totals.setdefault(name, [0.0] * len(scores))
+                for k, score in enumerate(scores):
+                    sums[k] += score
+                    info("caffe.cpp:304", f"Batch {batch}, {name} = {number(score)}")
+    info("caffe.cpp:309", f"Loss: {number(total_loss / iterations)}")
+    means: dict[str, float | list[float]] = {}
+    for name, sums in totals.items():
+        weight = net.output_loss_weights[name]
+        row = [value / iterations for value in sums]
+        for mean in row:
+            ending = f" (* {number(weight)} = {number(weight * mean)} loss)" if weight else ""
+            info("caffe.cpp:321", f"{name} = {number(mean)}{ending}")
+        means[name] = row[0] if len(row) == 1 else row
+    return means
+
+
+def time_net(net: Net, iterations: int) -> None:
+    """Run ``iterations`` forward and backward passes layer by layer and log the milliseconds of each layer."""
+    layers = len(net.layers)
+    info("caffe.cpp:351", "Performing Forward")
+    info("caffe.cpp:356", f"Initial loss: {number(_pass(net, [0.0] * layers, [0.0] * layers))}")
+    info("caffe.cpp:357", "Performing Backward")
+    info("caffe.cpp:365", "*** Benchmark begins ***")
+    info("caffe.cpp:366", f"Testing for {iterations} iterations.")
+    forward, backward = [0.0] * layers, [0.0] * layers
+    began = time.perf_counter()
+    for k in range(1, iterations + 1):
+        start = time.perf_counter()
+        _pass(net, forward, backward)
+        info(
+            "caffe.cpp:394", f"Iteration: {k} forward-backward time: {number((time.perf_counter() - start) * 1e3)} ms."
+        )
+    total = (time.perf_counter() - began) * 1e3
+    info("caffe.cpp:397", "Average time per layer: ")
+    for node, ahead, back in zip(net.plan.nodes, forward, backward, strict=True):
+        info("caffe.cpp:400", f"{node.name:>10}\tforward: {number(ahead * 1e3 / iterations)} ms.")
+        info("caffe.cpp:403", f"{node.name:>10}\tbackward: {number(back * 1e3 / iterations)} ms.")
+    info("caffe.cpp:408", f"Average Forward pass: {number(sum(forward) * 1e3 / iterations)} ms.")
+    info("caffe.cpp:410", f"Average Backward pass: {number(sum(backward) * 1e3 / iterations)} ms.")
+    info("caffe.cpp:412", f"Average Forward-Backward: {number(total / iterations)} ms.")
+    info("caffe.cpp:414", f"Total Time: {number(total)} ms.")
+    info("caffe.cpp:415", "*** Benchmark ends ***")
+
+
+def _pass(net: Net, forward: list[float], backward: list[float]) -> float:
+    """Run each layer forward, then each backward on its own graph; add the seconds; return the loss.
+
+    Inputs that the caller would give are zeros.
+    """
+    inputs = {name: torch.zeros(net.shapes[name], device=net.device) for name in net.inputs}
+    values: dict[int, torch.Tensor] = {}
+    made: list[tuple[list[torch.Tensor], tuple[torch.Tensor, ...]]] = []
+    loss = 0.0
+    for i, node in enumerate(net.plan.nodes):
+        leaves = {
+            v: values[v].detach().requires_grad_(wanted and values[v].is_floating_point())
+            for v, wanted in zip(node.bottoms, net.backward_plan.bottoms[i], strict=True)
+        }
+        _wait(net)
+        start = time.perf_counter()
+        tops = net.run_layer(i, leaves, inputs)
+        _wait(net)
+        forward[i] += time.perf_counter() - start
+        made.append(([leaves[v] for v in node.bottoms], tops))
+        values.update(zip(node.tops, tops, strict=False))
+        loss += sum(w * top.detach().sum().item() for top, w in zip(tops, net.loss_weights[i], strict=True) if w)
+    gradients: dict[int, torch.Tensor] = {}
+    for i in reversed(range(len(made))):
+        node = net.plan.nodes[i]
+        leaves, tops = made[i]
+        outs, diffs = [], []
+        for j, top in enumerate(tops):
+            diff = gradients.get(node.tops[j]) if j < len(node.tops) else None
+            if net.loss_weights[i][j]:
+                diff = torch.full_like(top, net.loss_weights[i][j])
+            if diff is not None and top.requires_grad:
+                outs.append(top)
+                diffs.append(diff)
+        _wait(net)
+        start = time.perf_counter()
+        if outs:
+            torch.autograd.backward(outs, diffs)
+        _wait(net)
+        backward[i] += time.perf_counter() - start
+        for v, leaf in zip(node.bottoms, leaves, strict=True):
+            if leaf.grad is not None:
+                gradients[v] = gradients[v] + leaf.grad if v in gradients else leaf.grad
+    net.zero_grad()
+    return loss
+
+
+def _wait(net: Net) -> None:
+    if net.device.type == "cuda":
+        torch.cuda.synchronize(net.device)

@@ -1,0 +1,31 @@
+"""The command line: one module for each command or family of commands; it computes nothing.
+
+Options may be written as gflags let Caffe's users write them: ``-solver s``, ``--solver=s``, ``-gpu 0``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from netspec.cli import caffe_tools, check, extract, measure, train
+from netspec.cli.run import Commands, run
+
+_FAMILIES = (train, measure, check, extract, caffe_tools)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage."""
+    return run(parser(), list(sys.argv[1:] if argv is None else argv))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    made = argparse.ArgumentParser(
+        prog="netspec", description="Run Caffe's prototxt in PyTorch, with Caffe's numbers.", allow_abbrev=False
+    )
+    commands = Commands(made)
+    for family in _FAMILIES:
+        family.add_to(commands)
+    return made

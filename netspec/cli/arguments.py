@@ -1,0 +1,117 @@
+"""Options that several commands have, and what their words mean."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from netspec import log
+from netspec.errors import SpecError
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Add ``--gpu``."""
+    parser.add_argument(
+        "--gpu", default="", help="the GPU; for training also several: 0,1 or all (default: as the solver says)"
+    )
+
+
+def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
+    """Add ``--level``, ``--stage`` and, with a default, ``--phase``."""
+    if phase:
+        parser.add_argument(
+            "--phase", default=phase, choices=("TEST", "TRAIN"), type=str.upper, help=f"default: {phase}"
+        )
+    parser.add_argument("--level", type=int, default=0, help="the NetState's level (default: 0)")
+    parser.add_argument("--stage", default="", help="the NetState's stages, separated by commas")
+
+
+def add_python(parser: argparse.ArgumentParser) -> None:
+    """Add ``--allow-python-layers``."""
+    parser.add_argument(
+        "--allow-python-layers", action="store_true", help="let Python layers of the net run their code"
+    )
+
+
+def positive(text: str) -> int:
+    """Read a whole number above 0."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a positive number")
+    return value
+
+
+def shape(text: str) -> tuple[str, tuple[int, ...]]:
+    """Read ``BLOB=N,C,H,W``."""
+    match = re.fullmatch(r"([^=]+)=(\d+(?:,\d+)*)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected BLOB=N,C,H,W, e.g. data=32,3,224,224")
+    return match[1], tuple(int(d) for d in match[2].split(","))
+
+
+def stages(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return the stages of ``--stage``."""
+    return tuple(stage for stage in arguments.stage.split(",") if stage)
+
+
+def devices(gpu: str) -> list[Any]:
+    """Return the torch devices of ``--gpu``: the CPU where it is empty, every GPU for ``all``, else those numbered."""
+    import torch
+
+    if not gpu:
+        return [torch.device("cpu")]
+    count = torch.cuda.device_count()
+    numbers = [str(k) for k in range(count)] or ["0"] if gpu == "all" else gpu.split(",")
+    for number in numbers:
+        if not number.isdigit():
+            raise SpecError(f"--gpu {gpu}: expected the number of a GPU, several separated by commas, or all")
+        if int(number) >= count:
+            raise SpecError(
+                f"--gpu {gpu}: this machine has {count or 'no'} GPU(s) that torch can use; leave --gpu out for the CPU"
+            )
+    return [torch.device("cuda", int(number)) for number in numbers]
+
+
+def device(gpu: str) -> Any:
+    """Return the one torch device of ``--gpu``."""
+    first, *others = devices(gpu)
+    if others:
+        raise SpecError(f"--gpu {gpu}: several GPUs are for training; give one number")
+    return first
+
+
+def bar(description: str, unit: str) -> Callable[[Any], Any]:
+    """Return a wrapper that shows a progress bar on a terminal."""
+    from tqdm import tqdm
+
+    return lambda items: tqdm(items, desc=description, unit=unit, disable=not sys.stderr.isatty(), leave=False)
+
+
+def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str) -> Any:
+    """Return the net of ``--model``, on the device of ``--gpu``; the sites are where Caffe logs which device."""
+    from netspec.net.build import load_net
+
+    chosen = device(arguments.gpu)
+    if chosen.type == "cpu":
+        log.info(cpu_site, "Use CPU.")
+    else:
+        log.info(gpu_site, f"Use GPU with device ID {chosen.index}")
+    return load_net(
+        arguments.model,
+        phase,
+        level=arguments.level,
+        stages=arguments.stage.split(","),  # without --stage an empty one, as in Caffe
+        device=chosen,
+        allow_python=arguments.allow_python_layers,
+    )
+
+
+def load_weights(net: Any, paths: str | None) -> None:
+    """Load weights from one file after the other; their paths are separated by commas."""
+    from netspec.net import weights
+
+    for path in paths.split(",") if paths else ():
+        weights.load_weights(net, path.strip())

@@ -1,0 +1,113 @@
+"""Caffe's smaller tools, under their own names."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+
+from netspec import log
+from netspec.cli.arguments import device, positive
+from netspec.cli.run import Commands
+from netspec.errors import SpecError
+
+
+def add_to(commands: Commands) -> None:
+    """Add the commands."""
+    p = commands.add(
+        "extract_features", _extract_features, "write blobs to databases of float Datums (extract_features)"
+    )
+    p.set_defaults(log_level=logging.WARNING)  # Caffe's tool does not tell how it builds the net
+    p.add_argument("weights", help="the trained weights")
+    p.add_argument("model", help="the net's prototxt, with a data layer")
+    p.add_argument("blobs", help="blob names, separated by commas")
+    p.add_argument("databases", help="as many databases to write, separated by commas")
+    p.add_argument("batches", type=positive, help="mini-batches to run")
+    p.add_argument("db_type", choices=("lmdb", "leveldb"))
+    p.add_argument("mode", nargs="?", choices=("CPU", "GPU"), default="CPU")
+    p.add_argument("device", nargs="?", default="0", metavar="DEVICE_ID=0")
+
+    p = commands.add("device_query", _device_query, "show the GPUs (caffe device_query)")
+    p.add_argument("--gpu", default="all", help="one number, several separated by commas, or all (the default)")
+
+    for name, function, what in (
+        ("upgrade_net_proto_text", _upgrade_net_text, "a net's prototxt"),
+        ("upgrade_net_proto_binary", _upgrade_net_binary, "a .caffemodel"),
+        ("upgrade_solver_proto_text", _upgrade_solver_text, "a solver's prototxt"),
+    ):
+        p = commands.add(name, function, f"write {what} in the current format")
+        p.add_argument("input", metavar="IN")
+        p.add_argument("output", metavar="OUT")
+
+    commands.add("layers", _layers, "print the layers it knows, from their own descriptions")
+
+
+def _extract_features(arguments: argparse.Namespace) -> None:
+    from netspec.features.databases import extract_features as write_features
+    from netspec.net.build import load_net
+
+    number = arguments.device.rpartition("=")[2]
+    log.error("extract_features.cpp:62", "Using CPU" if arguments.mode == "CPU" else f"Using GPU {number}")
+    net = load_net(arguments.model, "TEST", arguments.weights, device=device(number if arguments.mode == "GPU" else ""))
+    write_features(
+        net, arguments.blobs.split(","), arguments.databases.split(","), arguments.batches, arguments.db_type
+    )
+    net.close()
+
+
+def _device_query(arguments: argparse.Namespace) -> None:
+    import torch
+
+    log.info("caffe.cpp:142", f"Querying GPUs {arguments.gpu}")
+    count = torch.cuda.device_count()
+    numbers = range(count) if arguments.gpu == "all" else [device(n).index for n in arguments.gpu.split(",")]
+    if not count:
+        raise SpecError("torch finds no GPU on this machine")
+    for number in numbers:
+        properties = torch.cuda.get_device_properties(number)
+        for title, value in (
+            ("Device id:", number),
+            ("Major revision number:", properties.major),
+            ("Minor revision number:", properties.minor),
+            ("Name:", properties.name),
+            ("Total global memory:", properties.total_memory),
+            ("Number of multiprocessors:", properties.multi_processor_count),
+        ):
+            log.info("common.cpp:178", f"{title:<31}{value}")
+
+
+def _upgrade_net_text(arguments: argparse.Namespace) -> None:
+    from netspec.proto.text import read_net, write_text
+
+    _write(arguments.output, write_text(read_net(arguments.input)).encode())
+    log.info("upgrade_net_proto_text.cpp:49", f"Wrote upgraded NetParameter text proto to {arguments.output}")
+
+
+def _upgrade_net_binary(arguments: argparse.Namespace) -> None:
+    from netspec.proto.binary import read_net_binary
+
+    _write(arguments.output, read_net_binary(arguments.input).SerializeToString())
+    log.info("upgrade_net_proto_binary.cpp:49", f"Wrote upgraded NetParameter binary proto to {arguments.output}")
+
+
+def _upgrade_solver_text(arguments: argparse.Namespace) -> None:
+    from netspec.proto.text import read_solver, write_text
+
+    _write(arguments.output, write_text(read_solver(arguments.input)).encode())
+    log.info("upgrade_solver_proto_text.cpp:49", f"Wrote upgraded SolverParameter text proto to {arguments.output}")
+
+
+def _write(path: str, data: bytes) -> None:
+    try:
+        Path(path).write_bytes(data)
+    except OSError as fault:
+        raise SpecError(f"{path}: cannot be written: {fault.strerror}") from None
+
+
+def _layers(arguments: argparse.Namespace) -> None:
+    from netspec.layers import layer_class, layer_types
+
+    for name in layer_types():
+        cls = layer_class(name)
+        first = ((cls and cls.__doc__) or "").strip().splitlines()[0]
+        print(f"{name:28} {first}")

@@ -1,0 +1,59 @@
+"""``netspec check``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+
+from netspec.cli.arguments import add_python, add_state, shape, stages
+from netspec.cli.run import Commands
+from netspec.proto.schema import PHASES
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add("check", _check, "build a net, or a solver's nets, without opening data; report every fault")
+    p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
+    p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
+    add_state(p, phase="TEST")
+    p.add_argument(
+        "--shape",
+        action="append",
+        default=[],
+        type=shape,
+        metavar="BLOB=N,C,H,W",
+        help="the shape of a data layer's top",
+    )
+    p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")
+    add_python(p)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from netspec.check.check import check_file
+    from netspec.check.table import as_json, table
+
+    shapes = dict(arguments.shape)
+    checked = check_file(
+        arguments.file,
+        PHASES[arguments.phase],
+        arguments.level,
+        stages(arguments),
+        shapes,
+        arguments.allow_python_layers,
+    )
+    for line in dict.fromkeys(line for part in checked for line in part.advice):
+        print(f"warning: {line}", file=sys.stderr)
+    faults = dict.fromkeys(str(fault) for part in checked for fault in part.faults)
+    if faults:
+        print("\n".join(faults), file=sys.stderr)
+        return 1
+    nets = [(part.label, part.net) for part in checked if part.net is not None]
+    if arguments.json:
+        found = {label: as_json(net) for label, net in nets}
+        print(json.dumps(next(iter(found.values())) if len(found) == 1 else found))
+        return 0
+    for label, net in nets:
+        print(f"{label}: {net.name or 'a net without a name'}\n{table(net)}\n")
+    return 0

@@ -1,0 +1,43 @@
+"""``netspec test`` and ``netspec time``."""
+
+from __future__ import annotations
+
+import argparse
+
+from netspec.cli.arguments import add_device, add_python, add_state, load, load_weights, positive
+from netspec.cli.run import Commands
+
+
+def add_to(commands: Commands) -> None:
+    """Add the commands."""
+    p = commands.add("test", _test, "score a model on its TEST-phase data (caffe test)")
+    p.add_argument("--model", required=True, help="the net's prototxt")
+    p.add_argument("--weights", required=True, help="the trained weights")
+    p.add_argument("--iterations", type=positive, default=50, help="batches to run (default: 50)")
+    add_device(p)
+    add_state(p, phase=None)
+    add_python(p)
+
+    p = commands.add("time", _time, "measure a model's forward and backward milliseconds a layer (caffe time)")
+    p.add_argument("--model", required=True, help="the net's prototxt")
+    p.add_argument("--iterations", type=positive, default=50, help="passes to time (default: 50)")
+    add_device(p)
+    add_state(p, phase="TRAIN")
+    add_python(p)
+
+
+def _test(arguments: argparse.Namespace) -> None:
+    from netspec.check.measure import test_net
+
+    net = load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
+    load_weights(net, arguments.weights)
+    test_net(net, arguments.iterations)
+    net.close()
+
+
+def _time(arguments: argparse.Namespace) -> None:
+    from netspec.check.measure import time_net
+
+    net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343")
+    time_net(net, arguments.iterations)
+    net.close()

@@ -1,0 +1,58 @@
+"""``netspec train``."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+
+from netspec import log
+from netspec.cli.arguments import add_device, add_python, add_state, devices
+from netspec.cli.run import Commands, WrongUsage, signals
+
+EFFECTS = ("stop", "snapshot", "none")
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add("train", _train, "train or fine-tune a model (caffe train)")
+    p.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
+    p.add_argument("--solver", help="the solver's prototxt")
+    p.add_argument("--snapshot", help="a .solverstate to resume from")
+    p.add_argument("--weights", help="weights to start from, several separated by commas")
+    add_device(p)
+    add_state(p, phase=None)
+    p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
+    p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="default: snapshot")
+    add_python(p)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
+    from netspec.solver.solver import load_solver
+
+    path = arguments.solver or arguments.path
+    if not path or (arguments.solver and arguments.path):
+        raise WrongUsage("need one solver definition: netspec train solver.prototxt")
+    if arguments.snapshot and arguments.weights:
+        raise WrongUsage("give a snapshot to resume training or weights to fine-tune, not both")
+    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGHUP: arguments.sighup_effect}
+    with signals(effects) as action:
+        solver = load_solver(
+            path,
+            weights=arguments.weights,
+            snapshot=arguments.snapshot,
+            device=devices(arguments.gpu) if arguments.gpu else None,
+            level=arguments.level,
+            stages=tuple(arguments.stage.split(",")),
+            allow_python=arguments.allow_python_layers,
+            action=action,
+        )
+        log.info("caffe.cpp:239", "Starting Optimization")
+        total, first, hidden = solver.param.max_iter, solver.iteration, not sys.stderr.isatty()
+        with tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False) as bar:
+            solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
+            solver.solve()
+        solver.close()
+    log.info("caffe.cpp:250", "Optimization Done.")

@@ -1,0 +1,61 @@
+"""Features as Caffe's own tool writes them: one float Datum a record, in a database a blob.
+
+Caffe: tools/extract_features.cpp
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+import torch
+
+from netspec import log
+from netspec.data.database import Writer
+from netspec.data.datum import array_to_datum
+from netspec.errors import SpecError, Where
+from netspec.net.net import Net
+
+COMMITTED = 1000  # records between two commits, each of which is told
+
+
+def extract_features(net: Net, blobs: Sequence[str], databases: Sequence[str], batches: int, backend: str) -> None:
+    """Run ``batches`` mini-batches and write each blob's rows to its database, under keys ``%010d``.
+
+    A row (C, H, W) stays so; a row of fewer axes is filled up with ones at the end. Raises SpecError where the
+    counts of names differ or the net lacks a blob.
+    """
+    where = Where(net.plan.source.file)
+    if len(blobs) != len(databases):
+        raise SpecError(f"found {len(blobs)} blob names and {len(databases)} databases, expected as many", where)
+    for name in blobs:
+        if name not in net.shapes:
+            raise SpecError(f'no blob "{name}" in this net; it has: {", ".join(net.shapes)}', where)
+        if not 1 <= len(net.shapes[name]) <= 4:
+            raise SpecError(f'blob "{name}" has shape {net.shapes[name]}, expected 1 to 4 axes', where)
+    net.keep = list(blobs)
+    log.error("extract_features.cpp:133", "Extracting Features")
+    written = 0
+    with ExitStack() as stack, torch.no_grad():
+        writers = [stack.enter_context(Writer(path, backend)) for path in databases]
+        for _ in range(batches):
+            net()
+            rows = 0
+            for name, writer in zip(blobs, writers, strict=True):
+                values = net.blobs[name].cpu().numpy()
+                rows = len(values)
+                shape = (*values.shape[1:], 1, 1, 1)[:3]
+                for n, value in enumerate(values):
+                    datum = array_to_datum(value.reshape(shape))
+                    writer.put(b"%010d" % (written + n), datum.SerializeToString())
+            if (written + rows) // COMMITTED > written // COMMITTED:
+                _tell(written + rows, blobs)
+            written += rows
+    if written % COMMITTED:
+        _tell(written, blobs)
+    log.error("extract_features.cpp:181", "Successfully extracted the features!")
+
+
+def _tell(count: int, blobs: Sequence[str]) -> None:
+    for name in blobs:
+        log.error("extract_features.cpp:176", f"Extracted features of {count} query images for feature blob {name}")

@@ -1,0 +1,74 @@
+"""Blobs of a net over the records of its data layer (Caffe: tools/extract_features.cpp)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from netspec.errors import SpecError, Where, did_you_mean
+from netspec.net.net import Net
+
+Progress = Callable[[Iterable[int]], Iterable[int]]  # tqdm's form: wraps what is counted
+
+
+def with_sources(net: Any, source: Any, sources: dict[str, str]) -> Any:
+    """Return a copy of the net in which the named data layers read other databases (layer name -> path)."""
+    changed = type(net)()
+    changed.CopyFrom(net)
+    for name, path in sources.items():
+        layers = [layer for layer in changed.layer if layer.name == name and layer.HasField("data_param")]
+        if not layers:
+            readers = [layer.name for layer in net.layer if layer.HasField("data_param")]
+            known = ", ".join(dict.fromkeys(readers)) or "none"
+            raise SpecError(f'no data layer "{name}" to give a source to; this net\'s: {known}', Where(source.file))
+        for layer in layers:
+            layer.data_param.source = path
+    return changed
+
+
+def extract_records(
+    net: Net, blobs: Sequence[str], iterations: int | None = None, progress: Progress = iter
+) -> dict[str, np.ndarray]:
+    """Return each blob over the records of the net's data layer, flattened to (N, D) float32.
+
+    Beside them ``keys`` (N,), ``seconds_per_record`` (reading and the net) and ``parameters``, how many the net learns.
+
+    ``iterations`` batches are run, by default as many as cover every record once (those read twice are dropped).
+    Raises SpecError where the net reads no records or lacks a blob.
+    """
+    readers = [layer for layer in net.layers if getattr(layer, "num_records", 0)]
+    if not readers:
+        raise SpecError("no layer of this net reads records; give image files instead", Where(net.plan.source.file))
+    for name in blobs:
+        if name not in net.shapes:
+            known = f"{did_you_mean(name, list(net.shapes)) or ';'} it has: {', '.join(net.shapes)}"
+            raise SpecError(f'no blob "{name}" in this net{known}', Where(net.plan.source.file))
+    reader = readers[0]
+    batch = reader.top_shapes[0][0]
+    records, first = reader.num_records, reader.iteration
+    rounds = -(-records // batch) if iterations is None else iterations
+    rows = min(records, rounds * batch) if iterations is None else rounds * batch
+    net.keep = list(blobs)
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in blobs}
+    begin = time.perf_counter()
+    with torch.no_grad():
+        for _ in progress(range(rounds)):
+            net()
+            for name in blobs:
+                value = net.blobs[name]
+                if value.dim() == 0 or value.shape[0] != batch:
+                    message = (
+                        f'blob "{name}" has shape {tuple(value.shape)}, expected one row a record ({batch} a batch)'
+                    )
+                    raise SpecError(message, Where(net.plan.source.file))
+                parts[name].append(value.reshape(batch, -1).cpu().numpy())
+    arrays = {name: np.concatenate(part)[:rows] for name, part in parts.items()}
+    arrays["seconds_per_record"] = np.array((time.perf_counter() - begin) / (rounds * batch))
+    arrays["parameters"] = np.array(sum(learnable.parameter.numel() for learnable in net.learnable))
+    keys = [key for i in range(first, first + rounds) for key in reader.keys(i)]
+    arrays["keys"] = np.array(keys[:rows])
+    return arrays

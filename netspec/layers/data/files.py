@@ -1,0 +1,384 @@
+"""Data layers that read and write files.
+
+The layers that read make the batch of iteration i as a function of i alone (netspec.data.sources), so that
+threads may read ahead.
+
+Caffe: src/caffe/layers/base_data_layer.cpp
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import partial
+
+import torch
+
+from netspec import log
+from netspec.data.database import open_reader
+from netspec.data.images import read_image_list
+from netspec.data.prefetch import Feed
+from netspec.data.sources import Cursor, DatabaseSource, ImageListSource, Source, draw_skip
+from netspec.data.transformer import Transformer
+from netspec.errors import SpecError
+from netspec.layers.base import Layer, Shape
+from netspec.layers.registry import register
+from netspec.proto.schema import PHASE_NAMES
+
+BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
+MOVED = ("scale", "mean_file", "crop_size", "mirror")  # to transform_param, so in a current layer they mean nothing
+Batch = tuple[tuple[torch.Tensor, ...], int]
+
+
+class ReadingLayer(Layer):
+    """Base of the layers that read records from files, some batches ahead of the net.
+
+    Files are opened in the constructor, threads start at the first forward pass. Where no data may be opened, the tops'
+    shapes are those given, or those that the prototxt fixes.
+    """
+
+    bottoms = (0, 0)
+    tops = (2, 2)
+
+    def open(self) -> Source:
+        """Open the files."""
+        raise NotImplementedError
+
+    def batch_size_of_param(self) -> int:
+        """Return the batch size that the prototxt asks for."""
+        raise NotImplementedError
+
+    def known_shape(self) -> Shape | None:
+        """Return the first top's shape where the prototxt alone says it."""
+        return None
+
+    def setup(self) -> None:
+        """Open the files, or find out the shapes without them."""
+        self.batch_size = self.batch_size_of_param()
+        self._source: Source | None = None
+        self._feed: Feed[Batch] | None = None
+        if not self.context.open_data:
+            self._shapes = self.shapes_without_data()
+            return
+        self._source = self.open()
+        self._shapes = list(self._source.shapes)[: self.num_tops]
+        make = partial(_make, self._source, self.num_tops, self.context.device.type == "cuda")
+        ahead: int = self.param.data_param.prefetch
+        self._feed = Feed(make, ahead, workers=max(1, min(ahead, os.cpu_count() or 1)))
+
+    def shapes_without_data(self) -> list[Shape]:
+        """Return the tops' shapes as given by the caller or fixed by the prototxt; a label goes with each image."""
+        given = self.context.given_shapes
+        data = given.get(self.param.top[0]) or self.known_shape()
+        if data is None:
+            raise self.shape_wanted(self.param.top[0], f"{self.batch_size},C,H,W")
+        return [data, *(given.get(top) or data[:1] for top in self.param.top[1:])]
+
+    def shape_wanted(self, blob: str, example: str) -> SpecError:
+        """Return the error that asks for the shape of a top."""
+        return self.error(f'the shape of "{blob}" is known by its data only; say --shape {blob}={example}', "top")
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the tops' shapes."""
+        return self._shapes
+
+    @property
+    def source(self) -> Source:
+        """Where the batches come from, for a layer that opened its data."""
+        assert self._source is not None, "built without opening data"
+        return self._source
+
+    @property
+    def num_records(self) -> int:
+        """How many records there are; a batch may read past the last one, on from the first."""
+        return self.source.cursor.count
+
+    @property
+    def iteration(self) -> int:
+        """The iteration whose batch the next forward pass returns."""
+        return self._feed.position if self._feed else 0
+
+    def keys(self, iteration: int) -> list[str]:
+        """Return the keys (or file names) of the records of an iteration, one a row of the tops."""
+        return self.source.keys(iteration)
+
+    def restart(self, iteration: int = 0) -> None:
+        """Return to the first record, or to the first one of ``iteration``."""
+        if self._feed:
+            self._feed.restart(iteration)
+
+    def close(self) -> None:
+        """Stop the threads that read ahead."""
+        if self._feed:
+            self._feed.close()
+
+    def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the next batch."""
+        if self._feed is None:
+            raise self.error("this net was built without opening its data, so it cannot run")
+        tops, wraps = self._feed.next()
+        for _ in range(wraps):
+            self.log_restart()
+        self.top_shapes = [tuple(top.shape) for top in tops]  # at batch size 1 images may differ in size
+        return tuple(top.to(self.context.device, non_blocking=True) for top in tops)
+
+    def log_restart(self) -> None:
+        """Say that the last record was passed, where Caffe says so."""
+
+    # What the subclasses share
+
+    @property
+    def stream(self) -> str:
+        """The name of this layer's random draws; a TRAIN and a TEST layer may share their name."""
+        return f"{self.param.name}/{PHASE_NAMES[self.phase]}"
+
+    def transformer(self) -> Transformer:
+        """Return the transformer of this layer's ``transform_param``."""
+        seed = self.context.random.seed
+        return Transformer(self.param.transform_param, self.phase, self.context.at, seed, self.stream)
+
+    def positive(self, value: int, *path: str) -> int:
+        """Return ``value``, or refuse it."""
+        if value <= 0:
+            raise self.error(f"{path[-1]} must be above 0, found {value}", *path)
+        return value
+
+    def named(self, value: str, *path: str) -> str:
+        """Return ``value``, or say that it is missing."""
+        if not value:
+            raise self.error(f"{path[-1]} is missing: where is the data?", *path)
+        return value
+
+    def skip(self, rand_skip: int, count: int, *path: str) -> int:
+        """Draw how many records to pass over at the start."""
+        skip = draw_skip(rand_skip, self.context.random.seed, self.stream)
+        if rand_skip:
+            log.info("image_data_layer.cpp:70", f"Skipping first {skip} data points.")
+        if skip >= count:
+            raise self.error(f"not enough records to skip {skip} of them (rand_skip): there are {count}", *path)
+        return skip
+
+    def log_size(self, source: Source, site: str) -> None:
+        """Log the shape of a batch."""
+        log.info(site, "output data size: " + ",".join(map(str, source.shapes[0])))
+
+
+def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:
+    """Make a batch, in whatever thread; page-locked where it goes to a GPU, so that the copy need not wait.
+
+    It knows nothing of the layer, so that a layer nobody needs any more goes at once, and its threads with it.
+    """
+    tops = tuple(torch.from_numpy(array) for array in source.batch(iteration)[:num_tops])
+    return tuple(top.pin_memory() if pinned else top for top in tops), source.cursor.wraps(iteration)
+
+
+@register("Data", "data_param", "transform_param")
+class Data(ReadingLayer):
+    """Read the Datums of an LMDB or LevelDB, in the order of their keys, over and over.
+
+    top[0]  transformed images (batch_size, C, H, W)
+    top[1]  labels (batch_size,); may be left out
+    Caffe: src/caffe/layers/data_layer.cpp
+    """
+
+    tops = (1, 2)
+    ignores = frozenset(f"data_param.{name}" for name in MOVED)
+
+    def batch_size_of_param(self) -> int:
+        """Return data_param.batch_size."""
+        return self.positive(self.param.data_param.batch_size, "data_param", "batch_size")
+
+    def construct(self) -> None:
+        """Open the database; a setting that is missing is said first."""
+        if self.context.open_data:
+            self.batch_size_of_param()
+            p, at = self.param.data_param, self.context.at("data_param", "source")
+            self._reader = open_reader(self.named(p.source, "data_param", "source"), BACKENDS[p.backend], at)
+
+    def open(self) -> Source:
+        """Read the first record, which sets the shape."""
+        p, reader = self.param.data_param, self._reader
+        transformer = self.transformer()
+        if p.force_encoded_color:
+            transformer.color = True
+        skip = self.skip(p.rand_skip, len(reader), "data_param", "rand_skip")
+        cursor = Cursor(len(reader), self.batch_size, skip, rank=self.context.rank, ranks=self.context.ranks)
+        source = DatabaseSource(reader, cursor, transformer, self.context.at("data_param", "source"))
+        self.log_size(source, "data_layer.cpp:45")
+        return source
+
+    def known_shape(self) -> Shape | None:
+        """Return a shape where crop_size gives height and width, and one mean_value a channel their number."""
+        p = self.param.transform_param
+        if p.crop_size and len(p.mean_value) > 1:
+            return (self.batch_size, len(p.mean_value), p.crop_size, p.crop_size)
+        return None
+
+    def log_restart(self) -> None:
+        """Say so as Caffe does."""
+        log.info("data_layer.cpp:73", "Restarting data prefetching from start.")
+
+
+@register("ImageData", "image_data_param", "transform_param", "data_param.prefetch")
+class ImageData(ReadingLayer):
+    """Read image files named in a list of ``name label`` lines, resized bilinearly where asked.
+
+    top[0]  transformed images (batch_size, 3 or 1, H, W)
+    top[1]  labels (batch_size,)
+    Caffe: src/caffe/layers/image_data_layer.cpp
+    """
+
+    ignores = frozenset(f"image_data_param.{name}" for name in MOVED)
+
+    def batch_size_of_param(self) -> int:
+        """Return image_data_param.batch_size, and check that new_height and new_width come together."""
+        p = self.param.image_data_param
+        if bool(p.new_height) != bool(p.new_width):
+            raise self.error("new_height and new_width must be given together", "image_data_param")
+        return self.positive(p.batch_size, "image_data_param", "batch_size")
+
+    def open(self) -> Source:
+        """Read the list; its first image sets the shape."""
+        p = self.param.image_data_param
+        name = self.named(p.source, "image_data_param", "source")
+        log.info("image_data_layer.cpp:38", f"Opening file {name}")
+        images = read_image_list(name, self.context.at("image_data_param", "source"))
+        if p.shuffle:
+            log.info("image_data_layer.cpp:53", "Shuffling data")
+        log.info("image_data_layer.cpp:63", f"A total of {len(images)} images.")
+        skip = self.skip(p.rand_skip, len(images), "image_data_param", "rand_skip")
+        cursor = Cursor(len(images), self.batch_size, skip, p.shuffle, self.context.random.seed, self.stream)
+        size = (p.new_height, p.new_width) if p.new_height else None
+        source = ImageListSource(images, p.root_folder, p.is_color, size, cursor, self.transformer())
+        self.log_size(source, "image_data_layer.cpp:90")
+        return source
+
+    def known_shape(self) -> Shape | None:
+        """Return the shape where crop_size, or new_height and new_width, give height and width."""
+        p, crop = self.param.image_data_param, self.param.transform_param.crop_size
+        height, width = (crop, crop) if crop else (p.new_height, p.new_width)
+        return (self.batch_size, 3 if p.is_color else 1, height, width) if height else None
+
+
+@register("HDF5Data", "hdf5_data_param", "transform_param", "data_param.prefetch")
+class HDF5Data(ReadingLayer):
+    """Read the rows of HDF5 files, from the datasets named like the tops.
+
+    top[i]  (batch_size, ...), the shape of a row of dataset i
+    Caffe: src/caffe/layers/hdf5_data_layer.cpp
+    """
+
+    tops = (1, None)
+
+    def batch_size_of_param(self) -> int:
+        """Return hdf5_data_param.batch_size."""
+        if self.param.HasField("transform_param"):
+            raise self.error("HDF5Data does not transform data; take transform_param away", "transform_param")
+        return self.positive(self.param.hdf5_data_param.batch_size, "hdf5_data_param", "batch_size")
+
+    def open(self) -> Source:
+        """Look into all the files for their rows."""
+        from netspec.data.hdf5 import Hdf5Source
+
+        p = self.param.hdf5_data_param
+        name = self.named(p.source, "hdf5_data_param", "source")
+        at = self.context.at("hdf5_data_param", "source")
+        context = self.context
+        seed = context.random.seed - context.rank  # all ranks share one order
+        return Hdf5Source(
+            name, self.param.top, self.batch_size, p.shuffle, seed, self.stream, at, context.rank, context.ranks
+        )
+
+    def shapes_without_data(self) -> list[Shape]:
+        """Return the shapes given by the caller; the prototxt says nothing of them."""
+        for top in self.param.top:
+            if top not in self.context.given_shapes:
+                raise self.shape_wanted(top, f"{self.batch_size},...")
+        return [self.context.given_shapes[top] for top in self.param.top]
+
+
+@register("WindowData", "window_data_param", "transform_param", "data_param.prefetch")
+class WindowData(ReadingLayer):
+    """Draw windows of images, some that show an object and some that show none, warped to one size.
+
+    top[0]  images (batch_size, 3, crop_size, crop_size)
+    top[1]  labels (batch_size,); 0 is background
+    Caffe: src/caffe/layers/window_data_layer.cpp
+    """
+
+    ignores = frozenset(
+        {f"window_data_param.{name}" for name in MOVED if name != "scale"}
+        | {f"transform_param.{name}" for name in ("scale", "force_color", "force_gray")}
+    )
+
+    def batch_size_of_param(self) -> int:
+        """Return window_data_param.batch_size, and check crop_size, crop_mode and context_pad."""
+        p, crop = self.param.window_data_param, self.param.transform_param.crop_size
+        self.positive(crop, "transform_param", "crop_size")
+        if p.crop_mode not in ("warp", "square"):
+            message = f'unknown crop_mode "{p.crop_mode}"; expected warp or square'
+            raise self.error(message, "window_data_param", "crop_mode")
+        if 2 * p.context_pad >= crop:
+            message = f"context_pad {p.context_pad} on both sides leaves nothing of crop_size {crop}"
+            raise self.error(message, "window_data_param", "context_pad")
+        return self.positive(p.batch_size, "window_data_param", "batch_size")
+
+    def open(self) -> Source:
+        """Read the window file."""
+        from netspec.data.windows import WindowSource
+
+        p = self.param
+        self.named(p.window_data_param.source, "window_data_param", "source")
+        return WindowSource(
+            p.window_data_param, p.transform_param, self.context.at, self.context.random.seed, self.stream
+        )
+
+    def known_shape(self) -> Shape:
+        """Return the shape; the prototxt says all of it."""
+        crop: int = self.param.transform_param.crop_size
+        return (self.batch_size, 3, crop, crop)
+
+
+@register("HDF5Output", "hdf5_output_param")
+class HDF5Output(Layer):
+    """Append both bottoms to the datasets ``data`` and ``label`` of a new HDF5 file.
+
+    bottom[0]  data (N, ...), up to 4 axes
+    bottom[1]  label (N, ...), up to 4 axes
+    Caffe: src/caffe/layers/hdf5_output_layer.cpp
+    """
+
+    bottoms = (2, 2)
+    tops = (0, 0)
+
+    def setup(self) -> None:
+        """Create the file, so that one that cannot be written stops the run before it begins."""
+        name = self.param.hdf5_output_param.file_name
+        if not name:
+            raise self.error("file_name is missing: where shall the results go?", "hdf5_output_param", "file_name")
+        self._sink = None
+        if self.context.open_data:
+            from netspec.data.hdf5 import Hdf5Sink
+
+            self._sink = Hdf5Sink(name, self.context.at("hdf5_output_param", "file_name"))
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Check that both bottoms have as many rows."""
+        data, label = bottom_shapes
+        if max(len(data), len(label)) > 4:
+            raise self.error(f"found shapes {data} and {label}; at most 4 axes can be saved", "bottom")
+        if data[:1] != label[:1]:
+            raise self.error(f"data has {data[:1]} rows, label {label[:1]}; expected as many", "bottom")
+        return ()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._sink is not None:
+            self._sink.close()
+
+    def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Write the rows."""
+        assert self._sink is not None, "built without opening data"
+        data, label = (bottom.detach().cpu().numpy() for bottom in bottoms)
+        self._sink.append(data, label)
+        return ()

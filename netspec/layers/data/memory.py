@@ -1,0 +1,156 @@
+"""Data layers without files: blobs that the program gives, and blobs that fillers make."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from netspec import log
+from netspec.layers import fillers
+from netspec.layers.base import Layer, Shape
+from netspec.layers.registry import register
+from netspec.proto.schema import FillerParameter
+
+T = TypeVar("T")
+
+
+@register("Input", "input_param")
+class Input(Layer):
+    """Name blobs that the caller fills: ``net(data=array)``.
+
+    top[i]  the shape given for it; one shape may stand for all tops; the caller's own wins (``check --shape``)
+    Caffe: src/caffe/layers/input_layer.cpp
+    """
+
+    bottoms = (0, 0)
+    tops = (1, None)
+    is_input = True
+
+    def setup(self) -> None:
+        """Read the shapes."""
+        shapes: list[Shape] = [tuple(shape.dim) for shape in self.param.input_param.shape]
+        given = self.context.given_shapes
+        if not shapes and all(top in given for top in self.param.top):
+            shapes = [given[top] for top in self.param.top]
+        if len(shapes) not in (1, self.num_tops):
+            raise self.error(f"found {len(shapes)} shapes, expected 1 or one a top ({self.num_tops})", "input_param")
+        shapes = shapes * self.num_tops if len(shapes) == 1 else shapes
+        self.shapes = [given.get(top, shape) for top, shape in zip(self.param.top, shapes, strict=True)]
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shapes."""
+        return self.shapes
+
+    def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return zeros, which is what Caffe's blobs hold until the caller fills them."""
+        return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
+
+
+@register("DummyData", "dummy_data_param")
+class DummyData(Layer):
+    """Make blobs with fillers: constant ones once, random ones at each forward pass.
+
+    top[i]  shape i, or num x channels x height x width; one shape and one filler may stand for all tops
+    Caffe: src/caffe/layers/dummy_data_layer.cpp
+    """
+
+    bottoms = (0, 0)
+    tops = (1, None)
+    OLD_AXES = ("num", "channels", "height", "width")
+
+    def setup(self) -> None:
+        """Read the shapes, and fill each blob for a try; those of constant fillers are kept."""
+        self.shapes = [self.possible(shape) for shape in self._read_shapes()]
+        given = list(self.param.dummy_data_param.data_filler)
+        self._fillers = self._one_a_top(given or [FillerParameter()], "data_filler")
+        self._constants: list[torch.Tensor | None] = []
+        for i, filler in enumerate(self._fillers):
+            blob = self._fill(i, torch.Generator())
+            self._constants.append(blob if filler.type == "constant" else None)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shapes."""
+        return self.shapes
+
+    def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the constant blobs, and the others filled anew."""
+        generator = self.context.random.on("cpu")
+        return tuple(self._fill(i, generator) if kept is None else kept for i, kept in enumerate(self._constants))
+
+    def _fill(self, i: int, generator: torch.Generator) -> torch.Tensor:
+        try:
+            return fillers.fill(self._fillers[i], self.shapes[i], generator).to(self.context.device)
+        except ValueError as fault:
+            raise self.error(str(fault), "dummy_data_param", "data_filler", i) from None
+
+    def _read_shapes(self) -> list[Shape]:
+        p = self.param.dummy_data_param
+        old = [list(getattr(p, axis)) for axis in self.OLD_AXES]
+        if not any(old):
+            return self._one_a_top([tuple(shape.dim) for shape in p.shape], "shape")
+        if p.shape:
+            message = "both shape and the old num, channels, height, width are given"
+            raise self.error(message, "dummy_data_param", "shape")
+        columns = [self._one_a_top(values, axis) for axis, values in zip(self.OLD_AXES, old, strict=True)]
+        return list(zip(*columns, strict=True))
+
+    def _one_a_top(self, values: list[T], field: str) -> list[T]:
+        if len(values) not in (1, self.num_tops):
+            message = f"found {len(values)} {field}, expected 1 or one a top ({self.num_tops})"
+            raise self.error(message, "dummy_data_param", field)
+        return values * self.num_tops if len(values) == 1 else values
+
+
+@register("MemoryData", "memory_data_param", "transform_param")
+class MemoryData(Layer):
+    """Hand out arrays that the program gives with ``set_input_arrays``, batch after batch, over and over.
+
+    top[0]  images (batch_size, channels, height, width)
+    top[1]  labels (batch_size,)
+    Caffe: src/caffe/layers/memory_data_layer.cpp (Reset), python/caffe/_caffe.cpp (Net_SetInputArrays)
+    """
+
+    bottoms = (0, 0)
+    tops = (2, 2)
+
+    def setup(self) -> None:
+        """Read the shape."""
+        p = self.param.memory_data_param
+        self.shape: Shape = (p.batch_size, p.channels, p.height, p.width)
+        if min(self.shape) <= 0:
+            message = "batch_size, channels, height and width must all be given and above 0"
+            raise self.error(message, "memory_data_param")
+        self._arrays: tuple[torch.Tensor, torch.Tensor] | None = None
+        self._next = 0
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shapes."""
+        return self.shape, self.shape[:1]
+
+    def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
+        """Take images (n, C, H, W) and labels (n,), n a multiple of the batch size; they are not transformed."""
+        data, labels = np.asarray(data, np.float32), np.asarray(labels, np.float32).reshape(-1)
+        batch, *image = self.shape
+        if data.shape[1:] != tuple(image) or len(data) != len(labels) or not len(data) or len(data) % batch:
+            expected = f"images (n, {', '.join(map(str, image))}) and n labels, n a multiple of batch_size {batch}"
+            message = f"found images {data.shape} and {len(labels)} labels, expected {expected}"
+            raise self.error(message, "memory_data_param")
+        if self.param.HasField("transform_param"):
+            log.warning("memory_data_layer.cpp:88", "MemoryData does not transform array data on Reset()")
+        self._arrays = torch.from_numpy(data), torch.from_numpy(labels)
+        self._next = 0
+
+    def restart(self) -> None:
+        """Return to the first image."""
+        self._next = 0
+
+    def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the next batch."""
+        if self._arrays is None:
+            raise self.error("has no data yet; call set_input_arrays(data, labels) on it first")
+        here = slice(self._next, self._next + self.shape[0])
+        self._next = here.stop % len(self._arrays[0])
+        return tuple(array[here].to(self.context.device) for array in self._arrays)

@@ -1,0 +1,130 @@
+"""What a blob holds before anything is learned: Caffe's seven fillers.
+
+Caffe: include/caffe/filler.hpp
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from netspec.data.blobs import Shape
+from netspec.errors import did_you_mean
+
+FAN_IN, FAN_OUT, AVERAGE = 0, 1, 2  # caffe.proto: enum FillerParameter.VarianceNorm
+
+
+def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    """Return a float32 CPU tensor of ``shape``, filled as ``filler`` (a FillerParameter) says.
+
+    Raises ValueError, in one plain sentence, for a filler that Caffe would refuse. The distributions are Caffe's; the
+    numbers drawn are not, since its random generator belongs to the version of boost it was built with.
+    """
+    if filler.type not in _FILLERS:
+        known = sorted(_FILLERS)
+        raise ValueError(
+            f'unknown filler "{filler.type}"{did_you_mean(filler.type, known) or ";"} known: {", ".join(known)}'
+        )
+    if math.prod(shape) == 0:
+        raise ValueError(f"cannot fill an empty blob of shape {shape}")
+    if filler.sparse != -1 and filler.type != "gaussian":
+        raise ValueError(f'filler "{filler.type}" knows no sparse (found {filler.sparse}); only "gaussian" does')
+    return _FILLERS[filler.type](filler, shape, generator)
+
+
+def _constant(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    return torch.full(shape, filler.value, dtype=torch.float32)
+
+
+def _uniform(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    if not filler.min <= filler.max:
+        raise ValueError(f'filler "uniform" needs min <= max, found min {filler.min:g} and max {filler.max:g}')
+    return _draw_uniform(shape, filler.min, filler.max, generator)
+
+
+def _gaussian(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    if not filler.std > 0:
+        raise ValueError(f'filler "gaussian" needs std > 0, found {filler.std:g}')
+    if filler.sparse < -1:
+        raise ValueError(f'filler "gaussian" needs sparse >= 0 (or -1 for none), found {filler.sparse}')
+    values = _draw_normal(shape, filler.mean, filler.std, generator)
+    if filler.sparse >= 0:
+        # On average `sparse` of the weights of one input stay: the probability is a share of the outputs, shape[0].
+        outputs = _first_axis(filler, shape)
+        if filler.sparse > outputs:
+            raise ValueError(f'filler "gaussian" needs sparse <= shape[0] = {outputs}, found {filler.sparse}')
+        values *= torch.empty_like(values).bernoulli_(filler.sparse / outputs, generator=generator)
+    return values
+
+
+def _positive_unitball(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    rows = _draw_uniform(shape, 0.0, 1.0, generator).view(_first_axis(filler, shape), -1)
+    return (rows / rows.sum(dim=1, keepdim=True)).view(shape)
+
+
+def _xavier(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    bound = math.sqrt(3.0 / _fan(filler, shape))
+    return _draw_uniform(shape, -bound, bound, generator)
+
+
+def _msra(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    return _draw_normal(shape, 0.0, math.sqrt(2.0 / _fan(filler, shape)), generator)
+
+
+def _bilinear(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    if len(shape) != 4 or shape[2] != shape[3]:
+        raise ValueError(f'filler "bilinear" needs a 4-D blob with square filters, found shape {shape}')
+    width = shape[3]
+    factor = (width + 1) // 2
+    centre = (width - 1) / (2.0 * factor)
+    ramp = 1 - (torch.arange(width, dtype=torch.float64) / factor - centre).abs()
+    return torch.outer(ramp, ramp).float().expand(shape).contiguous()
+
+
+_FILLERS: dict[str, Callable[[Any, Shape, torch.Generator], torch.Tensor]] = {
+    "constant": _constant,
+    "uniform": _uniform,
+    "gaussian": _gaussian,
+    "positive_unitball": _positive_unitball,
+    "xavier": _xavier,
+    "msra": _msra,
+    "bilinear": _bilinear,
+}
+#: The fields of FillerParameter, besides ``type``, that mean something to each filler.
+READS: dict[str, tuple[str, ...]] = {
+    "constant": ("value",),
+    "uniform": ("min", "max"),
+    "gaussian": ("mean", "std", "sparse"),
+    "positive_unitball": (),
+    "xavier": ("variance_norm",),
+    "msra": ("variance_norm",),
+    "bilinear": (),
+}
+
+
+def _first_axis(filler: Any, shape: Shape) -> int:
+    if not shape:
+        raise ValueError(f'filler "{filler.type}" needs a blob of at least one axis, found a scalar')
+    return shape[0]
+
+
+def _fan(filler: Any, shape: Shape) -> float:
+    """Return the count that the variance is divided by: Caffe's fans are counts of the blob, not of the layer.
+
+    So fan_out is ``num_output`` for an InnerProduct, and wrong by the factor ``group`` for a grouped convolution.
+    """
+    count = math.prod(shape)
+    fan_in = count // _first_axis(filler, shape)
+    fan_out = count // shape[1] if len(shape) > 1 else count
+    return {FAN_IN: fan_in, FAN_OUT: fan_out, AVERAGE: (fan_in + fan_out) / 2}[filler.variance_norm]
+
+
+def _draw_uniform(shape: Shape, low: float, high: float, generator: torch.Generator) -> torch.Tensor:
+    return torch.empty(shape, dtype=torch.float32).uniform_(low, high, generator=generator)
+
+
+def _draw_normal(shape: Shape, mean: float, std: float, generator: torch.Generator) -> torch.Tensor:
+    return torch.empty(shape, dtype=torch.float32).normal_(mean, std, generator=generator)

@@ -1,0 +1,1 @@
+"""Losses, and the accuracy that is measured like one."""

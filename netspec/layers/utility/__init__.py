@@ -1,0 +1,1 @@
+"""Layers that compute between blobs, move numbers, or run Python code."""

@@ -1,0 +1,153 @@
+"""The Python layer: runs code that people wrote for pycaffe.
+
+Caffe: include/caffe/layers/python_layer.hpp
+"""
+
+from __future__ import annotations
+
+import importlib
+import traceback
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from netspec.errors import SpecError, did_you_mean
+from netspec.layers.base import Layer, Shape
+from netspec.layers.registry import register
+from netspec.layers.utility.pycaffe_shim import Blob, importable
+
+
+class _Call(torch.autograd.Function):
+    """One forward pass of a Python layer and its backward; the tensors are its bottoms, then its learnable blobs."""
+
+    @staticmethod
+    def forward(ctx: Any, layer: Python, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        ctx.layer = layer
+        return layer.call_forward(tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        return None, *ctx.layer.call_backward(grads, ctx.needs_input_grad[1:])
+
+
+@register("Python", "python_param")
+class Python(Layer):
+    """Run the class python_param.layer of python_param.module, on numpy views of the blobs.
+
+    The module is looked for in the current directory, then where Python looks (PYTHONPATH). Its class has setup,
+    reshape and forward(bottom, top) and backward(top, propagate_down, bottom), and finds self.param_str, self.phase and
+    self.blobs. As in Caffe, backward belongs to the last forward. On a GPU the arrays are copies in main memory.
+
+    bottom[i]  any shape
+    top[i]     the shape that reshape or forward gives it
+    blobs[i]   those that setup adds by self.blobs.add_blob(...)
+    Caffe: include/caffe/layers/python_layer.hpp
+    """
+
+    bottoms = (0, None)
+    tops = (0, None)
+
+    def setup(self) -> None:
+        """Import the code and run its setup, unless it is only asked for shapes that are given."""
+        given = self.context.given_shapes
+        self.code: Any = None
+        if not self.context.open_data and all(name in given for name in self.param.top):
+            return
+        if not self.context.allow_python:
+            raise self.error(
+                "a Python layer runs code that the prototxt names; pass --allow-python-layers where you trust it",
+                "type",
+            )
+        names = list(self.param.bottom)
+        self.bottom = [Blob(shape) for shape in self.bottom_shapes]
+        self.top = [self.bottom[names.index(n)] if n in names else Blob() for n in self.param.top]  # one blob in place
+        self.code = self._load()
+        self._call("setup", self.bottom, self.top)
+        for blob in self.code.blobs:
+            self.add_blob(blob.shape)
+            self.blobs[-1].data.copy_(torch.from_numpy(blob.data))
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the tops' shapes, as the code's reshape sets them."""
+        if self.code is None:
+            return [self.context.given_shapes[name] for name in self.param.top]
+        for blob, shape in zip(self.bottom, bottom_shapes, strict=True):
+            blob.reshape(*shape)
+        self._call("reshape", self.bottom, self.top)
+        return [blob.shape for blob in self.top]
+
+    def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Run the code's reshape and forward, as Caffe does at each pass."""
+        tensors = (*bottoms, *(self.blob(i) for i in range(len(self.blobs))))
+        return _Call.apply(self, *tensors) if self.top else self.call_forward(tensors)
+
+    def call_forward(self, tensors: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """Show the tensors (bottoms, learnable blobs) to the code, run it, return the tops."""
+        for blob, tensor in zip([*self.bottom, *self.code.blobs], tensors, strict=True):
+            blob.bind(_array(tensor.clone() if blob in self.top else tensor))
+        like = tensors[0] if tensors else torch.empty(0, device=self.context.device)
+        for blob in self.top:
+            blob.cast(_array(like[:0]).dtype)
+        self._call("reshape", self.bottom, self.top)
+        self._call("forward", self.bottom, self.top)
+        return tuple(torch.tensor(blob.data, device=like.device) for blob in self.top)
+
+    def call_backward(self, grads: Sequence[torch.Tensor], needed: Sequence[bool]) -> list[torch.Tensor | None]:
+        """Run the code's backward; return the gradients of the bottoms and learnable blobs that are needed."""
+        for blob in (*self.bottom, *self.code.blobs):
+            blob.diff.fill(0)
+        for blob, grad in zip(self.top, grads, strict=True):
+            blob.diff[...] = _array(grad)
+        self._call("backward", self.top, list(needed[: len(self.bottom)]), self.bottom)
+        return [
+            torch.tensor(blob.diff, device=grads[0].device) if need else None
+            for blob, need in zip([*self.bottom, *self.code.blobs], needed, strict=True)
+        ]
+
+    def _load(self) -> Any:
+        """Return an instance of the layer's class."""
+        p = self.param.python_param
+        try:
+            with importable():
+                module = importlib.import_module(p.module)
+        except Exception as fault:  # the module's code may raise anything
+            message = f'cannot import module "{p.module}" (looked for in the current directory and PYTHONPATH): '
+            raise self.error(message + _describe(fault), "python_param", "module") from fault
+        cls = getattr(module, p.layer, None)
+        if cls is None:
+            message = f'module "{p.module}" ({getattr(module, "__file__", "built in")}) has no class "{p.layer}"'
+            raise self.error(message + did_you_mean(p.layer, dir(module)), "python_param", "layer")
+        try:
+            code = cls(self.param)
+        except Exception as fault:
+            raise self.error(f"{p.module}.{p.layer}: {_describe(fault)}", "python_param", "layer") from fault
+        if not hasattr(code, "blobs"):
+            raise self.error(f"{p.module}.{p.layer} is no caffe.Layer", "python_param", "layer")
+        code.param_str = code.param_str_ = p.param_str  # the second is the name of 2014
+        code.phase = self.phase
+        return code
+
+    def _call(self, method: str, *arguments: Any) -> None:
+        """Call a method of the code; whatever it raises is a fault of the user's file."""
+        p = self.param.python_param
+        try:
+            with importable():
+                getattr(self.code, method)(*arguments)
+        except SpecError:
+            raise
+        except Exception as fault:
+            raise self.error(f"{p.module}.{p.layer}.{method}: {_describe(fault)}", "python_param") from fault
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    """Return a view of the tensor's values, or a copy where they are elsewhere than in main memory."""
+    return tensor.detach().contiguous().cpu().numpy()
+
+
+def _describe(fault: Exception) -> str:
+    """Return the exception's class, text and place in one line."""
+    frames = traceback.extract_tb(fault.__traceback__)
+    place = f" ({frames[-1].filename}:{frames[-1].lineno})" if frames else ""
+    return f"{type(fault).__name__}: {' '.join(str(fault).split())}{place}"

@@ -1,0 +1,302 @@
+"""Layers that slide a filter over a map, and Crop, which brings two maps to one size afterwards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import chain
+
+import torch
+from torch.nn import functional as F
+
+from netspec.exact.functions import ColumnProducts, in_caffes_order
+from netspec.layers.base import Layer, Shape
+from netspec.layers.registry import register
+
+_CONVOLVE = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
+_DECONVOLVE = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
+
+
+def _by(sizes: Shape) -> str:
+    return " x ".join(map(str, sizes))
+
+
+class _SlidingFilter(Layer):
+    """Base of the layers described by a ConvolutionParameter: the filter's geometry, one number a spatial axis."""
+
+    kernel: Shape
+    stride: Shape
+    pad: Shape
+    dilation: Shape
+
+    def read_geometry(self) -> None:
+        """Read ``axis`` and the filter's kernel, stride, pad and dilation for the first bottom's axes."""
+        param, shape = self.param.convolution_param, self.bottom_shapes[0]
+        self.channel_axis = self.canonical_axis(param.axis, shape, "convolution_param", "axis")
+        self.spatial_axes = len(shape) - self.channel_axis - 1
+        given = param.kernel_size or param.HasField("kernel_h") or param.HasField("kernel_w")
+        if self.spatial_axes and not given:
+            raise self.error("kernel_size (or kernel_h and kernel_w) is missing", "convolution_param")
+        self.kernel = self._read("kernel_size", "kernel_h", "kernel_w", default=1, least=1)
+        self.stride = self._read("stride", "stride_h", "stride_w", default=1, least=1)
+        self.pad = self._read("pad", "pad_h", "pad_w", default=0, least=0)
+        self.dilation = self._read("dilation", None, None, default=1, least=1)
+
+    def _read(self, name: str, name_h: str | None, name_w: str | None, default: int, least: int) -> Shape:
+        param, axes, field = self.param.convolution_param, self.spatial_axes, "convolution_param"
+        given = tuple(getattr(param, name))
+        pair = [n for n in (name_h, name_w) if n is not None and param.HasField(n)]
+        if pair:
+            if given:
+                raise self.error(f"found both {name} and {pair[0]}; give one of them", field, pair[0])
+            if axes != 2:
+                raise self.error(f"{pair[0]} is for 2 spatial axes, the bottom has {axes}; use {name}", field, pair[0])
+            given = (getattr(param, str(name_h)), getattr(param, str(name_w)))
+        elif len(given) <= 1:
+            given = (given or (default,)) * axes
+        elif len(given) != axes:
+            message = f"found {name} {len(given)} times, expected once or once for each of {axes} spatial axes"
+            raise self.error(message, field, name, axes)
+        if any(v < least for v in given):
+            names = f"{name_h} and {name_w}" if pair else name
+            raise self.error(f"{names} must be at least {least}, found {_by(given)}", field, pair[0] if pair else name)
+        return given
+
+    @property
+    def extent(self) -> Shape:
+        """The pixels that a dilated filter spans."""
+        return tuple(d * (k - 1) + 1 for k, d in zip(self.kernel, self.dilation, strict=True))
+
+    def slide(self, shape: Shape) -> Shape:
+        """Return how often the filter fits, along each spatial axis of a bottom of ``shape``."""
+        axes = zip(shape[self.channel_axis + 1 :], self.pad, self.extent, self.stride, strict=True)
+        # C++ rounds a quotient towards zero: a filter too long by less than a stride still fits once, over zeros.
+        fits = tuple(int((size + 2 * p - e) / s) + 1 for size, p, e, s in axes)
+        self.check_output(fits, shape)
+        return fits
+
+    def check_output(self, spatial: Shape, shape: Shape) -> None:
+        """Refuse tops without a single pixel."""
+        if any(size < 1 for size in spatial):
+            raise self.error(
+                f"the filter does not fit: a bottom of shape {shape} would give a map of {_by(spatial)} (kernel "
+                f"{_by(self.kernel)}, stride {_by(self.stride)}, pad {_by(self.pad)}, dilation {_by(self.dilation)})",
+                "convolution_param",
+            )
+
+    def check_axes(self, bottom_shapes: Sequence[Shape], channels: int) -> None:
+        """Refuse bottoms that the filters, made for those seen first, do not suit; all must have one shape."""
+        shape = bottom_shapes[0]
+        if len(shape) != self.channel_axis + 1 + self.spatial_axes or shape[self.channel_axis] != channels:
+            raise self.error(
+                f"bottom of shape {shape} does not suit the filters, made for {channels} channels at axis "
+                f"{self.channel_axis} and {self.spatial_axes} spatial axes",
+                "bottom",
+            )
+        for i, other in enumerate(bottom_shapes):
+            if other != shape:
+                raise self.error(f"all bottoms must have one shape, found {shape} and {other}", "bottom", i)
+
+    def overhang(self, shape: Shape) -> list[int]:
+        """Return, in the order of F.pad, the zeros to append where the filter is longer than the padded map."""
+        axes = zip(shape[self.channel_axis + 1 :], self.pad, self.extent, strict=True)
+        short = [max(0, e - size - 2 * p) for size, p, e in axes]
+        return list(chain.from_iterable((0, n) for n in reversed(short)))
+
+
+@register("Convolution", "convolution_param")
+class Convolution(_SlidingFilter):
+    """Cross-correlate each map with learned filters; any number of bottoms, one set of filters for all.
+
+    bottom[i]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: up to three)
+    top[i]     (N, num_output, H', W'),  H' = (H + 2 pad - dilation (kernel - 1) - 1) // stride + 1
+    blobs[0]   filters (num_output, C / group, kernel_h, kernel_w)
+    blobs[1]   bias    (num_output,)                                   unless bias_term: false
+    Caffe: src/caffe/layers/base_conv_layer.cpp, conv_layer.cpp
+    """
+
+    bottoms = (1, None)
+    tops = (1, None)
+    same_tops = True
+
+    def setup(self) -> None:
+        """Read the geometry, add the filters and the bias."""
+        self.read_geometry()
+        if self.spatial_axes > 3:
+            raise self.error(
+                f"{self.type} of {self.spatial_axes} spatial axes is not supported, 3 are the most", "bottom"
+            )
+        param = self.param.convolution_param
+        self.channels = self.bottom_shapes[0][self.channel_axis]
+        self.num_output, self.group = param.num_output, param.group
+        if self.num_output < 1:
+            raise self.error("num_output must be at least 1", "convolution_param", "num_output")
+        for name, count in (("channels of the bottom", self.channels), ("num_output", self.num_output)):
+            if self.group < 1 or count % self.group:
+                raise self.error(
+                    f"{name}, {count}, must be a multiple of group, {self.group}", "convolution_param", "group"
+                )
+        self.add_blob(self.filter_shape(), param.weight_filler)
+        if param.bias_term:
+            self.add_blob((self.num_output,), param.bias_filler)
+
+    def filter_shape(self) -> Shape:
+        """Return the shape of blobs[0]."""
+        return (self.num_output, self.channels // self.group, *self.kernel)
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Return the spatial shape of a top for a bottom of ``shape``."""
+        return self.slide(shape)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return one shape for all tops; the bottoms must suit the filters."""
+        self.check_axes(bottom_shapes, self.channels)
+        shape = bottom_shapes[0]
+        top = (*shape[: self.channel_axis], self.num_output, *self.output_shape(shape))
+        return [top] * len(bottom_shapes)
+
+    def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the responses to each bottom."""
+        weight = self.blob(0)
+        bias = self.blob(1) if len(self.blobs) > 1 else None
+        axes = max(self.spatial_axes, 1)  # a map without spatial axes is one of a single pixel
+        if not self.kernel:
+            weight = weight.unsqueeze(2)
+        geometry = [v or (n,) for v, n in ((self.stride, 1), (self.pad, 0), (self.dilation, 1))]
+        tops = []
+        for bottom, shape in zip(bottoms, self.top_shapes, strict=True):
+            images = math.prod(bottom.shape[: self.channel_axis])
+            maps = bottom.reshape(images, self.channels, *(bottom.shape[self.channel_axis + 1 :] or (1,)))
+            tops.append(self.apply_filters(axes, maps, weight, bias, *geometry).reshape(shape))
+        return tuple(tops)
+
+    def apply_filters(
+        self, axes: int, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, *geometry: Shape
+    ) -> torch.Tensor:
+        """Run torch's kernel for ``axes`` spatial axes; ``geometry`` is stride, pad, dilation."""
+        overhang = self.overhang(self.bottom_shapes[0])
+        if any(overhang):
+            maps = F.pad(maps, overhang)
+        stride, pad, dilation = geometry
+        work = math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * weight.numel()
+        if axes == 2 and self.group == 1 and in_caffes_order(maps, weight, work):
+            return ColumnProducts.apply(maps, weight, bias, geometry)
+        return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
+
+    def multiply_adds(self) -> int:
+        """Return output pixels times the filters' weights."""
+        pixels = math.prod(self.top_shapes[0]) // self.num_output
+        return len(self.top_shapes) * pixels * math.prod(self.blob_shapes[0])
+
+
+@register("Deconvolution", "convolution_param")
+class Deconvolution(Convolution):
+    """Spread each pixel by learned filters: a convolution's backward pass, run forward.
+
+    bottom[i]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: up to three)
+    top[i]     (N, num_output, H', W'),  H' = stride (H - 1) + dilation (kernel - 1) + 1 - 2 pad
+    blobs[0]   filters (C, num_output / group, kernel_h, kernel_w)
+    blobs[1]   bias    (num_output,)                                   unless bias_term: false
+    Caffe: src/caffe/layers/base_conv_layer.cpp, deconv_layer.cpp
+    """
+
+    def filter_shape(self) -> Shape:
+        """Return the shape of blobs[0]: a convolution's with its ends exchanged."""
+        return (self.channels, self.num_output // self.group, *self.kernel)
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Return the spatial shape of a top for a bottom of ``shape``."""
+        axes = zip(shape[self.channel_axis + 1 :], self.stride, self.extent, self.pad, strict=True)
+        spatial = tuple(s * (size - 1) + e - 2 * p for size, s, e, p in axes)
+        self.check_output(spatial, shape)
+        return spatial
+
+    def apply_filters(
+        self, axes: int, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, *geometry: Shape
+    ) -> torch.Tensor:
+        """Run torch's kernel for ``axes`` spatial axes; ``geometry`` is stride, pad, dilation."""
+        stride, pad, dilation = geometry
+        return _DECONVOLVE[axes](maps, weight, bias, stride, pad, 0, self.group, dilation)
+
+    def multiply_adds(self) -> int:
+        """Return input pixels times the filters' weights."""
+        pixels = math.prod(self.bottom_shapes[0]) // self.channels
+        return len(self.bottom_shapes) * pixels * math.prod(self.blob_shapes[0])
+
+
+@register("Im2col", "convolution_param")
+class Im2col(_SlidingFilter):
+    """Lay the pixels under each position of a filter side by side, as channels.
+
+    bottom[0]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: any number, at least one)
+    top[0]     (N, C kernel_h kernel_w, H', W'),  H' as Convolution's; zero where the filter leaves the map
+    Caffe: src/caffe/layers/im2col_layer.cpp
+    """
+
+    ignores = frozenset(
+        f"convolution_param.{name}" for name in ("num_output", "bias_term", "group", "weight_filler", "bias_filler")
+    )
+
+    def setup(self) -> None:
+        """Read the geometry."""
+        self.read_geometry()
+        if self.spatial_axes < 1:
+            raise self.error("the bottom has no spatial axis after its channels", "bottom")
+        self.channels = self.bottom_shapes[0][self.channel_axis]
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape with a channel for each pixel of the filter, and the filter's positions."""
+        self.check_axes(bottom_shapes, self.channels)
+        shape = bottom_shapes[0]
+        return [(*shape[: self.channel_axis], self.channels * math.prod(self.kernel), *self.slide(shape))]
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the pixels under the filter."""
+        padding = chain.from_iterable((p, p) for p in reversed(self.pad))
+        overhang = self.overhang(self.bottom_shapes[0])
+        windows = F.pad(data, [p + n for p, n in zip(padding, overhang, strict=True)])
+        first = self.channel_axis + 1
+        geometry = zip(self.extent, self.stride, self.dilation, strict=True)
+        for axis, (extent, stride, dilation) in enumerate(geometry, start=first):
+            windows = windows.unfold(axis, extent, stride)[..., ::dilation]  # the filter's pixels, as a last axis
+        last = first + self.spatial_axes
+        order = (*range(first), *range(last, windows.dim()), *range(first, last))
+        return windows.permute(order).reshape(self.top_shapes[0])
+
+
+@register("Crop", "crop_param")
+class Crop(Layer):
+    """Cut a blob to the size of another, from ``axis`` on.
+
+    bottom[0]  the blob to cut, any shape
+    bottom[1]  the blob of the wanted size, at least as many axes; gets no gradient
+    top[0]     bottom[0]'s shape before ``axis``, bottom[1]'s from there on
+    Caffe: src/caffe/layers/crop_layer.cpp
+    """
+
+    bottoms = (2, 2)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the wanted shape; place the window."""
+        data, wanted = bottom_shapes
+        param = self.param.crop_param
+        axis = self.canonical_axis(param.axis, data, "crop_param", "axis")
+        cut = len(data) - axis
+        if len(wanted) < len(data):
+            raise self.error(f"cannot crop a blob of shape {data} to one of fewer axes, {wanted}", "bottom", 1)
+        offsets = tuple(param.offset or (0,))
+        if len(offsets) not in (1, cut):
+            message = f"found offset {len(offsets)} times, expected once or once for each of {cut} cropped axes"
+            raise self.error(message, "crop_param", "offset")
+        offsets = offsets if len(offsets) == cut else offsets * cut
+        self.window = [slice(None)] * axis
+        for i, offset in enumerate(offsets, start=axis):
+            if offset + wanted[i] > data[i]:
+                message = f"offset {offset} and size {wanted[i]} of the crop leave axis {i}, of size {data[i]}"
+                raise self.error(message, "crop_param", "offset", i - axis)
+            self.window.append(slice(offset, offset + wanted[i]))
+        return [(*data[:axis], *wanted[axis : len(data)])]
+
+    def forward(self, data: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+        """Return the window."""
+        return data[tuple(self.window)]

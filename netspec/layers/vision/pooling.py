@@ -1,0 +1,256 @@
+"""Layers that reduce each window of a map to one number: Pooling, and SPP, a pyramid of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch.nn import functional as F
+
+from netspec.layers.base import Layer, Shape
+from netspec.layers.registry import register
+from netspec.proto.schema import TRAIN
+
+MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
+CEIL, FLOOR = 0, 1  # caffe.proto: enum PoolingParameter.RoundMode
+LOWEST = torch.finfo(torch.float32).min  # what a maximum starts from: Caffe's -FLT_MAX
+SMALLEST = torch.finfo(torch.float32).tiny  # Caffe's FLT_MIN
+
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Where the windows of a map lie; every pair is (vertical, horizontal), in pixels."""
+
+    size: Pair  # of the map
+    kernel: Pair
+    stride: Pair
+    pad: Pair
+    round_mode: int = CEIL
+
+    @property
+    def count(self) -> Pair:
+        """Return how many windows there are, down and across.
+
+        Rounded up, so the last window may reach past the map; it is dropped if it would begin past the map's end, but
+        only where either axis is padded. Unpadded, a stride longer than the kernel can leave it without a pixel.
+        """
+        counts = []
+        for size, kernel, stride, pad in self._axes():
+            room = size + 2 * pad - kernel
+            count = (room // stride if self.round_mode == FLOOR else -(-room // stride)) + 1
+            if any(self.pad) and (count - 1) * stride >= size + pad:
+                count -= 1
+            counts.append(count)
+        return counts[0], counts[1]
+
+    @property
+    def known_to_torch(self) -> bool:
+        """Whether torch's pooling has these windows: none empty, none padded by more than half a kernel."""
+        axes = zip(self._axes(), self.count, strict=True)
+        return all(2 * p <= k and (n - 1) * s < size + p for (size, k, s, p), n in axes)
+
+    def padded(self, maps: torch.Tensor, value: float) -> torch.Tensor:
+        """Return the maps framed by ``value`` such that every window is full."""
+        frame: list[int] = []
+        for (size, kernel, stride, pad), count in zip(self._axes(), self.count, strict=True):
+            frame = [pad, (count - 1) * stride + kernel - pad - size, *frame]
+        return F.pad(maps, frame, value=value)
+
+    def areas(self, like: torch.Tensor) -> torch.Tensor:
+        """Return what an average divides by, (count down, count across): padding counts, up to ``pad`` past the map."""
+        lengths = []
+        for (size, kernel, stride, pad), count in zip(self._axes(), self.count, strict=True):
+            starts = torch.arange(count, dtype=like.dtype, device=like.device) * stride - pad
+            lengths.append((starts + kernel).clamp(max=size + pad) - starts)
+        return torch.outer(lengths[0], lengths[1])
+
+    def _axes(self) -> zip[tuple[int, int, int, int]]:
+        return zip(self.size, self.kernel, self.stride, self.pad, strict=True)
+
+
+def max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the maximum of each window and the index, row * width + column, of the pixel it came from.
+
+    The first of equal pixels gets the gradient, padding and NaN never win, and a window without a pixel above
+    -FLT_MAX (all NaN, all -inf, or empty) yields -FLT_MAX, index -1 and no gradient.
+    """
+    values, indices = _native_max_pool(maps, windows)
+    # torch lets NaN win, so the maxima betray whether any window needs Caffe's rule; maps without one pay only for
+    # this look at the smaller output.
+    if values.numel() and not bool(values.detach().amin() > LOWEST):
+        values, indices = _native_max_pool(torch.where(maps > LOWEST, maps, LOWEST), windows)
+        indices = torch.where(values > LOWEST, indices, -1)
+    return values, indices
+
+
+def _native_max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
+    kernel, stride, pad = windows.kernel, windows.stride, windows.pad
+    if windows.known_to_torch:
+        ceil = windows.round_mode == CEIL
+        return F.max_pool2d(maps, kernel, stride, pad, ceil_mode=ceil, return_indices=True)
+    framed = windows.padded(maps, LOWEST)
+    values, indices = F.max_pool2d(framed, kernel, stride, return_indices=True)
+    rows = indices.div(framed.shape[-1], rounding_mode="floor") - pad[0]
+    return values, rows * maps.shape[-1] + indices % framed.shape[-1] - pad[1]
+
+
+def average_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
+    """Return the mean of each window; padding counts as zeros.
+
+    A window without a pixel divides zero by what is left of its area, at times zero: NaN, as in Caffe.
+    """
+    if windows.known_to_torch:
+        ceil = windows.round_mode == CEIL
+        return F.avg_pool2d(maps, windows.kernel, windows.stride, windows.pad, ceil_mode=ceil, count_include_pad=True)
+    return _sum_pool(maps, windows) / windows.areas(maps)
+
+
+def _sum_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
+    return F.avg_pool2d(windows.padded(maps, 0.0), windows.kernel, windows.stride, divisor_override=1)
+
+
+def weighted_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
+    """Return the mean of each window's pixels, each weighted by itself: stochastic pooling in the test phase."""
+    return _sum_pool(maps * maps, windows) / (_sum_pool(maps, windows) + SMALLEST)
+
+
+def sampled_pool(maps: torch.Tensor, windows: Windows, generator: torch.Generator) -> torch.Tensor:
+    """Return one pixel of each window, drawn with a probability proportional to its value (not negative)."""
+    (kernel_h, kernel_w), (down, across) = windows.kernel, windows.count
+    columns = F.unfold(windows.padded(maps, 0.0), windows.kernel, stride=windows.stride)
+    pixels = columns.view(*maps.shape[:2], kernel_h * kernel_w, down, across)
+    with torch.no_grad():
+        sums = pixels.cumsum(dim=2)
+        shape = (*maps.shape[:2], 1, down, across)
+        drawn = 1 - torch.rand(shape, generator=generator, device=maps.device, dtype=maps.dtype)  # never 0
+        chosen = (sums >= drawn * sums[:, :, -1:]).byte().argmax(dim=2, keepdim=True)  # the first that reaches it
+    return pixels.gather(2, chosen).squeeze(2)
+
+
+class _PoolingBase(Layer):
+    """What Pooling and SPP have in common."""
+
+    def check_pad(self, windows: Windows, method: int, field: str) -> None:
+        """Refuse padding as Caffe does: as long as the kernel, or for another method than MAX and AVE."""
+        if any(windows.pad) and method == STOCHASTIC:
+            raise self.error("STOCHASTIC pooling knows no padding", field)
+        if any(p and p >= k for p, k in zip(windows.pad, windows.kernel, strict=True)):
+            raise self.error(f"pad {windows.pad} must be less than the kernel {windows.kernel}", field)
+
+    def pool(self, maps: torch.Tensor, windows: Windows, method: int) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Return the pooled maps (N, C, down, across) and, for MAX, the indices of the winners."""
+        if method == MAX:
+            return max_pool(maps, windows)
+        if method == AVE:
+            return average_pool(maps, windows), None
+        if self.phase == TRAIN:
+            return sampled_pool(maps, windows, self.context.random.on(maps.device)), None
+        return weighted_pool(maps, windows), None
+
+
+@register("Pooling", "pooling_param")
+class Pooling(_PoolingBase):
+    """Reduce each window of a map to its maximum, its average, or a pixel drawn at random.
+
+    bottom[0]  (N, C, H, W)
+    top[0]     (N, C, H', W'),  H' = ceil((H + 2 pad - kernel) / stride) + 1, floor with round_mode: FLOOR; one less
+               where padded and the last window would begin past the map and its padding; 1 with global_pooling
+    top[1]     MAX only, optional: of each maximum, its index row * W + column in the map; -1 for none
+    Caffe: src/caffe/layers/pooling_layer.cpp; STOCHASTIC, which Caffe has on GPUs only, pooling_layer.cu
+    """
+
+    tops = (1, 2)
+
+    def setup(self) -> None:
+        """Read the method and the windows' geometry."""
+        param = self.param.pooling_param
+        self.method: int = param.pool
+        if self.num_tops > 1 and self.method != MAX:
+            raise self.error("only MAX pooling has a second top, the mask", "top", 1)
+        if param.global_pooling:
+            for name in ("kernel_size", "kernel_h", "kernel_w"):
+                if param.HasField(name):
+                    raise self.error(f"global_pooling takes the whole map: remove {name}", "pooling_param", name)
+        else:
+            self.kernel = self._pair("kernel_size", "kernel_h", "kernel_w", least=1)
+        self.stride = self._pair("stride", "stride_h", "stride_w", least=1)
+        self.pad = self._pair("pad", "pad_h", "pad_w", least=0)
+        if param.global_pooling and (self.pad != (0, 0) or self.stride != (1, 1)):
+            raise self.error("global_pooling goes with pad 0 and stride 1 only", "pooling_param", "global_pooling")
+
+    def _pair(self, name: str, name_h: str, name_w: str, least: int) -> Pair:
+        param, field = self.param.pooling_param, "pooling_param"
+        given = [n for n in (name_h, name_w) if param.HasField(n)]
+        if given and param.HasField(name):
+            raise self.error(f"found both {name} and {given[0]}; give one of them", field, given[0])
+        if len(given) == 1:
+            raise self.error(f"found {given[0]} only; give both {name_h} and {name_w}, or {name}", field, given[0])
+        if not given and name == "kernel_size" and not param.HasField(name):
+            raise self.error("kernel_size (or kernel_h and kernel_w, or global_pooling) is missing", field)
+        pair = (getattr(param, name_h), getattr(param, name_w)) if given else (getattr(param, name),) * 2
+        if min(pair) < least:
+            raise self.error(
+                f"{name} must be at least {least}, found {pair[0]} x {pair[1]}", field, (given or [name])[0]
+            )
+        return pair
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of the pooled maps, and of the mask."""
+        shape, param = bottom_shapes[0], self.param.pooling_param
+        if len(shape) != 4:
+            raise self.error(f"pooling needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
+        size = (shape[2], shape[3])
+        kernel = size if param.global_pooling else self.kernel
+        self.windows = Windows(size, kernel, self.stride, self.pad, param.round_mode)
+        self.check_pad(self.windows, self.method, "pooling_param")
+        if min(self.windows.count) < 1 or min(size) < 1:
+            message = f"no window of {kernel} at stride {self.stride}, pad {self.pad}, fits a map of {size}"
+            raise self.error(message, "pooling_param")
+        return [(*shape[:2], *self.windows.count)] * self.num_tops
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        """Return the pooled maps, and the mask if it is asked for."""
+        values, indices = self.pool(data, self.windows, self.method)
+        return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
+
+
+@register("SPP", "spp_param")
+class SPP(_PoolingBase):
+    """Pool a map into 1, then 2 x 2, then 4 x 4, ... windows: as many features whatever the map's size.
+
+    bottom[0]  (N, C, H, W)
+    top[0]     (N, C (1 + 4 + 16 + ...)) with ``pyramid_height`` terms, level by level; (N, C, 1, 1) for height 1
+    Caffe: src/caffe/layers/spp_layer.cpp
+    """
+
+    def setup(self) -> None:
+        """Refuse a pyramid without a level."""
+        if self.param.spp_param.pyramid_height < 1:
+            raise self.error("pyramid_height must be at least 1", "spp_param", "pyramid_height")
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the number of features; place each level's windows."""
+        shape, param = bottom_shapes[0], self.param.spp_param
+        if len(shape) != 4:
+            raise self.error(f"SPP needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
+        self.levels = [_pyramid_level(2**level, (shape[2], shape[3])) for level in range(param.pyramid_height)]
+        for windows in self.levels:
+            self.check_pad(windows, param.pool, "spp_param")
+        if len(self.levels) == 1:
+            return [(*shape[:2], *self.levels[0].count)]
+        return [(shape[0], shape[1] * sum(w.count[0] * w.count[1] for w in self.levels))]
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the features, the coarsest level's first."""
+        pooled = [self.pool(data, windows, self.param.spp_param.pool)[0] for windows in self.levels]
+        return pooled[0] if len(pooled) == 1 else torch.cat([level.flatten(1) for level in pooled], dim=1)
+
+
+def _pyramid_level(bins: int, size: Pair) -> Windows:
+    """Return windows, side by side, that cover a map of ``size`` with ``bins`` down and across."""
+    kernel = (-(-size[0] // bins), -(-size[1] // bins))
+    pad = ((kernel[0] * bins - size[0] + 1) // 2, (kernel[1] * bins - size[1] + 1) // 2)
+    return Windows(size, kernel, kernel, pad)

@@ -1,0 +1,3 @@
+"""Was netspec.describe."""
+
+from netspec.features.describer import Describer as Describer

@@ -1,0 +1,8 @@
+"""A runnable net: built from a Plan, its weights, its forward pass."""
+
+from netspec.net.build import build_net, load_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.net.weights import load_weights, save_weights
+
+__all__ = ["BuildOptions", "Net", "build_net", "load_net", "load_weights", "save_weights"]

@@ -1,0 +1,61 @@
+"""From a prototxt to a runnable net: read, filter, insert splits, plan, build, load weights.
+
+Caffe: Net::Init (src/caffe/net.cpp)
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from netspec import log
+from netspec.graph.filter import filter_net, with_state
+from netspec.graph.plan import make_plan
+from netspec.graph.splits import insert_splits
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.net.weights import copy_weights, load_weights
+from netspec.proto.schema import PHASES, NetParameter
+from netspec.proto.source_map import SourceMap
+from netspec.proto.text import parse_net, write_text
+
+
+def load_net(
+    path: str | Path,
+    phase: str | int = "TEST",
+    weights: str | Path | None = None,
+    level: int = 0,
+    stages: Iterable[str] = (),
+    device: str | torch.device = "cpu",
+    seed: int | None = None,
+    allow_python: bool = False,
+) -> Net:
+    """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
+
+    Raises SpecError for every fault of the files.
+    """
+    net, source = parse_net(path)
+    number = PHASES[phase] if isinstance(phase, str) else phase
+    options = BuildOptions(torch.device(device), seed, allow_python=allow_python)
+    built = build_net(with_state(net, number, level, stages), source, options)
+    if weights is not None:
+        load_weights(built, weights)
+    return built
+
+
+def build_net(net: Any, source: SourceMap, options: BuildOptions | None = None) -> Net:
+    """Filter by the net's own ``state``, insert splits, plan, and build."""
+    options = options or BuildOptions()
+    filtered, source = filter_net(net, source, options.report)
+    if log.logger.isEnabledFor(logging.INFO):
+        log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered).rstrip("\n"))
+    split, source = insert_splits(filtered, source, options.report)
+    built = Net(make_plan(split, source, options.report), options)
+    written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
+    if written.layer:  # weights in the prototxt itself
+        copy_weights(built, written, source.file)
+    return built

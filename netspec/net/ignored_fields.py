@@ -1,0 +1,68 @@
+"""Fields of a prototxt that have no effect: where Caffe says nothing, a net names each of them once.
+
+A field may belong to another layer's type (``pooling_param`` in a Convolution, ``loss_param`` in an EuclideanLoss), to
+another filler (``std`` with xavier), or to an older format (``data_param { scale: ... }``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from google.protobuf.message import Message
+
+from netspec.graph.plan import Plan
+from netspec.layers.base import Layer
+from netspec.layers.fillers import READS
+
+#: Fields of every layer: the net's affair, not a layer's own.
+COMMON = frozenset(
+    {"name", "type", "bottom", "top", "phase", "loss_weight", "param", "blobs", "propagate_down", "include", "exclude"}
+)
+#: These say how Caffe computes, not what: no result here depends on them.
+HOW_NOT_WHAT = frozenset({"engine", "force_nd_im2col", "share_in_parallel", "stable_prod_grad"})
+
+Path = tuple[str, ...]
+
+
+def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
+    """Yield a line for each field without effect, with its first place in the file and how many more there are."""
+    found: dict[tuple[str, Path, str], list[int]] = {}
+    for i, layer in enumerate(layers):
+        for path, reason in _unused(layer):
+            found.setdefault((layer.type, path, reason), []).append(i)
+    for (kind, path, reason), places in found.items():
+        first = places[0]
+        where = plan.source.at(first, *path, layer=plan.nodes[first].name, type=kind)
+        others = f" (nor in {len(places) - 1} more of these layers)" if len(places) > 1 else ""
+        yield f"{where}: {'.'.join(path)} has no effect: {reason}{others}"
+    if plan.net.debug_info:
+        yield f"{plan.source.net.find('debug_info')}: debug_info has no effect: only the solver's has"
+
+
+def _unused(layer: Layer) -> Iterator[tuple[Path, str]]:
+    partly = {name.partition(".")[0] for name in layer.reads if "." in name}
+    for field, value in layer.param.ListFields():
+        if field.name in COMMON:
+            continue
+        if field.name not in layer.reads | partly:
+            yield (field.name,), f"a layer of type {layer.type} does not read it"
+            continue
+        if field.message_type is None:
+            continue
+        whole = field.name in layer.reads
+        for inner, inner_value in value.ListFields():
+            path = f"{field.name}.{inner.name}"
+            known = (whole and not inner.is_extension and path not in layer.ignores) or path in layer.reads
+            if not known and inner.name not in HOW_NOT_WHAT:
+                yield (field.name, inner.name), f"a layer of type {layer.type} does not read it"
+            elif inner.message_type is not None and inner.message_type.full_name == "caffe.FillerParameter":
+                for filler in [inner_value] if isinstance(inner_value, Message) else inner_value:
+                    for name, reason in _unused_of_filler(filler):
+                        yield (field.name, inner.name, name), reason
+
+
+def _unused_of_filler(filler: Any) -> Iterator[tuple[str, str]]:
+    for field, _ in filler.ListFields():
+        if field.name != "type" and field.name not in READS.get(filler.type, ()):
+            yield field.name, f'filler "{filler.type}" does not read it'

@@ -1,0 +1,349 @@
+"""Net: a torch.nn.Module that walks a Plan. It knows no layer by name.
+
+Caffe: src/caffe/net.cpp
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from netspec import log
+from netspec.errors import SpecError, Where, did_you_mean
+from netspec.graph.plan import Node, Param, Plan, plan_backward
+from netspec.layers import layer_class, layer_types
+from netspec.layers.base import Context, Layer, Random, Shape, shape_string
+from netspec.net.ignored_fields import unused_fields
+from netspec.net.in_place import Memory, is_overwritten, run_overwritten
+from netspec.net.options import BuildOptions
+from netspec.proto.dialect.files import announce_known
+from netspec.proto.dialect.registry import advice_for_type
+from netspec.proto.schema import NetParameter
+
+Array = np.ndarray | torch.Tensor
+
+
+@dataclass(frozen=True)
+class Learnable:
+    """A parameter as the solver sees it: once, with its owner's place and its multipliers."""
+
+    parameter: torch.nn.Parameter
+    lr_mult: float
+    decay_mult: float
+    layer: str
+    index: int
+
+
+class Net(torch.nn.Module):
+    """A runnable net.
+
+    ``net(data=array, label=array)`` runs one forward pass and returns the output blobs, by name in Caffe's
+    (alphabetical) order; inputs are ndarrays or tensors. ``inputs`` and ``outputs`` list blob names; ``blobs`` holds
+    what the last pass kept: the outputs, or with ``keep = "all"`` every blob, or with a list those named besides the
+    outputs. ``params`` maps layer names to lists of tensors in Caffe's blob order; shared ones are one object.
+    ``layers`` and ``param.layer`` run in step, splits included. Gradients are torch's.
+    """
+
+    def __init__(self, plan: Plan, options: BuildOptions | None = None) -> None:
+        super().__init__()
+        options = options or BuildOptions()
+        self.plan = plan
+        self.param = NetParameter()
+        self.param.CopyFrom(plan.net)
+        self.name: str = plan.net.name
+        self.phase: int = plan.net.state.phase
+        self.device = options.device
+        self.keep: str | Iterable[str] = ()
+        self.blobs: dict[str, torch.Tensor] = {}
+        self.shapes: dict[str, Shape] = {}
+        self.loss_weights: list[list[float]] = []
+        self.learnable: list[Learnable] = []
+        self._last_use = _last_uses(plan)
+        seed = int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed
+        self.random = Random(seed)
+        self.layers = self._build_layers(options)
+        self._overwritten = [
+            is_overwritten(layer, node, plan) for layer, node in zip(self.layers, plan.nodes, strict=False)
+        ]
+        self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
+        self.outputs = list(plan.outputs)
+
+    # Building
+
+    def _build_layers(self, options: BuildOptions) -> Any:
+        layers: dict[int, Layer] = {}  # without the faulty ones, where faults are collected
+        shapes: dict[int, Shape] = {}
+        memory = 0
+        for i, (node, param) in enumerate(zip(self.plan.nodes, self.param.layer, strict=True)):
+            if not param.HasField("phase"):
+                param.phase = self.phase
+            at = partial(self.plan.source.at, i, layer=node.name, type=node.type)
+            log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
+            cls = layer_class(node.type)
+            if cls is None:
+                options.report(SpecError(_unknown_type(node.type), at("type")))
+                continue
+            if any(v not in shapes for v in node.bottoms):
+                continue  # for a fault upstream, which was reported
+            context = Context(
+                phase=self.phase,
+                random=self.random,
+                at=at,
+                device=options.device,
+                open_data=options.open_data,
+                given_shapes=options.given_shapes or {},
+                allow_python=options.allow_python,
+                rank=options.rank,
+                ranks=options.ranks,
+                created=partial(self._log_wiring, node),
+            )
+            try:
+                layer = cls(param, [shapes[v] for v in node.bottoms], context)
+                weights = _loss_weights(layer)
+            except SpecError as fault:
+                options.report(fault)
+                continue
+            layers[i] = layer
+            self.loss_weights.append(weights)
+            for v, shape in zip(node.tops, layer.top_shapes, strict=False):
+                shapes[v] = shape
+                self.shapes[self.plan.blobs[v]] = shape
+            log.info("net.cpp:124", f"Setting up {node.name}")
+            for shape, weight in zip(layer.top_shapes, weights, strict=True):
+                memory += math.prod(shape) * 4
+                log.info("net.cpp:131", "Top shape: " + shape_string(shape))
+                if weight:
+                    log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
+            log.info("net.cpp:139", f"Memory required for data: {memory}")
+            try:
+                self._adopt_params(layers, i, layer)
+            except SpecError as fault:
+                options.report(fault)
+        if len(layers) == len(self.plan.nodes):
+            self._finish(list(layers.values()))
+        return torch.nn.ModuleList(layers.values())
+
+    def _log_wiring(self, node: Any) -> None:
+        log.info("net.cpp:86", f"Creating Layer {node.name}")
+        for v in node.bottoms:
+            log.info("net.cpp:408", f"{node.name} <- {self.plan.blobs[v]}")
+        for v, in_place in zip(node.tops, node.in_place, strict=True):
+            if in_place:
+                log.info("net.cpp:369", f"{node.name} -> {self.plan.blobs[v]} (in-place)")
+            else:
+                log.info("net.cpp:382", f"{node.name} -> {self.plan.blobs[v]}")
+
+    def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer) -> None:
+        """Tie the shared parameters of layer ``i`` to their owners; list the others as learnable."""
+        node = self.plan.nodes[i]
+        if len(node.params) > len(layer.blobs):
+            message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one a learnable blob"
+            raise layer.error(message, "param", len(layer.blobs))
+        for j in range(len(layer.blobs)):
+            spec = _spec(node, layer, j)
+            if spec.owner is None:
+                parameter = layer.blobs[j]
+                parameter.requires_grad_(spec.lr_mult != 0 or self.param.force_backward)
+                self.learnable.append(Learnable(parameter, spec.lr_mult, spec.decay_mult, node.name, j))
+                continue
+            owner_index, owner_blob = spec.owner
+            if owner_index not in layers:
+                continue  # for a fault of the owner, which was reported
+            owner = layers[owner_index]
+            here, there = layer.blob_shapes[j], owner.blob_shapes[owner_blob]
+            owner_name = self.plan.nodes[owner_index].name
+            fits = math.prod(here) == math.prod(there) if spec.permissive else here == there
+            if not fits:
+                rule = "equal counts" if spec.permissive else "equal shapes (share_mode: STRICT)"
+                raise layer.error(
+                    f'cannot share param "{spec.name}" owned by layer "{owner_name}", param index {owner_blob}: '
+                    f"found shape {shape_string(here)} here and {shape_string(there)} there, expected {rule}",
+                    "param",
+                    j,
+                )
+            layer.blobs[j] = owner.blobs[owner_blob]
+            place = f"owned by layer '{owner_name}', param index {owner_blob}"
+            log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {place}")
+
+    def _finish(self, layers: list[Layer]) -> None:
+        """Log what needs backward computation, as Caffe decides it, and what is put out."""
+        learns = []
+        for node, layer in zip(self.plan.nodes, layers, strict=True):
+            learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
+        has_loss = [[bool(w) for w in weights] for weights in self.loss_weights]
+        self.backward_plan = plan_backward(self.plan, learns, has_loss, [layer.label_bottoms for layer in layers])
+        for node, needs in zip(reversed(self.plan.nodes), reversed(self.backward_plan.layers), strict=True):
+            if needs:
+                log.info("net.cpp:200", f"{node.name} needs backward computation.")
+            else:
+                log.info("net.cpp:202", f"{node.name} does not need backward computation.")
+        for name in self.plan.outputs:
+            log.info("net.cpp:244", f"This network produces output {name}")
+        log.info("net.cpp:257", "Network initialization done.")
+        for line in unused_fields(self.plan, layers):
+            log.warning("net.cpp:257", line)
+
+    # Running
+
+    def forward(self, **inputs: Array) -> dict[str, torch.Tensor]:
+        """Run the net and return its output blobs; ``inputs`` are the values of the blobs in ``self.inputs``."""
+        return self._run(inputs)[1]
+
+    def forward_loss(self, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Run the net; return the weighted sum of its losses (a scalar; 0 where there is none) and the outputs."""
+        return self._run(inputs)
+
+    def _run(self, inputs: Mapping[str, Array]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        unknown = sorted(set(inputs) - set(self.inputs))
+        missing = [name for name in self.inputs if name not in inputs]
+        if unknown or missing:
+            found = f"unknown input {unknown[0]!r}" if unknown else f"no value for input {missing[0]!r}"
+            known = ", ".join(self.inputs) or "none (it reads its own data)"
+            raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
+        kept = self._kept()
+        values: dict[int, torch.Tensor] = {}
+        memories: dict[int, Memory] = {}
+        loss: torch.Tensor | None = None
+        for i, node in enumerate(self.plan.nodes):
+            memory = memories.setdefault(self.plan.final[node.tops[0]], Memory()) if self._overwritten[i] else None
+            tops = self.run_layer(i, values, inputs, memory)
+            for v, top in zip(node.tops, tops, strict=False):
+                values[v] = top
+                if v in memories:
+                    memories[v].data = top.detach()
+            for top, weight in zip(tops, self.loss_weights[i], strict=True):
+                if weight:
+                    term = top.sum() if weight == 1 else top.sum() * weight
+                    loss = term if loss is None else loss + term
+            for v in self._last_use[i]:
+                if v not in kept:
+                    del values[v]
+        self.blobs = {self.plan.blobs[v]: values[v] for v in sorted(kept)}
+        outputs = {name: values[v] for name, v in self.plan.outputs.items()}
+        return (torch.zeros((), device=self.device) if loss is None else loss), outputs
+
+    def run_layer(
+        self, i: int, values: Mapping[int, torch.Tensor], inputs: Mapping[str, Array], memory: Memory | None = None
+    ) -> tuple[torch.Tensor, ...]:
+        """Run layer ``i`` alone on ``values`` (by value number) and return its tops.
+
+        ``memory`` is what its gradient is to read where later layers write in place over its top.
+        """
+        node, layer = self.plan.nodes[i], self.layers[i]
+        if layer.is_input:
+            return tuple(self._as_input(inputs[blob]) for blob in _tops(self.plan, node))
+        bottoms = []
+        for v, blocked in zip(node.bottoms, node.blocked, strict=True):
+            stop = blocked and not self.param.force_backward
+            bottoms.append(values[v].detach() if stop else values[v])
+        if memory is not None and torch.is_grad_enabled():
+            return run_overwritten(layer, bottoms[0], memory, node.in_place[0])
+        return layer.run(*bottoms)
+
+    def _as_input(self, value: Array) -> torch.Tensor:
+        if isinstance(value, torch.Tensor):
+            return value.to(self.device)
+        dtype = self.learnable[0].parameter.dtype if self.learnable else torch.float32
+        return torch.as_tensor(np.asarray(value)).to(self.device, dtype)
+
+    def _kept(self) -> set[int]:
+        current = {name: v for v, name in enumerate(self.plan.blobs)}
+        if self.keep == "all":
+            return set(current.values())
+        names = [self.keep] if isinstance(self.keep, str) else list(self.keep)
+        for name in names:
+            if name not in current:
+                raise ValueError(f"no blob {name!r} in this net{did_you_mean(name, list(current))}")
+        return set(self.plan.outputs.values()) | {current[name] for name in names}
+
+    # Parameters and data
+
+    @property
+    def params(self) -> dict[str, list[torch.nn.Parameter]]:
+        """Layer name -> learnable blobs, in Caffe's order; layers without any are left out."""
+        return {
+            node.name: list(layer.blobs)
+            for node, layer in zip(self.plan.nodes, self.layers, strict=True)
+            if len(layer.blobs)
+        }
+
+    @property
+    def output_loss_weights(self) -> dict[str, float]:
+        """Output blob -> its loss weight, 0 where it is no loss."""
+        weights = {
+            v: weight
+            for node, row in zip(self.plan.nodes, self.loss_weights, strict=True)
+            for v, weight in zip(node.tops, row, strict=False)
+        }
+        return {name: weights[v] for name, v in self.plan.outputs.items()}
+
+    def share_weights_with(self, other: Net) -> None:
+        """Use the learnable blobs of ``other``, layer by layer of equal name (Caffe: ShareTrainedLayersWith)."""
+        mine = {node.name: layer for node, layer in zip(self.plan.nodes, self.layers, strict=True)}
+        for node, theirs in zip(other.plan.nodes, other.layers, strict=True):
+            layer = mine.get(node.name)
+            if layer is None:
+                continue
+            shapes = (layer.blob_shapes, theirs.blob_shapes)
+            if shapes[0] != shapes[1]:
+                message = f"cannot share weights with the training net: blobs {shapes[0]} here, {shapes[1]} there"
+                raise layer.error(message)
+            for j, blob in enumerate(theirs.blobs):
+                layer.blobs[j] = blob
+
+    def restart_data(self) -> None:
+        """Make every layer that reads records begin at its first one again."""
+        for layer in self.layers:
+            layer.restart()
+
+    def close(self) -> None:
+        """Let go of files and threads."""
+        for layer in self.layers:
+            layer.close()
+
+
+def _tops(plan: Plan, node: Any) -> list[str]:
+    return [plan.blobs[v] for v in node.tops]
+
+
+def _spec(node: Node, layer: Layer, j: int) -> Param:
+    """Return what the prototxt, or the layer, says of learnable blob ``j``."""
+    spec = node.params[j] if j < len(node.params) else Param("", layer.default_param_lr, 1.0, False, None)
+    return replace(spec, lr_mult=0.0, decay_mult=0.0) if j in layer.not_learned else spec
+
+
+def _last_uses(plan: Plan) -> list[list[int]]:
+    """Return, by node, the values that nobody needs once it has run."""
+    last: dict[int, int] = {}
+    for i, node in enumerate(plan.nodes):
+        for v in (*node.tops, *node.bottoms):
+            last[v] = i
+    ends: list[list[int]] = [[] for _ in plan.nodes]
+    for v, i in last.items():
+        ends[i].append(v)
+    return ends
+
+
+def _loss_weights(layer: Layer) -> list[float]:
+    """Return the loss weight of each top (Caffe: Layer::SetLossWeights, LossLayer::LayerSetUp)."""
+    given = list(layer.param.loss_weight)
+    if given:
+        if len(given) != layer.num_tops:
+            message = f"found {len(given)} loss_weight, expected none or one a top blob ({layer.num_tops})"
+            raise layer.error(message, "loss_weight")
+        return given
+    return [1.0 if layer.is_loss and j == 0 else 0.0 for j in range(layer.num_tops)]
+
+
+def _unknown_type(name: str) -> str:
+    announce_known()
+    fork = advice_for_type(name)
+    advice = f"; {fork}" if fork else did_you_mean(name, layer_types()) or "; `netspec layers` lists the known ones"
+    return f'unknown layer type "{name}"{advice}'

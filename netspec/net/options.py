@@ -1,0 +1,30 @@
+"""How a net is built, whoever asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+
+from netspec.graph import Report, raise_fault
+from netspec.layers.base import Shape
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """How a net is built.
+
+    ``seed`` None draws one; ``open_data`` False opens no data (``given_shapes``: the tops of data layers, by blob);
+    ``report`` gets each fault (the default raises the first); ``allow_python`` lets Python layers run code. Of
+    ``ranks`` nets that train side by side this one is number ``rank``: its data layers read their share of the records.
+    """
+
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    seed: int | None = None
+    open_data: bool = True
+    given_shapes: Mapping[str, Shape] | None = None
+    report: Report = raise_fault
+    allow_python: bool = False
+    rank: int = 0
+    ranks: int = 1

@@ -1,0 +1,208 @@
+"""caffemodel <-> Net, by layer name: Caffe's binary form, and its HDF5 form in files that end in ``.h5``.
+
+Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+from netspec import log
+from netspec.data import blobs
+from netspec.errors import SpecError, Where
+from netspec.layers.base import shape_string
+from netspec.net.net import Net
+from netspec.proto.binary import read_net_binary
+from netspec.proto.schema import NetParameter
+from netspec.whole_file import whole_file
+
+Copies = list[tuple[torch.Tensor, np.ndarray]]
+
+
+def load_weights(net: Net, path: str | Path) -> None:
+    """Copy the weights of a .caffemodel or .caffemodel.h5 into the layers of the same names, all or none.
+
+    Layers that only the file has are ignored, and named in the log; layers that only the net has stay as they are.
+    Raises SpecError for a file that cannot be read, and for blobs of other number or shape than the net's.
+    """
+    path = Path(path)
+    if h5py.is_hdf5(path):
+        _copy(_from_hdf5(net, path))
+    else:
+        copy_weights(net, read_net_binary(path), path)
+
+
+def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
+    """Copy the weights in a message, read from ``path``, as :func:`load_weights` copies a file's."""
+    _copy(_from_message(net, message, Path(path)))
+
+
+def _copy(copies: Copies) -> None:
+    with torch.no_grad():
+        for blob, values in copies:
+            blob.copy_(torch.tensor(values).view(blob.shape))
+
+
+def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
+    """Write all layers of the net, splits included, and their weights; with ``diff`` their gradients too.
+
+    A blob that layers share is written by each of them, in HDF5 by its owner alone. Raises SpecError where the file
+    cannot be written; then what was there before is there still.
+    """
+    with whole_file(path) as unfinished:
+        if str(path).endswith(".h5"):
+            _to_hdf5(net, unfinished, diff)
+        else:
+            unfinished.write_bytes(net_to_proto(net, diff).SerializeToString(deterministic=True))
+
+
+def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
+    """Return the net's name, its layers as they run (filtered, split, each with its phase), and their blobs."""
+    proto = NetParameter(name=net.name)
+    for layer in net.layers:
+        written = proto.layer.add()
+        written.CopyFrom(layer.param)
+        if layer.is_loss and layer.num_tops == 1 and not written.loss_weight:
+            written.loss_weight.append(1)  # Caffe's loss layers note their default (loss_layer.cpp)
+        del written.blobs[:]
+        for j in range(len(layer.blobs)):
+            written.blobs.append(blobs.from_array(_values(layer, j), _gradient(layer, j) if diff else None))
+    return proto
+
+
+# Binary
+
+
+def _from_message(net: Net, message: Any, path: Path) -> Copies:
+    targets = _layers_by_name(net)
+    copies: Copies = []
+    for source in message.layer:
+        target = targets.get(source.name)
+        if target is None:
+            _ignore(source.name)
+            continue
+        if len(source.blobs) != len(target.blobs):
+            raise _wrong_count(path, source.name, len(source.blobs), len(target.blobs))
+        for j, blob in enumerate(source.blobs):
+            if not blobs.fits(blob, target.blob_shapes[j]):
+                raise _wrong_shape(path, source.name, j, blobs.shape_of(blob), target.blob_shapes[j])
+            try:
+                copies.append((target.blob(j), blobs.to_array(blob)))
+            except ValueError as fault:
+                raise SpecError(f'layer "{source.name}", blob {j}: {fault}', Where(str(path))) from None
+    return copies
+
+
+# HDF5: /data/<layer>/<i>, and /diff/<layer>/<i>
+
+
+def _from_hdf5(net: Net, path: Path) -> Copies:
+    targets = _layers_by_name(net)
+    shared = _shared(net)
+    copies: Copies = []
+    with h5py.File(path, "r") as file:
+        data = file.get("data")
+        if not isinstance(data, h5py.Group):
+            raise SpecError("these are not weights: the HDF5 file has no group /data", Where(str(path)))
+        for name, arrays in _layer_groups(data):
+            target = targets.get(name)
+            if target is None:
+                _ignore(name)
+                continue
+            if len(arrays) > len(target.blobs):
+                raise _wrong_count(path, name, len(arrays), len(target.blobs))
+            for j in range(len(target.blobs)):
+                array = arrays.get(str(j))
+                if array is None:
+                    if (name, j) in shared:
+                        continue
+                    raise _wrong_count(path, name, len(arrays), len(target.blobs))
+                if array.shape != target.blob_shapes[j]:
+                    raise _wrong_shape(path, name, j, array.shape, target.blob_shapes[j])
+                copies.append((target.blob(j), array[()]))
+    return copies
+
+
+def _layer_groups(data: h5py.Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
+    """Walk the layers, in Caffe's (alphabetical) order; a layer with a slash in its name is a group within a group."""
+    for name, group in data.items():
+        if isinstance(group, h5py.Group):
+            arrays = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
+            if arrays or not len(group):
+                yield prefix + name, arrays
+            yield from _layer_groups(group, f"{prefix}{name}/")
+
+
+def _to_hdf5(net: Net, path: Path, diff: bool) -> None:
+    shared = _shared(net)
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        diffs = file.create_group("diff") if diff else None
+        for layer in net.layers:
+            name = layer.param.name
+            group = data.require_group(name)
+            for j in range(len(layer.blobs)):
+                if (name, j) not in shared:
+                    group.create_dataset(str(j), data=_values(layer, j))
+            if diffs is not None:
+                group = diffs.require_group(name)
+                for j in range(len(layer.blobs)):
+                    group.create_dataset(str(j), data=_gradient(layer, j))
+
+
+# The net's side
+
+
+def _layers_by_name(net: Net) -> dict[str, Any]:
+    """Return the layers by name, the first of a name winning, as in Caffe."""
+    return {layer.param.name: layer for layer in reversed(net.layers)}
+
+
+def _shared(net: Net) -> set[tuple[str, int]]:
+    """Return the blobs, as (layer, index), that an earlier layer owns."""
+    owned: set[int] = set()
+    shared = set()
+    for layer in net.layers:
+        for j, blob in enumerate(layer.blobs):
+            if id(blob) in owned:
+                shared.add((layer.param.name, j))
+            owned.add(id(blob))
+    return shared
+
+
+def _values(layer: Any, j: int) -> np.ndarray:
+    return layer.blob(j).detach().cpu().numpy()
+
+
+def _gradient(layer: Any, j: int) -> np.ndarray:
+    gradient = layer.blobs[j].grad
+    if gradient is None:
+        return np.zeros(layer.blob_shapes[j], np.float32)
+    return gradient.detach().cpu().numpy().reshape(layer.blob_shapes[j])
+
+
+# The sentences
+
+
+def _ignore(name: str) -> None:
+    log.info("net.cpp:746", f"Ignoring source layer {name}")
+
+
+def _wrong_count(path: Path, name: str, found: int, expected: int) -> SpecError:
+    message = f"incompatible number of blobs for layer '{name}': {found} in the file, {expected} in the net. "
+    return SpecError(message + _RENAME, Where(str(path)))
+
+
+def _wrong_shape(path: Path, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:
+    shapes = f"Source param shape is {shape_string(found)}; target param shape is {shape_string(expected)}."
+    message = f"cannot copy param {j} weights from layer '{name}'; shape mismatch. {shapes} {_RENAME}"
+    return SpecError(message, Where(str(path)))
+
+
+_RENAME = "To learn this layer's parameters from scratch rather than copying from a saved net, rename the layer."

@@ -1,0 +1,1 @@
+"""The dialects of Caffe's forks as additions to the schema."""

@@ -1,0 +1,115 @@
+"""Where the files of dialects are, and what they declare; to know that, none of them is run.
+
+``DECLARATIONS`` and the types of the layers are read from a file's syntax (how one is written: netspec/dialects), so
+that a hint about a dialect needs neither torch nor trust in what else is installed.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+
+from netspec import log
+from netspec.errors import SpecError, Where, did_you_mean
+from netspec.proto.dialect.registry import Dialect, announce
+
+GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name and a module each
+FOLDER = Path(__file__).parents[2] / "dialects"  # netspec's own, found also where netspec is not installed
+
+
+@dataclass(frozen=True)
+class DialectFile:
+    """A file that was not read yet. ``module`` is the name that Python imports it by, "" for one given by its path."""
+
+    name: str
+    path: Path
+    module: str = ""
+
+
+@cache
+def known_files() -> dict[str, DialectFile]:
+    """Return the dialects that can be found by name: netspec's own, and those of installed packages' entry points."""
+    found = {}
+    for point in entry_points(group=GROUP):
+        module = point.value.partition(":")[0].strip()
+        try:
+            spec = find_spec(module)
+        except Exception:  # whatever another package does when it is imported, it must not hide the user's own fault
+            spec = None
+        if spec is None or spec.origin is None:
+            log.logger.warning(f'dialect "{point.name}": there is no module {module}; it is left out')
+        else:
+            found[point.name] = DialectFile(point.name, Path(spec.origin), module)
+    for path in sorted(FOLDER.glob("[!_]*.py")):
+        found[path.stem] = DialectFile(path.stem, path, f"{GROUP}.{path.stem}")
+    return found
+
+
+def find_file(name: str | Path) -> DialectFile:
+    """Return the file of a dialect, given by its name or by a path that ends in .py. Raises SpecError."""
+    path = Path(name)
+    if path.suffix == ".py":
+        return DialectFile(re.sub(r"\W", "_", path.stem), path)
+    files = known_files()
+    if str(name) not in files:
+        close = did_you_mean(str(name), list(files)) or f"; known ones: {', '.join(files)}, or the path of a .py file"
+        raise SpecError(f'there is no dialect "{name}"{close}')
+    return files[str(name)]
+
+
+def read_dialect(file: DialectFile) -> Dialect:
+    """Return what a file declares. Raises SpecError where it cannot be read or declares nothing."""
+    try:
+        text = file.path.read_text("utf-8")
+        tree = ast.parse(text)
+    except (OSError, UnicodeDecodeError) as fault:
+        raise SpecError(f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(str(file.path))) from None
+    except SyntaxError as fault:
+        place = Where(str(file.path), fault.lineno or 0, fault.offset or 0)
+        raise SpecError(f"this is not Python: {fault.msg}", place) from None
+    source = ""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and any(_name(target) == "DECLARATIONS" for target in node.targets):
+            if not (isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)):
+                place = Where(str(file.path), node.lineno, node.col_offset + 1)
+                raise SpecError("DECLARATIONS must be one plain string: it is read without running the file", place)
+            # Blank lines before it, so that the lines of errors are those of the file.
+            source = "\n" * (node.value.lineno - 1) + node.value.value
+    types = list(_registered_types(tree))
+    if not source and not types:
+        raise SpecError("declares no dialect: neither DECLARATIONS nor a layer with @register", Where(str(file.path)))
+    advice = f'add --plugin {file.name}, in Python netspec.use_dialect("{file.name}")'
+    return Dialect(file.name, source, tuple(types), advice, str(file.path))
+
+
+def _registered_types(tree: ast.Module) -> Iterator[str]:
+    """Yield the types under which new layers are registered, not those put in the place of Caffe's."""
+    for call in ast.walk(tree):
+        if isinstance(call, ast.Call) and _name(call.func) == "register" and call.args:
+            first = call.args[0]
+            replaces = any(keyword.arg == "replaces" for keyword in call.keywords)
+            if isinstance(first, ast.Constant) and isinstance(first.value, str) and not replaces:
+                yield first.value
+
+
+def _name(node: ast.expr) -> str:
+    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
+@cache
+def announce_known() -> None:
+    """Make every dialect that can be found known, so that errors name it; once, when the first error asks for it.
+
+    A file that cannot be read is left out with a warning.
+    """
+    for file in known_files().values():
+        try:
+            announce(read_dialect(file))
+        except SpecError as fault:
+            log.logger.warning(f'dialect "{file.name}" is left out: {fault}')

@@ -1,0 +1,151 @@
+"""The dialects of Caffe's forks: their messages and fields, added to the schema while a dialect is active.
+
+A dialect writes its additions down in the language of caffe.proto: new messages as they stand in the fork's own file,
+and new fields of Caffe's messages in ``extend``::
+
+    message NormalizeParameter {
+      optional bool across_spatial = 1 [default = true];
+    }
+    extend LayerParameter {
+      optional NormalizeParameter norm_param = 206;
+    }
+
+The text reader and writer then take ``norm_param { ... }`` for one of LayerParameter's fields, and a layer reads it
+with ``schema.value(self.param, "norm_param")``. The classes of Caffe's messages stay the same objects throughout; while
+no dialect is active, the schema is Caffe's. Numbers must be above those that Caffe itself uses in the message, so a
+fork that took one of these (``interp_param = 143``) needs another one here: text files do not tell the difference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from google.protobuf.descriptor_pb2 import FileDescriptorProto
+
+from netspec.errors import SpecError, Where
+from netspec.proto.dialect.declarations import read_declarations
+from netspec.proto.schema import PACKAGE, add_file, added_fields, as_field, fields_of, pool
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """What a fork adds. ``advice`` says to a user how to switch it on, e.g. ``"add --plugin ssd"``.
+
+    ``file`` is where the source stands, for errors.
+    """
+
+    name: str
+    source: str = ""
+    layer_types: tuple[str, ...] = ()
+    advice: str = ""
+    file: str = ""
+
+    @cached_property
+    def declarations(self) -> FileDescriptorProto:
+        """The additions as a descriptor, in a package of their own, so that forks may use the same names."""
+        file = read_declarations(self.source, self.file or f"{self.name}.proto", f"{PACKAGE}.{self.name}")
+        if "caffe.proto" not in file.dependency:
+            file.dependency.append("caffe.proto")
+        return file
+
+    def fields(self) -> set[tuple[str, str]]:
+        """The fields that it adds: full name of Caffe's message and name of the field."""
+        return {(full_name, field) for (full_name, _), field in self.numbers().items()}
+
+    def numbers(self) -> dict[tuple[str, int], str]:
+        """The names of the fields that it adds, by full name of Caffe's message and number of the field."""
+        added = self.declarations.extension
+        return {(f"{PACKAGE}.{f.extendee.removeprefix(f'{PACKAGE}.')}", f.number): f.name for f in added}
+
+
+_known: dict[str, Dialect] = {}
+_active: dict[str, Dialect] = {}
+
+
+def announce(dialect: Dialect) -> None:
+    """Make a dialect known, so that errors about its fields and layer types say that it has them.
+
+    Raises SpecError where its declarations cannot be read, or extend a message that Caffe does not have.
+    """
+    for full_name, _ in dialect.fields():
+        try:
+            pool.FindMessageTypeByName(full_name)
+        except KeyError:
+            raise SpecError(f'Caffe has no message "{full_name}" to extend', Where(dialect.declarations.name)) from None
+    _known[dialect.name] = dialect
+
+
+def activate(dialect: Dialect) -> None:
+    """Announce a dialect and add its fields and messages to the schema. Does nothing if it is active.
+
+    Raises SpecError as :func:`announce`, and where Caffe or another active dialect has a field or a number of it, or
+    its name.
+    """
+    if dialect.name in _active:
+        if _active[dialect.name] != dialect:
+            message = f'another dialect "{dialect.name}" is active, from {_active[dialect.name].declarations.name}'
+            raise SpecError(message, Where(dialect.declarations.name))
+        return
+    announce(dialect)
+    file = dialect.declarations
+    for full_name, field in dialect.fields():
+        if field in fields_of(pool.FindMessageTypeByName(full_name)):
+            raise SpecError(f'{full_name} has a field "{field}" already', Where(file.name))
+    _check_numbers(dialect)
+    try:
+        pool.FindFileByName(file.name)
+    except KeyError:
+        _add(file)
+    for declared in file.extension:
+        descriptor: Any = pool.FindExtensionByName(f"{file.package}.{declared.name}")
+        fields = added_fields.setdefault(descriptor.containing_type.full_name, {})
+        fields[declared.name] = as_field(declared, descriptor)
+    _active[dialect.name] = dialect
+
+
+def _check_numbers(dialect: Dialect) -> None:
+    numbers = dialect.numbers()
+    for other in _active.values():
+        for key in numbers.keys() & other.numbers().keys():
+            message = f'number {key[1]} of {key[0]} is taken, by "{other.numbers()[key]}" of dialect "{other.name}"'
+            raise SpecError(f'{message}; give "{numbers[key]}" another one', Where(dialect.declarations.name))
+
+
+def _add(file: FileDescriptorProto) -> None:
+    try:
+        add_file(file)
+    except TypeError as fault:
+        raise SpecError(f"these declarations do not fit Caffe's schema: {fault}", Where(file.name)) from None
+
+
+def deactivate(name: str) -> None:
+    """Take the fields of an active dialect out of the schema again."""
+    for full_name, field in _active.pop(name).fields():
+        del added_fields[full_name][field]
+
+
+def active() -> list[str]:
+    """Return the names of the active dialects."""
+    return sorted(_active)
+
+
+def advice_for_field(message: str, field: str) -> str:
+    """Return which known dialect has a field of a message (full name), and what to do; or an empty string."""
+    return _advice(field, [d for d in _known.values() if (message, field) in d.fields()])
+
+
+def advice_for_type(layer_type: str) -> str:
+    """Return which known dialect has a layer type, and what to do; or an empty string."""
+    return _advice(layer_type, [d for d in _known.values() if layer_type in d.layer_types])
+
+
+def _advice(name: str, dialects: list[Dialect]) -> str:
+    if not dialects:
+        return ""
+    names = " and ".join(f'"{d.name}"' for d in dialects)
+    advice = f"; {dialects[0].advice}" if dialects[0].advice else ""
+    return (
+        f'dialect{"s" if len(dialects) > 1 else ""} {names} {"have" if len(dialects) > 1 else "has"} "{name}"{advice}'
+    )

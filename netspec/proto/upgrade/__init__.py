@@ -1,0 +1,1 @@
+"""From every older form of nets and solvers to the current one."""

@@ -1,0 +1,393 @@
+"""From every older form of Caffe's nets and solvers to the current one, the places of their parts included.
+
+Each pass takes a net and its map and returns new ones; one that has nothing to do returns what it was given. They run
+in Caffe's order, on text as on weights. Where Caffe drops a field without a word (of a net that is partly V0: its V1
+layers, its ``state``), it is kept here.
+
+Caffe: src/caffe/util/upgrade_proto.cpp, UpgradeNetAsNeeded, UpgradeSolverAsNeeded, UpgradeSnapshotPrefixProperty
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from google.protobuf.message import Message
+
+from netspec import log
+from netspec.errors import SpecError
+from netspec.proto.schema import (
+    BlobShape,
+    LayerParameter,
+    NetParameter,
+    SolverParameter,
+    V1LayerParameter,
+    fields_of,
+)
+from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.upgrade.rewrite import Draft, copy_without
+from netspec.proto.upgrade.v0 import needs_v0_upgrade, upgrade_v0
+
+Upgraded = tuple[NetParameter, SourceMap]
+
+_V1_TYPES = {
+    "NONE": "",
+    "ABSVAL": "AbsVal",
+    "ACCURACY": "Accuracy",
+    "ARGMAX": "ArgMax",
+    "BNLL": "BNLL",
+    "CONCAT": "Concat",
+    "CONTRASTIVE_LOSS": "ContrastiveLoss",
+    "CONVOLUTION": "Convolution",
+    "DATA": "Data",
+    "DECONVOLUTION": "Deconvolution",
+    "DROPOUT": "Dropout",
+    "DUMMY_DATA": "DummyData",
+    "ELTWISE": "Eltwise",
+    "EUCLIDEAN_LOSS": "EuclideanLoss",
+    "EXP": "Exp",
+    "FLATTEN": "Flatten",
+    "HDF5_DATA": "HDF5Data",
+    "HDF5_OUTPUT": "HDF5Output",
+    "HINGE_LOSS": "HingeLoss",
+    "IM2COL": "Im2col",
+    "IMAGE_DATA": "ImageData",
+    "INFOGAIN_LOSS": "InfogainLoss",
+    "INNER_PRODUCT": "InnerProduct",
+    "LRN": "LRN",
+    "MEMORY_DATA": "MemoryData",
+    "MULTINOMIAL_LOGISTIC_LOSS": "MultinomialLogisticLoss",
+    "MVN": "MVN",
+    "POOLING": "Pooling",
+    "POWER": "Power",
+    "RELU": "ReLU",
+    "SIGMOID": "Sigmoid",
+    "SIGMOID_CROSS_ENTROPY_LOSS": "SigmoidCrossEntropyLoss",
+    "SILENCE": "Silence",
+    "SLICE": "Slice",
+    "SOFTMAX": "Softmax",
+    "SOFTMAX_LOSS": "SoftmaxWithLoss",
+    "SPLIT": "Split",
+    "TANH": "TanH",
+    "THRESHOLD": "Threshold",
+    "WINDOW_DATA": "WindowData",
+}
+# Field of a V1 layer, one value a learnable array -> field of the ParamSpec that holds them now.
+_PARAM_SPEC = {"param": "name", "blob_share_mode": "share_mode", "blobs_lr": "lr_mult", "weight_decay": "decay_mult"}
+
+_DATA_PARAMETERS = {"DATA": "data_param", "IMAGE_DATA": "image_data_param", "WINDOW_DATA": "window_data_param"}
+_TRANSFORM_FIELDS = ("scale", "mean_file", "crop_size", "mirror")
+
+_SOLVER_TYPES = {
+    "SGD": "SGD",
+    "NESTEROV": "Nesterov",
+    "ADAGRAD": "AdaGrad",
+    "RMSPROP": "RMSProp",
+    "ADADELTA": "AdaDelta",
+    "ADAM": "Adam",
+}
+_SOLVER_NETS = ("net_param", "train_net_param", "test_net_param")
+
+
+# ---- Nets ----
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """A pass, and what Caffe logs about it: ``lines`` of upgrade_proto.cpp, and the sentences' variable parts."""
+
+    needed: Callable[[NetParameter], bool]
+    run: Callable[[NetParameter, SourceMap], Upgraded]
+    lines: tuple[int, ...]
+    attempt: str
+    success: str
+    note: str = ""
+
+
+def upgrade_net(net: NetParameter, source: SourceMap) -> Upgraded:
+    """Return a net in the current format, and its map; log what was done in Caffe's words.
+
+    Raises SpecError for a net that has both ``layer`` and ``layers``, and for what a single pass refuses.
+    """
+    if len(net.layer) and len(net.layers):
+        line = source.net.find("layer").line
+        current = f" of line {line}" if line else ""
+        raise SpecError(
+            f'"layers" is the older format, and the net has "layer"{current} too; write all layers in the current '
+            'format, layer { type: "Convolution" ... }',
+            source.net.find("layers"),
+        )
+    for step in _PASSES:
+        if step.needed(net):
+            log.info(f"upgrade_proto.cpp:{step.lines[0]}", f"Attempting to upgrade {step.attempt}: {source.file}")
+            net, source = step.run(net, source)
+            log.info(f"upgrade_proto.cpp:{step.lines[1]}", f"Successfully upgraded {step.success}")
+            if step.note:
+                log.warning(f"upgrade_proto.cpp:{step.lines[2]}", f"Note that future Caffe releases will {step.note}")
+    return net, source
+
+
+def net_needs_upgrade(net: NetParameter) -> bool:
+    """Say whether any pass has something to do."""
+    return any(step.needed(net) for step in _PASSES)
+
+
+def needs_data_upgrade(net: NetParameter) -> bool:
+    """Say whether a V1 data layer has fields of its transformation among its own parameters."""
+    return any(_own_transform(layer) for layer in net.layers)
+
+
+def upgrade_data(net: NetParameter, source: SourceMap) -> Upgraded:
+    """Return a V1 net with scale, mean_file, crop_size and mirror of its data layers in their transform_param."""
+    if not needs_data_upgrade(net):
+        return net, source
+    result = copy_without(net, {"layers"})
+    places = []
+    for layer, place in zip(net.layers, source.layers, strict=True):
+        moved = _own_transform(layer)
+        name = _data_parameters(layer)
+        draft = Draft(result.layers.add(), place.where)
+        draft.copy(layer, place, {name} if moved else ())
+        if moved:
+            parameters = getattr(layer, name)
+            old = (place.fields.get(name) or (Place(place.where),))[0]
+            draft.inner(name, old.where).copy(parameters, old, moved)
+            transform = draft.inner("transform_param", old.where)
+            for field in moved:
+                transform.put(field, getattr(parameters, field), old.fields.get(field, ()))
+        places.append(draft.place())
+    return result, source.with_layers(places)
+
+
+def _data_parameters(layer: V1LayerParameter) -> str:
+    return _DATA_PARAMETERS.get(V1LayerParameter.LayerType.Name(layer.type), "")
+
+
+def _own_transform(layer: V1LayerParameter) -> list[str]:
+    name = _data_parameters(layer)
+    return [field for field in _TRANSFORM_FIELDS if name and getattr(layer, name).HasField(field)]
+
+
+def needs_v1_upgrade(net: NetParameter) -> bool:
+    """Say whether a net has V1 layers."""
+    return len(net.layers) > 0
+
+
+def upgrade_v1(net: NetParameter, source: SourceMap) -> Upgraded:
+    """Return a V1 net with ``layer`` for ``layers``: types by name, and a ParamSpec a learnable array."""
+    if not needs_v1_upgrade(net):
+        return net, source
+    assert not net.layer, "upgrade_net refuses such a net"
+    assert not needs_v0_upgrade(net), "upgrade_v0 goes first"
+    result = copy_without(net, {"layers"})
+    places = []
+    for layer, place in zip(net.layers, source.layers, strict=True):
+        draft = Draft(result.layer.add(), place.where)
+        draft.copy(layer, place, {"type", *_PARAM_SPEC})
+        if layer.HasField("type"):
+            name = _V1_TYPES[V1LayerParameter.LayerType.Name(layer.type)]
+            draft.put("type", name, place.fields.get("type", ()))
+        _upgrade_param_specs(layer, place, draft)
+        places.append(draft.place())
+    return result, source.with_layers(places)
+
+
+def _upgrade_param_specs(layer: V1LayerParameter, place: Place, draft: Draft) -> None:
+    specs: list[Draft] = []
+    for old_name, name in _PARAM_SPEC.items():
+        places = place.fields.get(old_name, ())
+        for index, value in enumerate(getattr(layer, old_name)):
+            at = places[index : index + 1]
+            if index == len(specs):
+                specs.append(Draft(draft.message.param.add(), at[0].where if at else place.where))
+            specs[index].put(name, value, at)
+    if specs:
+        draft.places["param"] = tuple(spec.place() for spec in specs)
+
+
+def needs_input_upgrade(net: NetParameter) -> bool:
+    """Say whether a net declares inputs by fields of its own."""
+    return len(net.input) > 0
+
+
+def upgrade_input(net: NetParameter, source: SourceMap) -> Upgraded:
+    """Return a net with an Input layer named "input" before all others, for its ``input`` fields and their shapes.
+
+    Inputs without any shape, as old weights have them, are dropped. Raises SpecError where only some have one. Shapes
+    beyond those of the inputs, and input_dim beside input_shape, are left out with a warning, as Caffe does without.
+    """
+    if not needs_input_upgrade(net):
+        return net, source
+    names = ("input", "input_shape", "input_dim")
+    result = copy_without(net, {*names, "layer"})
+    kept = {name: nodes for name, nodes in source.net.fields.items() if name not in names}
+    places = list(source.layers)
+    if len(net.input_shape) or len(net.input_dim):
+        inputs = source.net.fields.get("input", ())
+        draft = Draft(result.layer.add(name="input", type="Input"), source.net.find("input"))
+        draft.put("top", net.input, inputs)
+        shapes = draft.inner("input_param", draft.where)
+        for index in range(len(net.input)):
+            shapes.put("shape", *_input_shape(net, source.net, index))
+        places.insert(0, draft.place())
+    for surplus in _surplus(net, source.net):
+        log.warning("upgrade_proto.cpp:977", f"{surplus} is not used")
+    result.layer.extend(net.layer)
+    return result, replace(source, net=replace(source.net, fields=kept), layers=tuple(places))
+
+
+def _surplus(net: NetParameter, place: Place) -> list[str]:
+    """Return the parts of the input fields that no Input layer can take."""
+    if not len(net.input_shape) and not len(net.input_dim):
+        where = place.find("input")
+        return [f"{where}: input without input_shape or input_dim"] if where.line else []
+    inputs, found = len(net.input), []
+    if len(net.input_shape) > inputs:
+        found.append(f"{place.find('input_shape', inputs)}: input_shape beyond the {inputs} inputs")
+    used = 0 if len(net.input_shape) else 4 * inputs
+    if len(net.input_dim) > used:
+        beyond = f"beyond four each of {inputs} inputs" if used else "beside input_shape"
+        found.append(f"{place.find('input_dim', used)}: input_dim {beyond}")
+    return found
+
+
+def _input_shape(net: NetParameter, place: Place, index: int) -> tuple[Message, tuple[Place, ...]]:
+    if len(net.input_shape):
+        if index >= len(net.input_shape):
+            fault = f"found {len(net.input_shape)} input_shape for {len(net.input)} inputs, expected one each"
+            raise SpecError(fault, place.find("input", index))
+        return net.input_shape[index], place.fields.get("input_shape", ())[index : index + 1]
+    values = slice(4 * index, 4 * index + 4)
+    if len(net.input_dim[values]) < 4:
+        fault = f"found {len(net.input_dim)} input_dim for {len(net.input)} inputs, expected four each"
+        raise SpecError(fault, place.find("input", index))
+    dims = place.fields.get("input_dim", ())[values]
+    return BlobShape(dim=net.input_dim[values]), tuple(Place(d.where, {"dim": dims}) for d in dims[:1])
+
+
+def needs_batch_norm_upgrade(net: NetParameter) -> bool:
+    """Say whether a BatchNorm layer declares a ParamSpec for each of its three arrays that lets training move it."""
+    return any(_old_batch_norm(layer) for layer in net.layer)
+
+
+def upgrade_batch_norm(net: NetParameter, source: SourceMap) -> Upgraded:
+    """Return a net whose BatchNorm layers with three ParamSpecs have lr_mult and decay_mult 0 in them, names kept."""
+    if not needs_batch_norm_upgrade(net):
+        return net, source
+    result = copy_without(net, ())
+    for layer in filter(_old_batch_norm, result.layer):
+        for param in layer.param:
+            param.lr_mult = 0
+            param.decay_mult = 0
+    return result, source
+
+
+def _old_batch_norm(layer: LayerParameter) -> bool:
+    return (
+        layer.type == "BatchNorm"
+        and len(layer.param) == 3
+        and any(param.lr_mult != 0 or param.decay_mult != 0 for param in layer.param)
+    )
+
+
+_PASSES = (
+    _Pass(
+        needs_v0_upgrade,
+        upgrade_v0,
+        (23, 33, 36),
+        "input file specified using deprecated V0LayerParameter",
+        "file specified using deprecated V0LayerParameter",
+        "not support V0NetParameter; netspec upgrade_net_proto_text and upgrade_net_proto_binary write the new format.",
+    ),
+    _Pass(
+        needs_data_upgrade,
+        upgrade_data,
+        (44, 47, 49),
+        "input file specified using deprecated transformation parameters",
+        "file specified using deprecated data transformation parameters.",
+        "only support transform_param messages for transformation fields.",
+    ),
+    _Pass(
+        needs_v1_upgrade,
+        upgrade_v1,
+        (53, 61),
+        "input file specified using deprecated V1LayerParameter",
+        "file specified using deprecated V1LayerParameter",
+    ),
+    _Pass(
+        needs_input_upgrade,
+        upgrade_input,
+        (67, 70, 72),
+        "input file specified using deprecated input fields",
+        "file specified using deprecated input fields.",
+        "only support input layers and not input fields.",
+    ),
+    _Pass(
+        needs_batch_norm_upgrade,
+        upgrade_batch_norm,
+        (77, 80),
+        "batch norm layers using deprecated params",
+        "batch norm layers using deprecated params.",
+    ),
+)
+
+
+# ---- Solvers ----
+
+
+def upgrade_solver(solver: SolverParameter, place: Place) -> tuple[SolverParameter, Place]:
+    """Return a solver with ``type`` for ``solver_type`` and with the nets in it upgraded, and the places of its parts.
+
+    Raises SpecError where both are given.
+    """
+    file = place.where.file
+    nets = [name for name in _SOLVER_NETS if fields_of(solver.DESCRIPTOR)[name].present(solver)]
+    draft = Draft(SolverParameter(), place.where)
+    draft.copy(solver, place, {"solver_type", *nets})
+    for name in nets:
+        value = getattr(solver, name)
+        several = list(value) if name == "test_net_param" else [value]
+        for index, net in enumerate(several):
+            at = place.fields.get(name, ())[index : index + 1]
+            source = SourceMap.of(at[0]) if at else SourceMap.unknown(file, len(net.layer) + len(net.layers))
+            net, source = upgrade_net(net, source)
+            draft.put(name, net, (source.as_net(),) if at else ())
+    if solver.HasField("solver_type"):
+        if solver.HasField("type"):
+            raise SpecError('both "type" and the older "solver_type" are given; keep "type"', place.find("solver_type"))
+        log.info(
+            "upgrade_proto.cpp:1084",
+            f"Attempting to upgrade input file specified using deprecated 'solver_type' field (enum)': {file}",
+        )
+        old = SolverParameter.SolverType.Name(solver.solver_type)
+        draft.put("type", _SOLVER_TYPES[old], place.fields.get("solver_type", ()))
+        log.info(
+            "upgrade_proto.cpp:1091",
+            "Successfully upgraded file specified using deprecated 'solver_type' field (enum) to 'type' field "
+            "(string).",
+        )
+        log.warning(
+            "upgrade_proto.cpp:1093",
+            "Note that future Caffe releases will only support 'type' field (string) for a solver's type.",
+        )
+    return draft.message, draft.place()
+
+
+def upgrade_snapshot_prefix(solver: SolverParameter, path: str | Path) -> SolverParameter:
+    """Return a solver with a snapshot_prefix: its file's path without extension where it has none; where it names a
+    directory, the file's stem in there.
+    """
+    stem = os.path.splitext(str(path))[0]
+    result = copy_without(solver, ())
+    if not solver.HasField("snapshot_prefix"):
+        result.snapshot_prefix = stem
+        message = f"snapshot_prefix was not specified and is set to {result.snapshot_prefix}"
+        log.info("upgrade_proto.cpp:1108", message)
+    elif os.path.isdir(solver.snapshot_prefix):
+        result.snapshot_prefix = os.path.join(solver.snapshot_prefix, os.path.basename(stem))
+        log.info(
+            "upgrade_proto.cpp:1113", f"snapshot_prefix was a directory and is replaced to {result.snapshot_prefix}"
+        )
+    return result

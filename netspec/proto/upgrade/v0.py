@@ -1,0 +1,188 @@
+"""From the layers of 2013 to those of 2014: ``layers { layer { type: "conv" } }`` to ``layers { type: CONVOLUTION }``.
+
+Caffe: src/caffe/util/upgrade_proto.cpp, UpgradeV0Net, UpgradeV0PaddingLayers, UpgradeV0LayerParameter
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from netspec import log
+from netspec.errors import SpecError, did_you_mean
+from netspec.proto.schema import NetParameter, V1LayerParameter, fields_of
+from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.upgrade.rewrite import Draft, copy_without
+
+_TYPES = {
+    "accuracy": "ACCURACY",
+    "bnll": "BNLL",
+    "concat": "CONCAT",
+    "conv": "CONVOLUTION",
+    "data": "DATA",
+    "dropout": "DROPOUT",
+    "euclidean_loss": "EUCLIDEAN_LOSS",
+    "flatten": "FLATTEN",
+    "hdf5_data": "HDF5_DATA",
+    "hdf5_output": "HDF5_OUTPUT",
+    "im2col": "IM2COL",
+    "images": "IMAGE_DATA",
+    "infogain_loss": "INFOGAIN_LOSS",
+    "innerproduct": "INNER_PRODUCT",
+    "lrn": "LRN",
+    "multinomial_logistic_loss": "MULTINOMIAL_LOGISTIC_LOSS",
+    "pool": "POOLING",
+    "relu": "RELU",
+    "sigmoid": "SIGMOID",
+    "softmax": "SOFTMAX",
+    "softmax_loss": "SOFTMAX_LOSS",
+    "split": "SPLIT",
+    "tanh": "TANH",
+    "window_data": "WINDOW_DATA",
+}
+
+_PARAMETERS = {
+    "concat": "concat_param",
+    "conv": "convolution_param",
+    "data": "data_param",
+    "dropout": "dropout_param",
+    "hdf5_data": "hdf5_data_param",
+    "images": "image_data_param",
+    "infogain_loss": "infogain_loss_param",
+    "innerproduct": "inner_product_param",
+    "lrn": "lrn_param",
+    "pool": "pooling_param",
+    "window_data": "window_data_param",
+}
+
+# V0 field -> its name in the parameters of the layer types that took it.
+_FIELDS = {
+    "num_output": ("num_output", {"conv", "innerproduct"}),
+    "biasterm": ("bias_term", {"conv", "innerproduct"}),
+    "weight_filler": ("weight_filler", {"conv", "innerproduct"}),
+    "bias_filler": ("bias_filler", {"conv", "innerproduct"}),
+    "pad": ("pad", {"conv", "pool"}),
+    "kernelsize": ("kernel_size", {"conv", "pool"}),
+    "group": ("group", {"conv"}),
+    "stride": ("stride", {"conv", "pool"}),
+    "pool": ("pool", {"pool"}),
+    "dropout_ratio": ("dropout_ratio", {"dropout"}),
+    "local_size": ("local_size", {"lrn"}),
+    "alpha": ("alpha", {"lrn"}),
+    "beta": ("beta", {"lrn"}),
+    "k": ("k", {"lrn"}),
+    "source": ("source", {"data", "hdf5_data", "images", "window_data", "infogain_loss"}),
+    "batchsize": ("batch_size", {"data", "hdf5_data", "images", "window_data"}),
+    "rand_skip": ("rand_skip", {"data", "images"}),
+    "shuffle_images": ("shuffle", {"images"}),
+    "new_height": ("new_height", {"images"}),
+    "new_width": ("new_width", {"images"}),
+    "concat_dim": ("concat_dim", {"concat"}),
+    "det_fg_threshold": ("fg_threshold", {"window_data"}),
+    "det_bg_threshold": ("bg_threshold", {"window_data"}),
+    "det_fg_fraction": ("fg_fraction", {"window_data"}),
+    "det_context_pad": ("context_pad", {"window_data"}),
+    "det_crop_mode": ("crop_mode", {"window_data"}),
+}
+_TRANSFORMS = {"scale": "scale", "meanfile": "mean_file", "cropsize": "crop_size", "mirror": "mirror"}
+_UNCHANGED = ("name", "blobs", "blobs_lr", "weight_decay")
+
+
+def needs_v0_upgrade(net: NetParameter) -> bool:
+    """Say whether a net has a V0 layer."""
+    return any(layer.HasField("layer") for layer in net.layers)
+
+
+def upgrade_v0(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
+    """Return a net with its V0 layers as V1 layers, padding layers merged into the layers they feed.
+
+    Raises SpecError for an unknown layer type and for a padding layer that cannot be merged. A field that its layer's
+    type does not take is dropped, as in Caffe, with a warning.
+    """
+    if not needs_v0_upgrade(net):
+        return net, source
+    net, source = merge_padding(net, source)
+    result = copy_without(net, {"layers"})
+    places = []
+    for layer, place in zip(net.layers, source.layers, strict=True):
+        draft = Draft(result.layers.add(), place.where)
+        draft.copy(layer, place, {"layer"})
+        if layer.HasField("layer"):
+            _upgrade_layer(layer.layer, _inner(place), draft)
+        places.append(draft.place())
+    return result, source.with_layers(places)
+
+
+def merge_padding(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
+    """Return a V0 net without its padding layers: the convolution or pooling that each feeds pads by itself.
+
+    Raises SpecError where a padding layer feeds anything else, or has not one bottom and one top.
+    """
+    result = copy_without(net, {"layers"})
+    places: list[Place] = []
+    producers: dict[str, tuple[V1LayerParameter, Place] | None] = dict.fromkeys(net.input)
+    for layer, place in zip(net.layers, source.layers, strict=True):
+        if layer.layer.type == "padding":
+            for what in ("bottom", "top"):
+                if len(getattr(layer, what)) != 1:
+                    raise _error(
+                        f"a padding layer has one {what}, found {len(getattr(layer, what))}", layer, place, what
+                    )
+        else:
+            draft = Draft(result.layers.add(), place.where)
+            draft.copy(layer, place)
+            for index, bottom in enumerate(layer.bottom):
+                if bottom not in producers:
+                    known = did_you_mean(bottom, list(producers))
+                    raise _error(f'unknown bottom blob "{bottom}"{known}', layer, place, "bottom", index)
+                producer = producers[bottom]
+                if producer is not None and producer[0].layer.type == "padding":
+                    _merge(producer, layer, place, draft)
+            places.append(draft.place())
+        producers |= dict.fromkeys(layer.top, (layer, place))
+    return result, source.with_layers(places)
+
+
+def _merge(producer: tuple[V1LayerParameter, Place], layer: V1LayerParameter, place: Place, draft: Draft) -> None:
+    padding, padding_place = producer
+    if layer.layer.type not in ("conv", "pool") or len(layer.bottom) != 1:
+        fault = f'padding layer "{padding.layer.name}" feeds it; only a conv or pool layer with one bottom can pad'
+        raise _error(fault, layer, place, "bottom")
+    draft.message.ClearField("bottom")
+    draft.places.pop("bottom", None)
+    draft.put("bottom", padding.bottom, padding_place.fields.get("bottom", ()))
+    inner = draft.inner("layer", place.where)
+    inner.put("pad", padding.layer.pad, _inner(padding_place).fields.get("pad", ()))
+
+
+def _upgrade_layer(old: V1LayerParameter, place: Place, draft: Draft) -> None:
+    """Put the fields of a V0LayerParameter into the draft of a V1 layer."""
+    draft.copy(old, place, {n for n in fields_of(old.DESCRIPTOR) if n not in _UNCHANGED})
+    if old.HasField("type"):
+        if old.type not in _TYPES:
+            where = replace(place.find("type"), layer=old.name)
+            raise SpecError(f'unknown V0 layer type "{old.type}"{did_you_mean(old.type, list(_TYPES))}', where)
+        draft.put("type", V1LayerParameter.LayerType.Value(_TYPES[old.type]), place.fields.get("type", ()))
+    for name, field in fields_of(old.DESCRIPTOR).items():
+        if name in _UNCHANGED or name == "type" or not field.present(old):
+            continue
+        value, places = field.get(old), place.fields.get(name, ())
+        new_name, types = _FIELDS.get(name, ("", ()))
+        if name in _TRANSFORMS:
+            draft.inner("transform_param", place.where).put(_TRANSFORMS[name], value, places)
+        elif old.type in types:
+            draft.inner(_PARAMETERS[old.type], place.where).put(new_name, value, places)
+        elif name == "hdf5_output_param" and old.type == "hdf5_output":
+            draft.put(name, value, places)
+        else:
+            where = place.find(name)
+            log.warning("upgrade_proto.cpp:230", f"{where}: Unknown parameter {name} for layer type {old.type}")
+
+
+def _inner(place: Place) -> Place:
+    """Return the places of the V0 part of a layer, the layer's own where they are unknown."""
+    inner = place.fields.get("layer", ())
+    return inner[0] if inner else Place(place.where)
+
+
+def _error(message: str, layer: V1LayerParameter, place: Place, *path: str | int) -> SpecError:
+    return SpecError(message, replace(place.find(*path), layer=layer.layer.name, type=layer.layer.type))

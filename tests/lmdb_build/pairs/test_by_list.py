@@ -1,0 +1,211 @@
+"""Pairs that somebody listed: masks, folders, tables, single images."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import scipy.io
+
+from lmdb_build.pairs.by_list import MaskSource, PlaceSource, folders_source, index_source, singles_source, table_source
+from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, choose_pairs, split_by_group, split_by_time
+from loopclosure.errors import InputError
+from paths import shared
+
+
+def images(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / name), np.zeros((4, 6, 3), np.uint8))
+    return folder
+
+
+def label(source: MaskSource | PlaceSource, first: str, second: str) -> int:
+    a, b = (np.array([source.names.index(name)]) for name in (first, second))
+    assert source.judge(a, b) == source.judge(b, a)
+    return int(source.judge(a, b)[0])
+
+
+class TestMask:
+    @pytest.fixture
+    def run(self, tmp_path: Path) -> Path:
+        """Twelve images, the last six a second lap; frame 6 looks like 0, and so on, 11 like 5 only a little."""
+        images(tmp_path / "run", *(f"{number}.png" for number in range(1, 13)))
+        mask = np.zeros((12, 12), np.uint8)
+        for number in range(5):
+            mask[number + 6, number] = 255
+        mask[11, 5] = 128
+        cv2.imwrite(str(tmp_path / "mask.png"), mask)
+        return tmp_path
+
+    def test_marked_pairs_are_positive_and_neighbours_left_out(self, run: Path) -> None:
+        source = MaskSource(run / "mask.png", run / "run", run)
+        assert source.names[:2] == ["run/1.png", "run/2.png"]  # natural order: row 1 is 2.png, not 10.png
+        assert label(source, "run/1.png", "run/7.png") == POSITIVE
+        assert label(source, "run/1.png", "run/8.png") == NEGATIVE
+        assert label(source, "run/1.png", "run/6.png") == LEFT_OUT  # nearer than any marked pair
+        assert label(source, "run/6.png", "run/12.png") == LEFT_OUT  # soft
+        assert len(source.positives()) == 5
+
+    def test_the_gap_can_be_given(self, run: Path) -> None:
+        source = MaskSource(run / "mask.png", run / "run", run, min_gap=3)
+        assert label(source, "run/1.png", "run/4.png") == NEGATIVE
+        assert label(source, "run/1.png", "run/3.png") == LEFT_OUT
+
+    def test_left_and_right_images_alternate(self, run: Path) -> None:
+        left = MaskSource(run / "mask.png", run / "run", run, camera="left")
+        assert left.names == [f"run/{number}.png" for number in (1, 3, 5, 7, 9, 11)]
+        assert len(left.positives()) == 3
+        both = MaskSource(run / "mask.png", run / "run", run, camera="both")
+        assert label(both, "run/1.png", "run/8.png") == LEFT_OUT
+        assert label(both, "run/1.png", "run/7.png") == POSITIVE
+
+    def test_a_mask_of_another_size_is_refused(self, run: Path) -> None:
+        images(run / "run", "13.png")
+        with pytest.raises(InputError, match=r"mask\.png: is 12 x 12, but .*run has 13 images"):
+            MaskSource(run / "mask.png", run / "run", run)
+
+    def test_a_mask_of_matlab(self, run: Path) -> None:
+        truth = np.zeros((12, 12), np.uint8)
+        truth[9, 1] = 1
+        scipy.io.savemat(run / "truth.mat", {"truth": truth})
+        source = MaskSource(run / "truth.mat", run / "run", run)
+        assert label(source, "run/2.png", "run/10.png") == POSITIVE
+
+    def test_corridor_loop(self) -> None:
+        folder = shared("data", "corridor_loop")
+        source = MaskSource(folder / "samples_GT.bmp", folder / "samples", folder)
+        assert len(source.names) == 84
+        assert len(source.positives()) == 228
+        chosen = choose_pairs(source, np.arange(84), 400, np.random.default_rng(1), "train")
+        assert chosen.labels.sum() == 200
+
+
+class TestFolders:
+    @pytest.fixture
+    def source(self, tmp_path: Path) -> PlaceSource:
+        images(tmp_path, *(f"day/{number}.png" for number in (1, 2, 3, 10, 11)))
+        images(tmp_path, *(f"night/{number}.jpg" for number in (1, 2, 3, 10, 99)))
+        return folders_source(tmp_path / "day", tmp_path / "night", tmp_path)
+
+    def test_equal_names_are_the_same_place_whatever_their_ending(self, source: PlaceSource) -> None:
+        assert len(source.names) == 8
+        assert label(source, "day/2.png", "night/2.jpg") == POSITIVE
+        assert label(source, "day/2.png", "night/3.jpg") == NEGATIVE
+        assert "2 unpaired" in source.settings["source"]
+
+    def test_pairs_join_the_two_folders_only(self, source: PlaceSource) -> None:
+        assert label(source, "day/2.png", "day/3.png") == LEFT_OUT
+
+    def test_neighbouring_places_can_be_left_out(self, source: PlaceSource, tmp_path: Path) -> None:
+        apart = folders_source(tmp_path / "day", tmp_path / "night", tmp_path, min_gap=2)
+        assert label(apart, "day/3.png", "night/10.jpg") == LEFT_OUT
+        assert label(apart, "day/1.png", "night/3.jpg") == NEGATIVE
+        assert label(apart, "day/1.png", "night/1.jpg") == POSITIVE
+
+    def test_a_split_never_parts_the_two_images_of_a_place(self, source: PlaceSource) -> None:
+        shares = {"train": 0.5, "val": 0.5}
+        for splits in (split_by_group(source, shares, 1), split_by_time(source, shares)):
+            assert sum(len(part) for part in splits.values()) == 8
+            for part in splits.values():
+                stems = [Path(source.names[index]).stem for index in part]
+                assert len(stems) == 4
+                assert all(stems.count(stem) == 2 for stem in stems)
+
+    def test_folders_without_equal_names_are_refused(self, tmp_path: Path) -> None:
+        images(tmp_path, "a/1.png", "b/2.png")
+        with pytest.raises(InputError, match="have no image of equal name"):
+            folders_source(tmp_path / "a", tmp_path / "b", tmp_path)
+
+
+class TestTables:
+    INDEX = "image,floor,clip,second\n" + "".join(
+        f"f{floor}/{clip}_{second}.jpg,f{floor},{clip},{second}\n"
+        for floor, clip in ((1, "a"), (1, "b"), (2, "c"))
+        for second in (1, 2, 3, 7)
+    )
+
+    def write(self, path: Path, text: str) -> Path:
+        path.write_text(text)
+        return path
+
+    def test_positives_with_groups_from_an_index(self, tmp_path: Path) -> None:
+        table = self.write(tmp_path / "p.csv", "image_a,image_b,dt\nf1/a_1.jpg,f1/a_2.jpg,1\n")
+        index = self.write(tmp_path / "i.csv", self.INDEX)
+        source = table_source(table, tmp_path, "floor", index)
+        assert len(source.names) == 12
+        assert label(source, "f1/a_1.jpg", "f1/a_2.jpg") == POSITIVE
+        assert label(source, "f1/a_1.jpg", "f1/b_1.jpg") == LEFT_OUT  # one floor, not listed
+        assert label(source, "f1/a_1.jpg", "f2/c_1.jpg") == NEGATIVE
+
+    def test_queries_and_references_without_groups(self, tmp_path: Path) -> None:
+        table = self.write(tmp_path / "p.csv", "place_id,query,ref\n0,q/0.jpg,r/0.jpg\n1,q/1.jpg,r/1.jpg\n")
+        source = table_source(table, tmp_path)
+        assert label(source, "q/0.jpg", "r/0.jpg") == POSITIVE
+        assert label(source, "q/0.jpg", "r/1.jpg") == NEGATIVE
+        assert label(source, "q/0.jpg", "q/1.jpg") == LEFT_OUT
+
+    def test_linked_images_are_one_place(self, tmp_path: Path) -> None:
+        table = self.write(tmp_path / "p.csv", "a,b\n1.jpg,2.jpg\n2.jpg,3.jpg\n8.jpg,9.jpg\n")
+        source = table_source(table, tmp_path)
+        assert label(source, "1.jpg", "3.jpg") == LEFT_OUT
+        assert label(source, "1.jpg", "9.jpg") == NEGATIVE
+        assert len(source.group_names) == 2
+
+    def test_neighbours_in_time_of_an_index(self, tmp_path: Path) -> None:
+        index = self.write(tmp_path / "i.csv", self.INDEX)
+        source = index_source(index, tmp_path, "floor", "clip", "second", 2.0)
+        assert label(source, "f1/a_1.jpg", "f1/a_3.jpg") == POSITIVE
+        assert label(source, "f1/a_3.jpg", "f1/a_7.jpg") == LEFT_OUT
+        assert label(source, "f1/a_1.jpg", "f1/b_1.jpg") == LEFT_OUT
+        assert label(source, "f1/a_1.jpg", "f2/c_2.jpg") == NEGATIVE
+        assert len(source.positives()) == 3 * 3
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [
+            ("", "has no row below its head line"),
+            ("a,b\n1,2\n", r"p\.csv:1:1: has 0 columns of image names \(none\); expected 2"),
+            ("a,b\n1.jpg,2.jpg\n3.jpg,4.jpg\n", r'p\.csv:2:1: image "1\.jpg" is not in .*i\.csv'),
+        ],
+    )
+    def test_tables_that_say_nothing_are_refused(self, tmp_path: Path, text: str, words: str) -> None:
+        table = self.write(tmp_path / "p.csv", text)
+        index = self.write(tmp_path / "i.csv", self.INDEX)
+        with pytest.raises(InputError, match=words):
+            table_source(table, tmp_path, "floor", index)
+
+    def test_a_column_that_is_not_there_and_a_second_that_is_no_number(self, tmp_path: Path) -> None:
+        index = self.write(tmp_path / "i.csv", self.INDEX)
+        with pytest.raises(InputError, match='has no column "storey"; there are: image, floor, clip, second'):
+            index_source(index, tmp_path, "storey", "clip", "second", 1)
+        self.write(index, "image,floor,clip,second\na.jpg,1,c,soon\n")
+        with pytest.raises(InputError, match=r'i\.csv:2:1: expected a number in column second, found "soon"'):
+            index_source(index, tmp_path, "floor", "clip", "second", 1)
+
+    def test_an_image_in_two_groups_is_refused(self, tmp_path: Path) -> None:
+        table = self.write(tmp_path / "p.csv", "a,b,floor\n1.jpg,2.jpg,x\n2.jpg,3.jpg,y\n")
+        with pytest.raises(InputError, match=r'p\.csv:3:1: 2\.jpg is of floor "x" above, here "y"'):
+            table_source(table, tmp_path, "floor")
+
+    def test_ie_tower_and_place_pairs(self) -> None:
+        folder = shared("data", "ie_tower")
+        source = table_source(folder / "positives.csv", folder, "floor", folder / "index.csv")
+        assert (len(source.names), len(source.group_names), len(source.positives())) == (2877, 25, 656)
+        places = table_source(shared("data", "place_pairs", "ESSEX3IN1", "pairs.csv"), shared("data", "place_pairs"))
+        assert (len(places.names), len(places.positives())) == (400, 200)
+
+
+def test_single_images_are_places_that_only_a_warp_shows_twice(tmp_path: Path) -> None:
+    images(tmp_path / "s", "1.png", "2.png", "3.png")
+    source = singles_source(tmp_path / "s", tmp_path)
+    assert label(source, "s/1.png", "s/2.png") == NEGATIVE
+    chosen = choose_pairs(source, np.arange(3), 6, np.random.default_rng(0), "train", warp_share=1.0)
+    assert chosen.warped.all()
+    assert sorted(chosen.first[chosen.labels == 1].tolist()) == [0, 1, 2]
+
+
+def test_images_outside_the_root_are_refused(tmp_path: Path) -> None:
+    images(tmp_path / "s", "1.png")
+    with pytest.raises(InputError, match="is not below the root folder"):
+        singles_source(tmp_path / "s", tmp_path / "elsewhere")

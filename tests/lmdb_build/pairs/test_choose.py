@@ -1,0 +1,243 @@
+"""The choice of pairs: seeded, balanced, no image in two splits, every label as the rule has it."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmdb_build.pairs import choose as pairs_room
+from lmdb_build.pairs.build import Plan, build_lists
+from lmdb_build.pairs.by_pose import PoseRule, PoseSource
+from lmdb_build.pairs.choose import NEGATIVE, POSITIVE, choose_pairs, find_pairs, split_by_group, split_by_time
+from lmdb_build.pairs.list_file import read_pair_list
+from loopclosure.errors import InputError
+from loopclosure.places.same_place import same_place
+from loopclosure.places.trajectory import Frame, Poses, Sequence
+
+
+def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> Sequence:
+    """A camera that turns and strays about, back to where it was now and then."""
+    rng = np.random.default_rng(seed)
+    stamps = start_s + np.arange(count) / 10
+    yaw = np.cumsum(rng.normal(0, 0.12, count))
+    positions = np.cumsum(rng.normal(0, 0.15, (count, 3)), axis=0)
+    quaternions = np.column_stack([np.zeros((count, 2)), np.sin(yaw / 2), np.cos(yaw / 2)])
+    frames = tuple(Frame(float(stamp), f"rgb/{stamp:.6f}.png") for stamp in stamps)
+    return Sequence(name, frames, stamps, positions, quaternions, 0)
+
+
+def pose_source(lengths: tuple[int, ...] = (120, 90, 110), rule: PoseRule | None = None) -> PoseSource:
+    sequences = [wander(f"s{number}", length, number) for number, length in enumerate(lengths)]
+    return PoseSource(sequences, [sequence.name for sequence in sequences], rule or PoseRule())
+
+
+def everything(source: PoseSource) -> np.ndarray:
+    return np.arange(len(source.names))
+
+
+def build(source: PoseSource, plan: Plan, out: Path) -> dict[str, Path]:
+    return build_lists(source, plan, out.parent, out, lambda text: None, lambda doubt: None)
+
+
+def as_sets(pairs: np.ndarray) -> set[tuple[int, int]]:
+    return {(min(a, b), max(a, b)) for a, b in pairs.tolist()}
+
+
+@pytest.mark.parametrize("by", ["time", "group"])
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("lengths", [(120, 90, 110), (61, 200, 40, 77)])
+def test_lists_are_balanced_disjoint_and_labelled_by_the_rule(
+    tmp_path: Path, by: str, seed: int, lengths: tuple[int, ...]
+) -> None:
+    rule = PoseRule(min_gap_s=0.25)
+    source = pose_source(lengths, rule)
+    index = {name: number for number, name in enumerate(source.names)}
+    counts = {"train": 120, "val": 40, "test": 30}
+    lists = build(source, Plan(counts, seed=seed, by=by), tmp_path / "lists")
+    images: dict[str, set[str]] = {}
+    for split, path in lists.items():
+        listed = read_pair_list(path)
+        assert len(listed) == counts[split]
+        assert sum(pair.label for pair in listed) == counts[split] // 2
+        assert len({frozenset((pair.first, pair.second)) for pair in listed}) == counts[split]
+        images[split] = {name for pair in listed for name in (pair.first, pair.second)}
+        for pair in listed:
+            a, b = index[pair.first], index[pair.second]
+            same_sequence = source.groups[a] == source.groups[b]
+            place = bool(same_place(source.poses[a], source.poses[b])) and same_sequence
+            assert pair.label == int(place)
+            assert not same_sequence or abs(source.stamps[a] - source.stamps[b]) >= rule.min_gap_s
+    assert not images["train"] & images["val"]
+    assert not images["train"] & images["test"]
+    assert not images["val"] & images["test"]
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+    plan = Plan({"train": 100, "val": 40, "test": 0}, seed=5)
+    first, second = (build(pose_source(), plan, tmp_path / name) for name in ("a", "b"))
+    other = build(pose_source(), Plan(plan.counts, seed=6), tmp_path / "c")
+    assert set(first) == {"train", "val"}
+    for split in first:
+        assert first[split].read_bytes() == second[split].read_bytes()
+        assert first[split].read_bytes() != other[split].read_bytes()
+
+
+def test_a_split_does_not_change_when_another_gets_more_pairs(tmp_path: Path) -> None:
+    few, many = (
+        build(pose_source(), Plan({"train": train, "val": 40, "test": 40}), tmp_path / str(train))["val"]
+        for train in (20, 200)
+    )
+    assert few.read_bytes() == many.read_bytes()
+
+
+def test_the_list_is_shuffled(tmp_path: Path) -> None:
+    path = build(pose_source(), Plan({"train": 200}), tmp_path / "lists")["train"]
+    labels = [pair.label for pair in read_pair_list(path)]
+    assert 30 < sum(labels[:100]) < 70
+    assert labels != sorted(labels)
+
+
+def test_a_split_by_time_keeps_stretches_whole_and_a_gap_between_them() -> None:
+    source = pose_source()
+    splits = split_by_time(source, {"train": 0.5, "val": 0.25, "test": 0.25}, gap=1.0)
+    for track in range(3):
+        spans = []
+        for images in splits.values():
+            stamps = source.stamps[images[source.tracks[images] == track]]
+            np.testing.assert_allclose(np.diff(stamps), 0.1)
+            spans.append((stamps[0], stamps[-1]))
+        for (_, end), (begin, _) in pairwise(spans):
+            assert begin - end >= 1.0 - 1e-9
+    assert len(splits["train"]) == 160
+
+
+def test_a_split_by_group_gives_each_split_whole_sequences() -> None:
+    source = pose_source((50, 60, 70, 80, 90))
+    for shares, sizes in (((0.6, 0.2, 0.2), [3, 1, 1]), ((0.98, 0.01, 0.01), [3, 1, 1]), ((0.1, 0.1, 0.8), [1, 1, 3])):
+        for seed in range(5):
+            splits = split_by_group(source, dict(zip(("train", "val", "test"), shares, strict=True)), seed)
+            owners = [set(source.groups[images].tolist()) for images in splits.values()]
+            assert [len(owner) for owner in owners] == sizes
+            assert set.union(*owners) == set(range(5))
+
+
+def test_sequences_can_be_given_to_splits_by_name() -> None:
+    source = pose_source()
+    splits = split_by_group(source, {"train": 0.5, "val": 0.5}, 1, {"val": ["s1"], "test": ["s2"]})
+    assert set(source.groups[splits["train"]].tolist()) == {0}
+    assert set(source.groups[splits["val"]].tolist()) == {1}
+
+
+@pytest.mark.parametrize(
+    ("named", "words"),
+    [
+        ({"val": ["s1"]}, "name the sequences of all splits but one; not named: train, test"),
+        ({"val": ["s9"], "test": ["s1"]}, 'no sequence is called "s9"; there are: s0, s1, s2'),
+        ({"val": ["s1"], "test": ["s1"]}, 'sequence "s1" is named for two splits'),
+    ],
+)
+def test_wrongly_named_sequences_are_refused(named: dict[str, list[str]], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        split_by_group(pose_source(), {"train": 0.5, "val": 0.25, "test": 0.25}, 1, named)
+
+
+def test_fewer_sequences_than_splits_are_refused() -> None:
+    with pytest.raises(InputError, match="1 sequence cannot be split by sequence into train and val"):
+        split_by_group(pose_source((50,)), {"train": 0.5, "val": 0.5}, 1)
+
+
+def test_too_few_pairs_are_an_error_that_says_how_many_there_are(tmp_path: Path) -> None:
+    source = pose_source((30,), PoseRule(negatives="same_sequence"))
+    pairs = [(a, b) for a in range(30) for b in range(a + 1, 30)]
+    labels = source.judge(*np.array(pairs).T)
+    positives, negatives = int((labels == POSITIVE).sum()), int((labels == NEGATIVE).sum())
+    with pytest.raises(InputError, match=f"{positives} positive and {negatives} negative ones; .* --at-most") as caught:
+        build(source, Plan({"train": 2000}), tmp_path / "lists")
+    assert str(caught.value).startswith("train: 2000 pairs need 1000 of each label")
+    assert not (tmp_path / "lists").exists()
+    path = build(source, Plan({"train": 2000}, at_most=True), tmp_path / "lists")["train"]
+    taken = read_pair_list(path)
+    assert len(taken) == 2 * min(positives, negatives)
+    assert sum(pair.label for pair in taken) == min(positives, negatives)
+
+
+def test_a_label_without_any_pair_is_an_error_even_with_at_most(tmp_path: Path) -> None:
+    source = pose_source((30,), PoseRule(negatives="cross_sequence"))
+    with pytest.raises(InputError, match="it has no negative pair at all"):
+        build(source, Plan({"train": 20}, at_most=True), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        (Plan({"train": 7}), "even, not 7"),
+        (Plan({"train": 0}), "no pair is asked for"),
+        (Plan({"train": 2}, seed=-1), "seed"),
+        (Plan({"train": 2}, warp_share=1.5), "--warp-share is 0 to 1"),
+        (Plan({"train": 2, "val": 2}, shares={"train": 1.0, "val": 0.0, "test": 0.0}), "share of val is 0"),
+    ],
+)
+def test_numbers_that_make_no_plan_are_refused(tmp_path: Path, plan: Plan, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        build(pose_source(), plan, tmp_path)
+
+
+def test_drawing_finds_what_looking_at_all_pairs_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = pose_source()
+    images = everything(source)
+    everything_there = find_pairs(source, images, {POSITIVE: 10**6, NEGATIVE: 10**6}, np.random.default_rng(0))
+    monkeypatch.setattr(pairs_room, "ALL_PAIRS", 100)
+    monkeypatch.setattr(pairs_room, "DRAWN_AT_ONCE", 512)
+    drawn = find_pairs(source, images, {POSITIVE: 300, NEGATIVE: 300}, np.random.default_rng(0))
+    for label in (POSITIVE, NEGATIVE):
+        assert len(as_sets(drawn[label])) == len(drawn[label]) == 300
+        assert as_sets(drawn[label]) <= as_sets(everything_there[label])
+    # More than there are: drawing gives up, and the count is exact.
+    exhausted = find_pairs(source, images, {POSITIVE: 10**6}, np.random.default_rng(0))
+    assert as_sets(exhausted[POSITIVE]) == as_sets(everything_there[POSITIVE])
+
+
+def test_pairs_are_drawn_evenly() -> None:
+    """Each of the 780 pairs of 40 images that are all one place is drawn as often as any other."""
+    still = wander("s", 40, 1)
+    source = PoseSource([still], ["s"], PoseRule(max_distance_m=1e3, max_angle_deg=181))
+    drawn = np.zeros((40, 40))
+    for seed in range(200):
+        pairs = find_pairs(source, everything(source), {POSITIVE: 78}, np.random.default_rng(seed))[POSITIVE]
+        drawn[pairs[:, 0], pairs[:, 1]] += 1
+    times = drawn[np.triu_indices(40, 1)]
+    assert times.sum() == 200 * 78
+    assert times.min() > 3
+    assert times.max() < 45
+    assert abs(times.std() - 4.24) < 0.6  # binomial: sqrt(200 * 0.1 * 0.9)
+
+
+def test_warped_pairs_replace_their_share_of_both_labels() -> None:
+    source = pose_source()
+    chosen = choose_pairs(source, everything(source), 100, np.random.default_rng(0), "train", warp_share=0.3)
+    for label in (POSITIVE, NEGATIVE):
+        assert int(chosen.warped[chosen.labels == label].sum()) == 15
+    copies = chosen.warped & (chosen.labels == POSITIVE)
+    assert np.array_equal(chosen.first == chosen.second, copies)
+
+
+def test_given_hard_negatives_are_all_taken_and_not_twice() -> None:
+    source = pose_source()
+    all_negatives = find_pairs(source, everything(source), {NEGATIVE: 40}, np.random.default_rng(9))[NEGATIVE]
+    chosen = choose_pairs(
+        source, everything(source), 100, np.random.default_rng(0), "train", hard_negatives=all_negatives
+    )
+    negatives = np.column_stack([chosen.first, chosen.second])[chosen.labels == NEGATIVE]
+    assert as_sets(all_negatives) <= as_sets(negatives)
+    assert len(as_sets(negatives)) == 50
+
+
+def test_one_pose_more_or_less_far_apart_changes_the_label() -> None:
+    """The choice asks the rule: a source with other limits labels otherwise."""
+    source, wide = pose_source(), pose_source(rule=PoseRule(max_distance_m=4, max_angle_deg=40))
+    first, second = np.triu_indices(len(source.names), 1)
+    assert (wide.judge(first, second) == POSITIVE).sum() > (source.judge(first, second) == POSITIVE).sum()
+    a, b = Poses(source.poses.positions[first], source.poses.quaternions[first]), source.poses[second]
+    within = source.groups[first] == source.groups[second]
+    assert np.array_equal(source.judge(first, second) == POSITIVE, same_place(a, b) & within)

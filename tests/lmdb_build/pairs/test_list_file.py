@@ -1,0 +1,261 @@
+"""Lists of pairs: as files, warped, with hard negatives, joined, reported and drawn."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lmdb_build.pairs.build import Plan, build_lists
+from lmdb_build.pairs.by_list import PlaceSource, singles_source
+from lmdb_build.pairs.choose import NEGATIVE, choose_pairs
+from lmdb_build.pairs.contact_sheet import contact_sheet, write_contact_sheet
+from lmdb_build.pairs.hard_negatives import hard_negatives
+from lmdb_build.pairs.list_file import join_lists, read_pair_list, read_settings, root_of, write_pair_list
+from lmdb_build.pairs.report import report
+from lmdb_build.pairs.warp import warp
+from loopclosure.descriptors.feature_file import Features
+from loopclosure.errors import InputError
+
+
+def picture(seed: int, height: int = 60, width: int = 80) -> np.ndarray:
+    """Smooth random blobs."""
+    coarse = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    (tmp_path / "photos").mkdir()
+    for number in range(8):
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), picture(number))
+    return tmp_path
+
+
+def ring(count: int = 30) -> PlaceSource:
+    """Places 0 to count - 1, each photographed twice."""
+    places = [str(number) for number in range(count)]
+    positives = [(number, number + count) for number in range(count)]
+    return PlaceSource([f"{side}/{place}.png" for side in "ab" for place in places], places * 2, positives, {})
+
+
+class TestFile:
+    def test_what_is_written_is_read_again(self, tmp_path: Path) -> None:
+        path = tmp_path / "deep" / "list.txt"
+        write_pair_list(path, [("a/1.png", "b.png", 1), ("c.png", "d.png", 0)], {"seed": "3", "rule": "2 m: 15 deg"})
+        assert [(pair.first, pair.second, pair.label) for pair in read_pair_list(path)] == [
+            ("a/1.png", "b.png", 1),
+            ("c.png", "d.png", 0),
+        ]
+        assert read_pair_list(path)[0].line == 4
+        assert read_settings(path)["rule"] == "2 m: 15 deg"
+
+    @pytest.mark.parametrize(
+        ("line", "place", "words"),
+        [
+            ("a.png b.png", ":2:1: ", "expected two images and a label"),
+            ("a.png b.png 2", ":2:13: ", 'not "2"'),
+            ("a.png b c.png 1", ":2:1: ", "expected two images and a label"),
+        ],
+    )
+    def test_a_broken_line_is_named(self, tmp_path: Path, line: str, place: str, words: str) -> None:
+        path = tmp_path / "list.txt"
+        path.write_text(f"# head\n{line}\n")
+        with pytest.raises(InputError) as caught:
+            read_pair_list(path)
+        assert str(caught.value).startswith(f"{path}{place}")
+        assert words in str(caught.value)
+
+    def test_an_empty_and_a_missing_list(self, tmp_path: Path) -> None:
+        (tmp_path / "list.txt").write_text("# nothing\n")
+        with pytest.raises(InputError, match="lists no pair"):
+            read_pair_list(tmp_path / "list.txt")
+        with pytest.raises(InputError, match=r"none\.txt: cannot be read \(No such file"):
+            read_pair_list(tmp_path / "none.txt")
+
+    def test_a_name_with_blanks_is_quoted(self, tmp_path: Path) -> None:
+        path = tmp_path / "list.txt"
+        write_pair_list(path, [("my photo.png", "#b.png", 1)], {})
+        (pair,) = read_pair_list(path)
+        assert (pair.first, pair.second) == ("my photo.png", "#b.png")
+
+    def test_a_name_that_a_list_cannot_hold_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match="cannot list the image"):
+            write_pair_list(tmp_path / "list.txt", [('my "photo".png', "b.png", 1)], {})
+
+
+class TestWarp:
+    def test_a_warp_keeps_the_size_and_shows_the_same_thing_otherwise(self) -> None:
+        original = picture(1)
+        warped = warp(original, np.random.default_rng(0))
+        assert warped.shape == original.shape
+        assert warped.dtype == np.uint8
+        assert np.abs(warped.astype(int) - original).mean() > 5
+        assert np.array_equal(warped, warp(original, np.random.default_rng(0)))
+        assert not np.array_equal(warped, warp(original, np.random.default_rng(1)))
+
+    def test_a_warp_has_no_border(self) -> None:
+        white = np.full((60, 80, 3), 200, np.uint8)
+        for seed in range(20):
+            warped = warp(white, np.random.default_rng(seed)).reshape(-1, 3)
+            assert (warped == warped[0]).all()
+
+    def test_warped_pairs_are_written_beside_the_list_again_with_the_same_bytes(self, photos: Path) -> None:
+        source = singles_source(photos / "photos", photos)
+        contents = []
+        for name in ("one", "two"):
+            plan = Plan({"train": 8}, by="group", warp_share=1.0)
+            path = build_lists(source, plan, photos, photos / name, lambda text: None, lambda doubt: None)["train"]
+            pairs = read_pair_list(path)
+            assert all((photos / pair.second).is_file() for pair in pairs)
+            for pair in pairs:
+                assert pair.second.startswith(f"{name}/train_warped/")
+                same = Path(pair.second).name.split("_")[1] == Path(pair.first).name
+                assert same == bool(pair.label)
+            contents.append([(photos / pair.second).read_bytes() for pair in pairs])
+        assert contents[0] == contents[1]
+
+    def test_warped_images_must_lie_below_the_root(self, photos: Path) -> None:
+        source = singles_source(photos / "photos", photos / "photos")
+        plan = Plan({"train": 4}, by="group", warp_share=1.0)
+        with pytest.raises(InputError, match="warped images must lie below the root folder"):
+            build_lists(source, plan, photos / "photos", photos / "out", lambda text: None, lambda doubt: None)
+
+    def test_a_missing_image_is_named(self, photos: Path) -> None:
+        source = singles_source(photos / "photos", photos)
+        for path in (photos / "photos").iterdir():
+            path.unlink()
+        with pytest.raises(InputError, match=r"photos/\d\.png: no such image"):
+            build_lists(
+                source,
+                Plan({"train": 4}, by="group", warp_share=1.0),
+                photos,
+                photos / "o",
+                lambda t: None,
+                lambda d: None,
+            )
+
+
+class TestHardNegatives:
+    def test_they_are_the_nearest_negatives(self) -> None:
+        source = ring()
+        # On a line: places 2k and 2k + 1 lie close together, both photographs of a place closer still.
+        line = np.array([2.0 * place - 0.8 * (place % 2) for place in range(30)])
+        features = np.concatenate([line, line + 0.01])[:, None]
+        found = hard_negatives(source, np.arange(60), features, 15)
+        places = np.sort(found % 30, axis=1)
+        assert len(found) == 15
+        assert (source.judge(found[:, 0], found[:, 1]) == NEGATIVE).all()
+        assert (places[:, 1] - places[:, 0] == 1).all()
+        assert (places[:, 0] % 2 == 0).all()
+
+    def test_they_spread_over_the_images(self) -> None:
+        source = ring()
+        rng = np.random.default_rng(0)
+        features = rng.normal(size=(60, 4))
+        features[:6] *= 1e-3  # six images that a net cannot tell apart
+        found = hard_negatives(source, np.arange(60), features, 40)
+        assert len(np.unique(found)) > 40
+
+    def test_none_are_found_among_images_of_one_place(self) -> None:
+        source = PlaceSource(["a.png", "b.png"], ["x", "x"], [(0, 1)], {})
+        assert len(hard_negatives(source, np.arange(2), np.eye(2), 5)) == 0
+
+    def test_their_share_of_a_list(self, tmp_path: Path) -> None:
+        source = ring()
+        line = np.concatenate([np.arange(30.0), np.arange(30.0)])
+        features = Features(tmp_path / "f.npz", line[:, None].astype(np.float32), list(source.names))
+        for share, near in ((0.0, 5), (1.0, 20)):
+            plan = Plan({"train": 40}, by="group", features=features, hard_share=share)
+            path = build_lists(source, plan, tmp_path, tmp_path / str(share), lambda t: None, lambda d: None)["train"]
+            gaps = [
+                abs(int(Path(pair.first).stem) - int(Path(pair.second).stem))
+                for pair in read_pair_list(path)
+                if not pair.label
+            ]
+            assert (sum(gap == 1 for gap in gaps) >= near) if share else (sum(gap == 1 for gap in gaps) < near)
+
+    def test_images_without_features_are_an_error(self, tmp_path: Path) -> None:
+        source = ring()
+        features = Features(tmp_path / "f.npz", np.zeros((1, 2), np.float32), ["a/0.png"])
+        with pytest.raises(InputError, match="has no descriptor of"):
+            build_lists(
+                source,
+                Plan({"train": 4}, by="group", features=features),
+                tmp_path,
+                tmp_path,
+                lambda t: None,
+                lambda d: None,
+            )
+
+
+class TestJoin:
+    def test_joined_lists_keep_every_pair_below_the_common_root(self, tmp_path: Path) -> None:
+        write_pair_list(tmp_path / "x/lists/a.txt", [("1.png", "2.png", 1)] * 3, {"root folder": ".."})
+        write_pair_list(tmp_path / "y/b.txt", [("3.png", "4.png", 0)] * 3, {"root folder": "."})
+        number, root = join_lists([tmp_path / "x/lists/a.txt", tmp_path / "y/b.txt"], tmp_path / "z/all.txt", seed=1)
+        assert (number, root) == (6, tmp_path.resolve())
+        joined = read_pair_list(tmp_path / "z/all.txt")
+        assert sorted((pair.first, pair.second, pair.label) for pair in joined) == [
+            *[("x/1.png", "x/2.png", 1)] * 3,
+            *[("y/3.png", "y/4.png", 0)] * 3,
+        ]
+        assert root_of(tmp_path / "z/all.txt").resolve() == tmp_path.resolve()
+
+    def test_a_root_that_is_not_above_all_is_refused(self, tmp_path: Path) -> None:
+        write_pair_list(tmp_path / "x/a.txt", [("1.png", "2.png", 1)], {})
+        with pytest.raises(InputError, match="not below the root folder"):
+            join_lists([tmp_path / "x/a.txt"], tmp_path / "all.txt", 1, root=tmp_path / "y")
+
+
+def test_the_report_counts_each_kind_and_every_pair() -> None:
+    source = ring()
+    chosen = choose_pairs(source, np.arange(60), 40, np.random.default_rng(0), "train", warp_share=0.5)
+    lines = report(source, chosen, "train", 60).splitlines()
+    assert lines[0].startswith("train: 40 pairs of 60 images, ")
+    counts = {line[:46].strip(): int(line[46:]) for line in lines[1:]}
+    assert sum(counts.values()) == 40
+    assert counts["positive, same place"] == 10
+
+
+class TestContactSheet:
+    @pytest.fixture
+    def listed(self, photos: Path) -> Path:
+        write_pair_list(
+            photos / "list.txt",
+            [
+                ("photos/0.png", "photos/1.png", 1),
+                ("photos/2.png", "photos/3.png", 0),
+                ("photos/4.png", "photos/5.png", 0),
+            ],
+            {},
+        )
+        return photos / "list.txt"
+
+    def test_positives_are_framed_green_on_the_left_and_negatives_red_on_the_right(self, listed: Path) -> None:
+        sheet = contact_sheet(listed, listed.parent, rows=2)
+        height, width = sheet.shape[:2]
+        green = (sheet == (60, 150, 40)).all(axis=2)
+        red = (sheet == (50, 50, 200)).all(axis=2)
+        assert green[:, : width // 2].sum() > 1000
+        assert red[:, width // 2 :].sum() > 1000
+        assert not green[:, width // 2 :].any()
+        assert not red[:, : width // 2].any()
+        assert red[height // 2 :].sum() > 1000  # two negatives
+        assert not green[height * 2 // 3 :].any()  # but one positive
+
+    def test_the_pictures_are_there(self, listed: Path) -> None:
+        sheet = contact_sheet(listed, listed.parent, rows=1)
+        shown = cv2.resize(sheet[50:230, 6:246], (80, 60), interpolation=cv2.INTER_AREA)
+        assert np.abs(shown.astype(int) - picture(0)).mean() < 4
+
+    def test_a_missing_image_is_named_with_its_line(self, listed: Path) -> None:
+        (listed.parent / "photos/1.png").unlink()
+        with pytest.raises(InputError, match=r"list\.txt:2:1: .*photos/1\.png no such image"):
+            contact_sheet(listed, listed.parent)
+
+    def test_it_is_written_as_its_ending_says(self, listed: Path) -> None:
+        write_contact_sheet(listed, listed.parent, listed.parent / "deep/sheet.png")
+        assert cv2.imread(str(listed.parent / "deep/sheet.png")) is not None
+        with pytest.raises(InputError, match="cannot be written as a picture"):
+            write_contact_sheet(listed, listed.parent, listed.parent / "sheet.nothing")

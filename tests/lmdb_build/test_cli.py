@@ -1,0 +1,132 @@
+"""The command lmdb-build: from a walk to lists and a picture, and what it says to wrong input."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lmdb_build.cli import main
+from lmdb_build.pairs.list_file import read_pair_list, read_settings
+from paths import ROOT
+
+
+@pytest.fixture(scope="module")
+def walks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("walks")
+    command = ["walk", str(out), "--sequences", "2", "--frames", "60", "--size", "48x36", "--laps", "2"]
+    assert main(command) == 0
+    return out
+
+
+def pairs(walks: Path, *more: str) -> list[str]:
+    return ["pairs", str(walks / "walk_1"), str(walks / "walk_2"), "--test", "0", *more]
+
+
+def test_from_a_walk_to_lists_and_a_picture(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "lists"
+    command = pairs(
+        walks, "--out", str(out), "--train", "60", "--val", "20", "--different-scenes", "--root", str(walks)
+    )
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert "60 images with a pose, 0 without one left out" in said.out
+    assert "positive, same sequence" in said.out
+    assert "nobody said" not in said.err
+    listed = read_pair_list(out / "train.txt")
+    assert len(listed) == 60
+    assert all((walks / pair.first).is_file() and (walks / pair.second).is_file() for pair in listed)
+    assert not (out / "test.txt").exists()
+    assert main(["sheet", str(out / "train.txt"), str(tmp_path / "sheet.png")]) == 0
+    assert (tmp_path / "sheet.png").stat().st_size > 10_000
+
+
+def test_two_houses_are_two_scenes(walks: Path) -> None:
+    first, second = (next((walks / name / "rgb").iterdir()).read_bytes() for name in ("walk_1", "walk_2"))
+    assert first != second
+
+
+def test_undeclared_scenes_are_warned_about(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(pairs(walks, "--out", str(tmp_path), "--train", "60", "--val", "0")) == 0
+    assert "warning: train: " in capsys.readouterr().err
+
+
+def test_named_sequences_and_shared_frames(walks: Path, tmp_path: Path) -> None:
+    command = pairs(walks, "--out", str(tmp_path), "--train", "40", "--val", "20", "--val-sequences", "walk_2")
+    assert main([*command, "--negatives", "same_sequence", "--same-frame", "walk_1,walk_2"]) == 0
+    assert {pair.first.split("/")[0] for pair in read_pair_list(tmp_path / "val.txt")} == {"walk_2"}
+    assert read_settings(tmp_path / "val.txt")["one frame of reference"] == "walk_1 walk_2"
+
+
+def test_warped_and_joined(walks: Path, tmp_path: Path) -> None:
+    out = walks / "warped"
+    assert main(pairs(walks, "--out", str(out), "--train", "20", "--val", "10", "--warp-share", "0.5")) == 0
+    assert len(list((out / "train_warped").iterdir())) == 10
+    assert main(["join", str(out / "all.txt"), str(out / "train.txt"), str(out / "val.txt")]) == 0
+    joined = read_pair_list(out / "all.txt")
+    assert len(joined) == 30
+    assert all((walks / pair.second).is_file() for pair in joined)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["pairs", "{0}/nowhere", "--out", "{1}"], "no such folder"),
+        (["pairs", "{0}/walk_1", "--out", "{1}", "--train", "3"], "even, not 3"),
+        (["pairs", "{0}/walk_1", "--out", "{1}", "--train", "100000"], "--at-most"),
+        (["pairs", "--folders", "{0}/walk_1", "{1}", "--out", "{1}"], "holds no image"),
+        (["pairs", "--table", "{1}/none.csv", "--out", "{1}"], "cannot be read"),
+        (["sheet", "{1}/none.txt", "{1}/x.png"], "cannot be read"),
+        (["walk", "{0}"], "holds a sequence already"),
+        (["walk", "{1}/w", "--rooms", "3"], "even number of rooms"),
+        (["walk", "{0}/walk_1/rgb.txt"], "Not a directory"),
+    ],
+)
+def test_a_fault_of_the_users_is_one_line_and_status_1(
+    walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    assert main([argument.format(walks, tmp_path) for argument in arguments]) == 1
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+
+
+def test_a_broken_line_of_groundtruth_is_named(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s/rgb.txt").write_text("1.0 rgb/1.png\n")
+    (tmp_path / "s/groundtruth.txt").write_text("# head\n1.0 0 0 0 0 0 0 one\n")
+    assert main(["pairs", str(tmp_path / "s"), "--out", str(tmp_path)]) == 1
+    place = tmp_path / "s/groundtruth.txt"
+    assert capsys.readouterr().err.startswith(f'{place}:2:17: expected a number for qw, found "one"')
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["pairs", "--out", "x"],
+        ["pairs", "a", "--folders", "b", "c", "--out", "x"],
+        ["pairs", "--mask", "m.mat", "--out", "x"],
+        ["walk", "x", "--size", "320"],
+        ["walk", "x", "--sequences", "0"],
+        ["pairs", "a", "--out", "x", "--shares", "1,2"],
+    ],
+)
+def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_python_m_lmdb_build() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "lmdb_build", "--help"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0
+    assert "walk" in done.stdout

@@ -1,0 +1,202 @@
+"""The made-up walk: true geometry, places really seen again, all from the seed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lmdb_build.walk.house import House, Quad, Room, build_house
+from lmdb_build.walk.render import Camera, Light, Renderer
+from lmdb_build.walk.sequence import Walk, write_walk
+from loopclosure.errors import InputError
+from loopclosure.places.same_place import same_place_matrix
+from loopclosure.places.trajectory import Sequence, read_groundtruth, read_tum_sequence, rotation_matrices
+
+SMALL = Walk(frames=150, width=64, height=48, laps=3, seed=7)
+CAMERA = Camera(160, 120, 131.25)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("walk") / "walk_1"
+    assert len(list(write_walk(folder, SMALL))) == SMALL.frames
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sequence(folder: Path) -> Sequence:
+    return read_tum_sequence(folder)
+
+
+def plain_light(rooms: int = 1) -> Light:
+    return Light(np.ones(3), np.zeros(3), np.zeros((rooms, 3)))
+
+
+def flat_house(*quads: Quad) -> House:
+    return House(list(quads), [Room(0, (-5.0, -5.0, 5.0, 5.0))], np.zeros((1, 2)), 1.0)
+
+
+def facing_quad(distance: float, size: float, texture: np.ndarray) -> Quad:
+    """A square before a camera at the origin with no rotation (looking along +z, y down)."""
+    origin = np.array([-size / 2, -size / 2, distance])
+    return Quad(origin, np.array([size, 0, 0.0]), np.array([0, size, 0.0]), texture, 0)
+
+
+def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence: Sequence) -> None:
+    assert (len(sequence), sequence.dropped) == (SMALL.frames, 0)
+    assert all((folder / frame.path).is_file() for frame in sequence.frames)
+    trajectory = read_groundtruth(folder / "groundtruth.txt")
+    assert np.diff(trajectory.stamps).mean() * 9 < np.diff(sequence.stamps).mean()
+    picture = cv2.imread(str(folder / sequence.frames[0].path))
+    assert picture is not None
+    assert picture.shape == (SMALL.height, SMALL.width, 3)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_house(folder: Path, tmp_path: Path) -> None:
+    short = replace(SMALL, frames=4, laps=1)
+    for name, walk in (("a", short), ("b", short), ("c", replace(short, seed=8))):
+        list(write_walk(tmp_path / name, walk))
+    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*"))
+    same = [(tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes() for file in files]
+    # rgb.txt and groundtruth.txt say the sequence's own name in a comment.
+    assert {file.name for file, equal in zip(files, same, strict=True) if not equal} == {"rgb.txt", "groundtruth.txt"}
+    assert (tmp_path / "a/rgb/1000.000000.jpg").read_bytes() != (tmp_path / "c/rgb/1000.000000.jpg").read_bytes()
+
+
+def test_places_are_seen_again_on_every_lap(sequence: Sequence) -> None:
+    truth = same_place_matrix(sequence, sequence)
+    lap = np.arange(SMALL.frames) * SMALL.laps // SMALL.frames
+    for later in (1, 2):
+        again = truth[np.ix_(lap == later, lap == 0)].any(axis=1)
+        assert again.mean() > 0.9
+
+
+def test_the_same_place_looks_the_same_and_other_places_do_not(folder: Path, sequence: Sequence) -> None:
+    thumbnails = []
+    for frame in sequence.frames:
+        picture = cv2.imread(str(folder / frame.path))
+        assert picture is not None
+        small = cv2.resize(picture, (16, 12), interpolation=cv2.INTER_AREA).astype(float).ravel()
+        thumbnails.append((small - small.mean()) / small.std())
+    alike = np.array(thumbnails) @ np.array(thumbnails).T / len(thumbnails[0])
+    apart = np.abs(sequence.stamps[:, None] - sequence.stamps) > 10
+    truth = same_place_matrix(sequence, sequence)
+    nearly_the_same_view = same_place_matrix(sequence, sequence, 0.5, 6) & apart
+    other = np.median(alike[~truth])
+    assert np.median(alike[nearly_the_same_view]) > 0.6
+    assert np.median(alike[truth & apart]) > 0.35
+    assert other < 0.15
+
+
+def test_a_lap_later_it_is_another_light_and_a_few_steps_aside(sequence: Sequence) -> None:
+    truth = same_place_matrix(sequence, sequence)
+    later = np.flatnonzero(np.arange(SMALL.frames) >= SMALL.frames // SMALL.laps)
+    aside = []
+    for index in later:
+        first_lap = np.flatnonzero(truth[index, : SMALL.frames // SMALL.laps])
+        if len(first_lap):
+            aside.append(np.linalg.norm(sequence.positions[first_lap] - sequence.positions[index], axis=1).min())
+    assert 0.03 < np.median(aside) < 0.6
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_painted_corner_appears_where_its_point_in_space_projects(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    texture = np.zeros((256, 256, 3), np.uint8)
+    texture[:128, :128] = texture[128:, 128:] = 255
+    quad = facing_quad(3.0, 1.6, texture)
+    corner = np.array([0.0, 0.0, 3.0])
+    rotation = Rotation.from_euler("xyz", rng.uniform([-12, -15, -30], [12, 15, 30]), degrees=True).as_matrix()
+    position = rng.uniform([-0.8, -0.5, -0.5], [0.8, 0.5, 0.8])
+    expected = CAMERA.project((corner - position) @ rotation)
+    assert (expected > 8).all()
+    assert (expected < [CAMERA.width - 8, CAMERA.height - 8]).all()
+
+    picture = Renderer(flat_house(quad), CAMERA, plain_light()).draw(position, rotation)
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    start = np.array([[expected + rng.uniform(-1.5, 1.5, 2)]], np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    found = cv2.cornerSubPix(grey, start, (6, 6), (-1, -1), criteria)[0, 0]
+    np.testing.assert_allclose(found, expected, atol=0.25)
+
+
+def test_texture_columns_run_to_the_right_and_rows_down() -> None:
+    texture = np.zeros((64, 64, 3), np.uint8)
+    texture[:32, :32], texture[:32, 32:], texture[32:, :32] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
+    picture = Renderer(flat_house(facing_quad(2.0, 1.2, texture)), CAMERA, plain_light()).draw(np.zeros(3), np.eye(3))
+    assert picture[45, 65].tolist() == [250, 0, 0]
+    assert picture[45, 95].tolist() == [0, 250, 0]
+    assert picture[75, 65].tolist() == [0, 0, 250]
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_the_nearer_surface_hides_the_other_whatever_their_order(order: tuple[int, int]) -> None:
+    near = facing_quad(2.0, 0.5, np.full((32, 32, 3), 200, np.uint8))
+    far = facing_quad(4.0, 8.0, np.full((32, 32, 3), 50, np.uint8))
+    quads = [(near, far)[index] for index in order]
+    picture = Renderer(flat_house(*quads), CAMERA, plain_light()).draw(np.zeros(3), np.eye(3))
+    assert picture[60, 80, 0] == 200
+    assert picture[10, 10, 0] == 50
+
+
+def test_a_surface_is_not_seen_from_behind() -> None:
+    quad = facing_quad(2.0, 1.0, np.full((32, 32, 3), 200, np.uint8))
+    turned = replace(quad, origin=quad.origin + quad.right, right=-quad.right)
+    assert not Renderer(flat_house(turned), CAMERA, plain_light()).draw(np.zeros(3), np.eye(3)).any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_house_has_no_holes(seed: int) -> None:
+    house = build_house(seed)
+    white = [replace(quad, texture=np.full((32, 32, 3), 255, np.uint8), glow=None, shell=False) for quad in house.quads]
+    renderer = Renderer(House(white, house.rooms, house.way, house.step_m), CAMERA, plain_light(len(house.rooms)))
+    for index in range(0, len(house.way), 40):
+        position = np.append(house.way[index], 1.5)
+        for turn in (0.0, 1.3, 2.9, 4.4):
+            ahead = np.array([np.cos(turn), np.sin(turn), 0])
+            right = np.array([np.sin(turn), -np.cos(turn), 0])
+            picture = renderer.draw(position, np.column_stack([right, [0, 0, -1], ahead]))
+            assert (picture == 255).mean() > 0.9995
+
+
+@pytest.mark.parametrize("rooms", [4, 6, 8])
+def test_the_way_leads_through_every_room_and_never_into_furniture(rooms: int) -> None:
+    for seed in range(4):
+        house = build_house(seed, rooms)
+        for room in house.rooms:
+            x0, y0, x1, y1 = room.bounds
+            assert ((house.way > [x0, y0]) & (house.way < [x1, y1])).all(axis=1).any()
+            assert len(room.footprints) >= 2
+            for p0, o0, p1, o1 in room.footprints:
+                gap = np.maximum(np.maximum([p0, o0] - house.way, house.way - [p1, o1]), 0)
+                assert np.linalg.norm(gap, axis=1).min() >= 0.5
+
+
+def test_the_camera_is_carried_upright(sequence: Sequence) -> None:
+    axes = rotation_matrices(sequence.quaternions)
+    assert (axes[:, 2, 1] < -0.98).all()  # y points down
+    assert (np.abs(axes[:, 2, 0]) < 0.05).all()  # x is level
+    assert (np.abs(sequence.positions[:, 2] - 1.5) < 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rooms": 5}, "even number of rooms"),
+        ({"frames": 1}, "frames must be 2"),
+        ({"width": 8}, "width must be 32"),
+        ({"laps": 0}, "laps must be 1"),
+        ({"seed": -1}, "seed is 0 or more"),
+    ],
+)
+def test_numbers_that_make_no_walk_are_refused(tmp_path: Path, change: dict[str, int], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        list(write_walk(tmp_path / "w", replace(SMALL, **change)))
+
+
+def test_a_folder_with_a_sequence_is_not_written_over(folder: Path) -> None:
+    with pytest.raises(InputError, match="holds a sequence already"):
+        list(write_walk(folder, SMALL))

@@ -1,0 +1,123 @@
+"""Similarity by blocks against the same by brute force."""
+
+import numpy as np
+import pytest
+
+from loopclosure.descriptors import similarity
+from loopclosure.descriptors.similarity import similarity_blocks, similarity_matrix, top_k
+from loopclosure.errors import InputError
+from loopclosure.places.truth import Exclusion
+
+
+def brute_force(queries, references, metric):
+    if metric == "euclidean":
+        return -np.linalg.norm(queries[:, None] - references[None], axis=2)
+    lengths = np.linalg.norm(queries, axis=1)[:, None] * np.linalg.norm(references, axis=1)[None]
+    return (queries @ references.T) / lengths
+
+
+@pytest.fixture
+def features():
+    return np.random.default_rng(0).normal(5.0, 1.0, (40, 7))
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+def test_matrix(features, metric):
+    references = features[:25] + 0.1
+    np.testing.assert_allclose(
+        similarity_matrix(features, references, metric), brute_force(features, references, metric), rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        similarity_matrix(features.astype(np.float32), None, metric),
+        brute_force(features, features, metric),
+        atol=5e-3,
+    )
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+def test_of_several_views_the_two_most_alike_count(features, metric):
+    queries, references = features[:20].reshape(10, -1), features[20:].reshape(10, -1)
+    expected = [
+        brute_force(queries[:, 7 * u : 7 * u + 7], references[:, 7 * v : 7 * v + 7], metric)
+        for u in (0, 1)
+        for v in (0, 1)
+    ]
+    np.testing.assert_allclose(similarity_matrix(queries, references, metric, views=2), np.max(expected, axis=0))
+
+
+def test_blocks_are_the_matrix(features):
+    blocks = list(similarity_blocks(features, rows=16))
+    assert [start for start, _ in blocks] == [0, 16, 32]
+    np.testing.assert_allclose(np.concatenate([block for _, block in blocks]), similarity_matrix(features), atol=1e-12)
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+@pytest.mark.parametrize(("rows", "columns"), [(1024, 16384), (7, 5), (1, 2)])
+def test_top_k_by_blocks_equals_sorting(features, metric, rows, columns, monkeypatch):
+    monkeypatch.setattr(similarity, "BLOCK_ROWS", rows)
+    monkeypatch.setattr(similarity, "BLOCK_COLUMNS", columns)
+    stamps = np.arange(40) * 0.5
+    found = top_k(features, k=4, metric=metric, exclusion=Exclusion(frames=3, seconds=2.5), stamps=stamps)
+    scores = brute_force(features, features, metric)
+    for query in range(40):
+        allowed = [j for j in range(query) if query - j > 3 and (query - j) * 0.5 >= 2.5]
+        expected = sorted(allowed, key=lambda j: -scores[query, j])[:4]
+        assert [int(j) for j in found.indices[query] if j >= 0] == expected
+        np.testing.assert_allclose(found.scores[query, : len(expected)], scores[query, expected], rtol=1e-7)
+        assert np.all(np.isneginf(found.scores[query, len(expected) :]))
+
+
+def test_top_k_against_other_references(features):
+    found = top_k(features[30:], features[:30], k=3)
+    expected = np.argsort(-brute_force(features[30:], features[:30], "euclidean"), axis=1)[:, :3]
+    np.testing.assert_array_equal(found.indices, expected)
+
+
+@pytest.mark.parametrize("columns", [16384, 3])
+def test_equal_scores_come_in_the_order_of_the_references(columns, monkeypatch):
+    monkeypatch.setattr(similarity, "BLOCK_COLUMNS", columns)
+    same = np.ones((9, 2), np.float32)
+    np.testing.assert_array_equal(top_k(same, same, k=3).indices, np.tile([0, 1, 2], (9, 1)))
+
+
+def test_memory_is_that_of_blocks(monkeypatch):
+    """20,000 frames: the whole matrix would be 1.6 GB of float32."""
+    import tracemalloc
+
+    features = np.random.default_rng(1).normal(size=(20_000, 4)).astype(np.float32)
+    monkeypatch.setattr(similarity, "BLOCK_ROWS", 256)
+    monkeypatch.setattr(similarity, "BLOCK_COLUMNS", 2048)
+    tracemalloc.start()
+    top_k(features, k=2, exclusion=Exclusion(frames=10))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+
+
+def test_a_feature_of_zeros_is_alike_to_nothing_by_cosine():
+    scores = similarity_matrix(np.array([[0.0, 0.0], [1.0, 0.0]]), metric="cosine")
+    np.testing.assert_array_equal(scores, [[0.0, 0.0], [0.0, 1.0]])
+
+
+def test_fewer_references_than_asked_for():
+    assert top_k(np.eye(3), np.eye(3)[:2], k=10).indices.shape == (3, 2)
+    found = top_k(np.eye(3), k=2)
+    np.testing.assert_array_equal(found.indices[0], [-1, -1])
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: similarity_matrix(np.zeros(3)), "shape"),
+        (lambda: similarity_matrix(np.zeros((3, 2)), np.zeros((3, 4))), "queries have 2 dimensions, references 4"),
+        (lambda: similarity_matrix(np.zeros((3, 2)), metric="l1"), 'unknown metric "l1"'),
+        (lambda: similarity_matrix(np.array([[0.0], [np.nan]])), "frame 1"),
+        (lambda: top_k(np.eye(3), k=0), "best 0"),
+        (lambda: top_k(np.eye(3), np.eye(3), exclusion=Exclusion(frames=1)), "concerns one sequence"),
+        (lambda: top_k(np.eye(3), exclusion=Exclusion(seconds=1)), "have no time"),
+        (lambda: Exclusion(frames=-1), "cannot exclude -1"),
+    ],
+)
+def test_faults_are_named(call, sentence):
+    with pytest.raises(InputError, match=sentence):
+        call()

@@ -1,0 +1,213 @@
+"""The detector: what it accepts, that it forgets nothing when saved, that growing it costs little."""
+
+import numpy as np
+import pytest
+
+from loopclosure.descriptors.similarity import similarity_matrix, top_k
+from loopclosure.detector.detector import FIRST_CAPACITY, DetectorSettings, LoopDetector
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.errors import InputError
+from loopclosure.places.truth import Exclusion
+
+
+def two_laps(places=60, dimensions=16, noise=0.02, seed=0):
+    """Descriptors of a lap of places, and of a second lap of the same ones."""
+    rng = np.random.default_rng(seed)
+    lap = rng.normal(size=(places, dimensions))
+    return np.concatenate([lap, lap + noise * rng.normal(size=lap.shape)]).astype(np.float32)
+
+
+def run(detector, descriptors, **more):
+    return [detector.add_descriptor(row, **more) for row in descriptors]
+
+
+def test_second_lap_closes_its_loops_and_the_first_none():
+    detector = LoopDetector(exclude_recent=10, threshold=-0.5)
+    results = run(detector, two_laps())
+    assert [r.accepted for r in results] == [None] * 60 + list(range(60))
+    assert [loop.query_id for loop in detector.loops] == list(range(60, 120))
+    assert results[0].verdict == "no candidate"
+    assert results[20].verdict == "below threshold"
+    assert len(detector) == 120
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+def test_candidates_are_those_of_the_search_by_blocks(metric):
+    descriptors = np.random.default_rng(1).normal(2.0, 1.0, (FIRST_CAPACITY + 40, 8)).astype(np.float32)
+    detector = LoopDetector(metric=metric, exclude_recent=7, top_k=4)
+    results = run(detector, descriptors)
+    expected = top_k(descriptors, k=4, metric=metric, exclusion=Exclusion(frames=7))
+    for result, indices, scores in zip(results, expected.indices, expected.scores, strict=True):
+        assert [number for number, _ in result.candidates] == [i for i in indices if i >= 0]
+        np.testing.assert_allclose(
+            [score for _, score in result.candidates], scores[: len(result.candidates)], atol=1e-4
+        )
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+def test_of_several_views_the_two_most_alike_count(metric, tmp_path):
+    descriptors = np.random.default_rng(1).normal(2.0, 1.0, (60, 24)).astype(np.float32)
+    expected = similarity_matrix(descriptors, None, metric, views=3)
+    detector = LoopDetector(metric=metric, views=3, exclude_recent=7, top_k=4)
+    results = run(detector, descriptors[:30])
+    detector.save(tmp_path / "detector.npz")
+    results += run(LoopDetector.load(tmp_path / "detector.npz"), descriptors[30:])
+    for i, result in enumerate(results):
+        scores = expected[i, : max(0, i - 7)]
+        assert [number for number, _ in result.candidates] == np.argsort(-scores)[:4].tolist()
+        np.testing.assert_allclose([score for _, score in result.candidates], np.sort(scores)[::-1][:4], atol=1e-3)
+    with pytest.raises(InputError, match="25 dimensions, not of 3 views"):
+        LoopDetector(views=3).add_descriptor(np.ones(25))
+
+
+def test_seconds_exclude_too():
+    detector = LoopDetector(exclude_recent=0, exclude_seconds=2.0, top_k=9)
+    for stamp in (0.0, 1.0, 1.5, 3.0, 3.5):
+        result = detector.add_descriptor(np.ones(3), stamp)
+    assert sorted(number for number, _ in result.candidates) == [0, 1, 2]
+    with pytest.raises(InputError, match="frame 5 has no stamp"):
+        detector.add_descriptor(np.ones(3))
+    with pytest.raises(InputError, match="earlier than the one before"):
+        detector.add_descriptor(np.ones(3), 1.0)
+
+
+def test_without_a_threshold_nothing_is_accepted():
+    results = run(LoopDetector(exclude_recent=10), two_laps())
+    assert all(r.accepted is None for r in results)
+    assert results[-1].verdict == "no threshold"
+    assert results[-1].candidates[0][0] == 59
+
+
+def test_consistency_wants_the_frames_before_to_agree():
+    descriptors = two_laps()
+    lonely = descriptors[:60].copy()
+    lonely[50] = descriptors[3]  # one frame looks like an old one, its neighbours do not
+    plain = LoopDetector(exclude_recent=10, threshold=-0.5)
+    steady = LoopDetector(exclude_recent=10, threshold=-0.5, consistency=3, consistency_window=2)
+    assert [r.query_id for r in run(plain, lonely) if r.accepted is not None] == [50]
+    assert [r.query_id for r in run(steady, lonely) if r.accepted is not None] == []
+    steady = LoopDetector(exclude_recent=10, threshold=-0.5, consistency=3, consistency_window=2)
+    results = run(steady, descriptors)
+    assert [r.query_id for r in results if r.accepted is not None] == list(range(63, 120))
+    assert [r.verdict for r in results[60:63]] == ["not consistent"] * 3
+
+
+def test_consistency_follows_a_lap_driven_backwards():
+    rng = np.random.default_rng(2)
+    lap = rng.normal(size=(40, 8))
+    steady = LoopDetector(exclude_recent=10, threshold=-0.1, consistency=2, consistency_window=1)
+    results = run(steady, np.concatenate([lap, lap[::-1]]))
+    accepted = {r.query_id: r.accepted for r in results if r.accepted is not None}
+    assert accepted == {query: 79 - query for query in range(47, 80)}  # 45, 46 lead on; before, the place is too recent
+
+
+def test_calibration_reaches_the_wanted_precision():
+    rng = np.random.default_rng(4)
+    descriptors = two_laps(noise=0.6, seed=4)
+    descriptors[60:] += 0.3 * rng.normal(size=(60, 16)).astype(np.float32)
+    detector = LoopDetector(exclude_recent=10)
+    results = run(detector, descriptors)
+    same = np.zeros((120, 120), bool)
+    same[np.arange(60, 120), np.arange(60)] = True
+    found = detector.calibrate(results, same, precision=0.95)
+    threshold = detector.settings.threshold
+    assert threshold is not None
+    again = LoopDetector(settings=detector.settings)
+    accepted = [r for r in run(again, descriptors) if r.accepted is not None]
+    right = sum(r.accepted == r.query_id - 60 for r in accepted)
+    assert right / len(accepted) >= 0.95
+    assert right / 60 * 60 == pytest.approx(found.recall_at_precision(0.95) * found.positives)
+    assert right > 10
+
+
+def test_a_precision_out_of_reach_is_refused():
+    detector = LoopDetector(exclude_recent=10)
+    results = run(detector, two_laps())
+    with pytest.raises(InputError, match=r"no threshold reaches a precision of 0.99 .* the best is 0 "):
+        detector.calibrate(results, np.zeros((120, 120), bool))
+    assert detector.settings.threshold is None
+
+
+def test_saved_and_loaded_it_goes_on_as_if_nothing_had_happened(tmp_path):
+    descriptors = two_laps(places=300)
+    settings = DetectorSettings(exclude_recent=20, threshold=-0.4, consistency=2, top_k=3)
+    whole = LoopDetector(settings=settings)
+    expected = [whole.add_descriptor(row, 0.1 * i, [i, 0, 0, 0, 0, 0, 1]) for i, row in enumerate(descriptors)]
+    first = LoopDetector(settings=settings)
+    for i, row in enumerate(descriptors[:302]):
+        first.add_descriptor(row, 0.1 * i, [i, 0, 0, 0, 0, 0, 1])
+    first.save(tmp_path / "detector.npz")
+    second = LoopDetector.load(tmp_path / "detector.npz")
+    assert second.settings == settings
+    later = [
+        second.add_descriptor(row, 0.1 * i, [i, 0, 0, 0, 0, 0, 1]) for i, row in enumerate(descriptors[302:], start=302)
+    ]
+    assert later == expected[302:]
+    assert second.loops == whole.loops
+    np.testing.assert_array_equal(second.poses, whole.poses)
+    np.testing.assert_array_equal(second.stamps, whole.stamps)
+
+
+def test_an_empty_detector_can_be_saved(tmp_path):
+    LoopDetector(threshold=0.0, check=GeometricCheck()).save(tmp_path / "empty.npz")
+    detector = LoopDetector.load(tmp_path / "empty.npz", describe=lambda image: image[0, 0].astype(float))
+    assert len(detector) == 0
+    detector.add(np.zeros((20, 20, 3), np.uint8))
+    assert len(detector) == 1
+
+
+def test_files_that_are_no_detector(tmp_path):
+    np.savez(tmp_path / "other.npz", rows=np.zeros(3))
+    (tmp_path / "text.npz").write_text("text")
+    for name in ("other.npz", "text.npz", "none.npz"):
+        with pytest.raises(InputError, match=r"expected a file that LoopDetector.save wrote"):
+            LoopDetector.load(tmp_path / name)
+    with pytest.raises(InputError, match="cannot be written"):
+        LoopDetector().save(tmp_path / "no" / "folder.npz")
+
+
+def test_memory_grows_by_doubling():
+    detector = LoopDetector(exclude_recent=0)
+    arrays = set()
+    for row in np.random.default_rng(0).normal(size=(4 * FIRST_CAPACITY, 3)):
+        detector.add_descriptor(row)
+        arrays.add(id(detector._frames.rows))
+    assert len(detector._frames.rows) == 4 * FIRST_CAPACITY
+    assert len(arrays) <= 3
+
+
+def test_describe_gets_the_image():
+    seen = []
+
+    def describe(image):
+        seen.append(image.shape)
+        return image.mean(axis=(0, 1))
+
+    detector = LoopDetector(describe, exclude_recent=0, threshold=-1.0)
+    assert detector.add(np.full((4, 5, 3), 7, np.uint8)).accepted is None
+    assert detector.add(np.full((4, 5, 3), 7, np.uint8)).accepted == 0
+    assert seen == [(4, 5, 3)] * 2
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda d: d.add_descriptor(np.zeros(3)), "4 dimensions|those before 2"),
+        (lambda d: d.add_descriptor([np.nan, 0.0]), "not finite"),
+        (lambda d: d.add_descriptor(np.zeros(2), pose=[1, 2, 3]), "expected tx ty tz"),
+        (lambda d: d.add(np.zeros((4, 4, 3), np.uint8)), "has no describe"),
+        (lambda d: LoopDetector(top_k=0), "top_k is 0"),
+        (lambda d: LoopDetector(metric="l1"), "unknown metric"),
+    ],
+)
+def test_faults_are_named(call, sentence):
+    detector = LoopDetector()
+    detector.add_descriptor([1.0, 2.0])
+    with pytest.raises(InputError, match=sentence):
+        call(detector)
+    assert len(detector) == 1
+
+
+def test_a_misspelt_setting_is_a_programmers_fault():
+    with pytest.raises(TypeError, match="has no setting treshold"):
+        LoopDetector(treshold=1.0)

@@ -1,0 +1,90 @@
+"""Loops as CSV and g2o: frames of reference, order of quaternions, and nothing made up."""
+
+import csv
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from loopclosure.detector.detector import LoopResult
+from loopclosure.detector.export import Sigmas, relative_pose, write_g2o, write_loops_csv
+from loopclosure.errors import InputError
+
+
+def matrix(pose):
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_quat(pose[3:]).as_matrix()
+    transform[:3, 3] = pose[:3]
+    return transform
+
+
+@pytest.fixture
+def poses():
+    rng = np.random.default_rng(0)
+    return np.concatenate([rng.normal(size=(4, 3)), Rotation.random(4, rng).as_quat()], axis=1)
+
+
+def loop(query, match, inliers=None):
+    return LoopResult(query, [(match, -0.25)], match, "accepted", -0.25, inliers, None)
+
+
+def test_relative_pose_is_the_inverse_times_the_other(poses):
+    for a in poses:
+        for b in poses:
+            np.testing.assert_allclose(matrix(relative_pose(a, b)), np.linalg.inv(matrix(a)) @ matrix(b), atol=1e-12)
+
+
+def test_g2o_edges_chain_the_vertices(tmp_path, poses):
+    path = tmp_path / "out" / "graph.g2o"
+    left_out = write_g2o(
+        path, poses, [loop(3, 0), loop(3, 1)], lambda q, m: relative_pose(poses[m], poses[q]) if m == 0 else None
+    )
+    assert left_out == 1
+    vertices, edges = {}, []
+    for line in path.read_text().splitlines():
+        tag, *fields = line.split()
+        if tag == "VERTEX_SE3:QUAT":
+            vertices[int(fields[0])] = np.array(fields[1:], float)
+        else:
+            assert tag == "EDGE_SE3:QUAT"
+            assert len(fields) == 2 + 7 + 21
+            edges.append((int(fields[0]), int(fields[1]), np.array(fields[2:9], float)))
+    assert [(a, b) for a, b, _ in edges] == [(0, 1), (1, 2), (2, 3), (0, 3)]
+    for a, b, step in edges:
+        np.testing.assert_allclose(matrix(vertices[a]) @ matrix(step), matrix(vertices[b]), atol=1e-6)
+
+
+def test_information_is_of_the_sigmas():
+    values = [float(v) for v in Sigmas(0.1, 0.5).information().split()]
+    full = np.zeros((6, 6))
+    full[np.triu_indices(6)] = values
+    np.testing.assert_allclose(full, np.diag([100, 100, 100, 4, 4, 4]))
+
+
+def test_frames_without_a_pose_are_no_vertices(tmp_path, poses):
+    poses[1] = np.nan
+    left_out = write_g2o(tmp_path / "g.g2o", poses, [loop(3, 1)], lambda q, m: np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    lines = (tmp_path / "g.g2o").read_text().splitlines()
+    assert left_out == 1
+    assert [line.split()[1] for line in lines if line.startswith("VERTEX")] == ["0", "2", "3"]
+    assert [line.split()[1:3] for line in lines if line.startswith("EDGE")] == [["0", "2"], ["2", "3"]]
+    with pytest.raises(InputError, match="no frame has a pose"):
+        write_g2o(tmp_path / "g.g2o", np.full((3, 7), np.nan), [], lambda q, m: None)
+
+
+def test_csv(tmp_path):
+    stamps = np.array([0.0, np.nan, 2.5])
+    write_loops_csv(tmp_path / "loops.csv", [loop(2, 0, 31), loop(2, 1)], stamps, ["a.png", "b.png", "c.png"])
+    with (tmp_path / "loops.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert rows[0] == {
+        "query_id": "2",
+        "match_id": "0",
+        "score": "-0.25",
+        "inliers": "31",
+        "query_stamp": "2.500000",
+        "match_stamp": "0.000000",
+        "query_name": "c.png",
+        "match_name": "a.png",
+    }
+    assert (rows[1]["inliers"], rows[1]["match_stamp"], rows[1]["match_name"]) == ("", "", "b.png")

@@ -1,0 +1,104 @@
+"""The detector over recordings: folders, sequences and videos, with any describe."""
+
+import cv2
+import numpy as np
+import pytest
+
+from loopclosure.descriptors.feature_file import Features, read_features
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.run import calibrate, from_poses, judged_by_poses, load_describe, open_recording, run_detector
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.errors import InputError
+from loopclosure.places.datasets import load_tum
+from loopclosure.places.frames import Selection
+
+
+def small(image):
+    return cv2.resize(image, (8, 6), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def test_sequence_with_poses(two_laps):
+    recording = open_recording(two_laps)
+    assert len(recording) == 40
+    assert recording.stamps is not None
+    assert recording.poses is not None
+    np.testing.assert_allclose(recording.poses[5, :3], [0, 5, 1], atol=1e-3)
+    detector = LoopDetector(small, exclude_recent=10, metric="cosine", threshold=0.95)
+    results = run_detector(detector, recording)
+    assert [r.accepted for r in results] == [None] * 20 + list(range(20))
+    assert judged_by_poses(detector) == "20 of 20 loops are the same place by their poses (2 m, 15 degrees)"
+    np.testing.assert_allclose(from_poses(detector)(25, 5), [0, 0, 0, 0, 0, 0, 1], atol=1e-6)
+
+
+def test_features_take_the_place_of_describe(two_laps, two_laps_features):
+    detector = LoopDetector(exclude_recent=5, threshold=-0.2)
+    results = run_detector(detector, open_recording(two_laps, Selection(stride=2)), read_features(two_laps_features))
+    assert [r.accepted for r in results] == [None] * 10 + list(range(10))
+
+
+def test_features_with_verification_read_the_images(two_laps, two_laps_features):
+    detector = LoopDetector(
+        exclude_recent=10, threshold=-0.2, check=GeometricCheck(max_features=100, min_inliers=8, ratio=0.9)
+    )
+    results = run_detector(detector, open_recording(two_laps), read_features(two_laps_features))
+    assert {r.verdict for r in results[20:]} <= {"accepted", "not verified"}
+    assert all(r.inliers is not None for r in results[20:])
+
+
+def write_video(path, count=30):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    for i in range(count):
+        image = np.zeros((48, 64, 3), np.uint8)
+        image[:, (4 * (i % 15)) : (4 * (i % 15) + 8)] = 255
+        writer.write(image)
+    writer.release()
+
+
+def test_video(tmp_path):
+    write_video(tmp_path / "walk.avi")
+    recording = open_recording(tmp_path / "walk.avi", Selection(stride=3))
+    assert recording.names[:2] == ["frame 0", "frame 3"]
+    detector = LoopDetector(small, exclude_recent=2, metric="cosine", threshold=0.98)
+    results = run_detector(detector, recording)
+    assert [r.accepted for r in results] == [None] * 5 + list(range(5))
+    assert detector.stamps[1] == pytest.approx(0.3)
+    with pytest.raises(InputError, match="no names to find features by"):
+        run_detector(detector, recording, Features(tmp_path / "f.npz", np.zeros((1, 2))))
+    with pytest.raises(InputError, match="no such video"):
+        open_recording(tmp_path / "gone.mp4")
+
+
+def test_calibration_on_a_sequence(two_laps, two_laps_features):
+    detector = LoopDetector(small, exclude_recent=10, metric="cosine")
+    sentence = calibrate(detector, load_tum(two_laps), precision=1.0)
+    assert "two_laps precision at least 1 at recall 1.000 of the 20 frames" in sentence
+    assert len(detector) == 0
+    assert detector.settings.threshold is not None
+    results = run_detector(detector, open_recording(two_laps))
+    assert [r.accepted for r in results] == [None] * 20 + list(range(20))
+
+
+def test_describe_by_name(tmp_path, monkeypatch):
+    (tmp_path / "my_describe.py").write_text(
+        "def flat(image):\n    return image.mean(axis=(0, 1))\n\n\n"
+        "def make(power, name='x'):\n    return lambda image: image.mean(axis=(0, 1)) ** power\n\n\n"
+        "class Row:\n    def __init__(self, row=0):\n        self.row = row\n\n"
+        "    def __call__(self, image):\n        return image[self.row, 0]\n\n\n"
+        "number = 3\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    image = np.full((4, 4, 3), 3, np.uint8)
+    image[1] = 5
+    assert load_describe("my_describe:flat", {})(image).tolist() == [3.5] * 3
+    assert load_describe("my_describe:make", {"power": "2"})(image).tolist() == [12.25] * 3
+    assert load_describe("my_describe:Row", {})(image).tolist() == [3] * 3
+    assert load_describe("my_describe:Row", {"row": "1"})(image).tolist() == [5] * 3
+    for specification, options, sentence in (
+        ("my_describe", {}, "expected module:function"),
+        ("no_such_module:f", {}, "cannot import"),
+        ("my_describe:g", {}, 'has no "g"'),
+        ("my_describe:number", {}, "cannot be called"),
+        ("my_describe:make", {"power": "2", "x": "1"}, "unexpected keyword"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            load_describe(specification, options)

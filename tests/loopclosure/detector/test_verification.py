@@ -1,0 +1,82 @@
+"""Geometric verification on made-up views: a textured wall seen from two sides, and another wall."""
+
+import cv2
+import numpy as np
+import pytest
+
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.errors import InputError
+
+
+def wall(seed):
+    """A surface of blots of all sizes, (240, 320, 3)."""
+    rng = np.random.default_rng(seed)
+    image = np.full((240, 320, 3), 128, np.uint8)
+    for _ in range(220):
+        centre = rng.integers(0, (320, 240))
+        cv2.circle(image, tuple(int(c) for c in centre), int(rng.integers(3, 22)), rng.integers(0, 256, 3).tolist(), -1)
+    return cv2.GaussianBlur(image, (0, 0), 1.0)
+
+
+def seen_from_the_side(image):
+    corners = np.float32([[0, 0], [320, 0], [320, 240], [0, 240]])
+    moved = np.float32([[12, 6], [300, 18], [312, 228], [4, 236]])
+    return cv2.warpPerspective(image, cv2.getPerspectiveTransform(corners, moved), (320, 240))
+
+
+@pytest.fixture(scope="module")
+def check():
+    return GeometricCheck()
+
+
+def test_the_same_wall_has_many_inliers_and_another_few(check):
+    here, there, other = (check.describe(image) for image in (wall(0), seen_from_the_side(wall(0)), wall(1)))
+    assert check.inliers(here, there) > 3 * check.min_inliers
+    assert not check.accepts(check.inliers(here, other))
+    assert check.inliers(here, there) == check.inliers(here, there)
+
+
+def test_matches_join_what_is_the_same_point(check):
+    image = wall(0)
+    shifted = np.roll(image, (10, 20), axis=(0, 1))
+    a, b = check.describe(image), check.describe(shifted)
+    matches = check.matches(a, b)
+    assert len(np.unique(matches[:, 1])) == len(matches) > 50
+    steps = b.points[matches[:, 1]] - a.points[matches[:, 0]]
+    assert np.mean(np.all(np.abs(steps - [20, 10]) < 1.0, axis=1)) > 0.9
+
+
+def test_an_image_without_a_point_is_no_crash(check):
+    blank = check.describe(np.full((60, 80, 3), 200, np.uint8))
+    assert blank.points.shape == (0, 2)
+    assert check.inliers(blank, check.describe(wall(0))) == 0
+    assert check.inliers(blank, blank) == 0
+
+
+def test_grey_images_and_the_limit_of_points():
+    few = GeometricCheck(max_features=30)
+    assert len(few.describe(cv2.cvtColor(wall(0), cv2.COLOR_BGR2GRAY)).points) == 30
+
+
+def test_settings_that_cannot_work():
+    with pytest.raises(InputError, match="expected at least 8"):
+        GeometricCheck(min_inliers=3)
+
+
+def test_the_detector_asks_for_geometry_last(tmp_path, check):
+    """Descriptors that call all walls alike: only the true pair survives, also after saving and loading."""
+    detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, threshold=-1.0, check=check)
+    assert detector.add(wall(0)).verdict == "no candidate"
+    wrong = detector.add(wall(1))
+    assert (wrong.accepted, wrong.verdict) == (None, "not verified")
+    assert wrong.inliers is not None
+    assert wrong.inliers < check.min_inliers
+    detector.save(tmp_path / "walls.npz")
+    for again in (detector, LoopDetector.load(tmp_path / "walls.npz", lambda image: np.ones(2))):
+        right = again.add(seen_from_the_side(wall(1)))
+        assert (right.accepted, right.verdict) == (1, "accepted")
+        assert right.inliers is not None
+        assert right.inliers > 3 * check.min_inliers
+    with pytest.raises(InputError, match="needs the images"):
+        detector.add_descriptor(np.ones(2))

@@ -1,0 +1,240 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopclosure.errors import InputError
+from loopclosure.methods.base import MethodResult, Setting, make_method
+from loopclosure.methods.seqslam import (
+    SeqSlam,
+    SequenceSettings,
+    best_matches,
+    earlier,
+    enhance_contrast,
+    trajectory_costs,
+)
+from loopclosure.progress import silent
+
+OPEN_SEQSLAM = SequenceSettings(anchor="start", edges="drop")
+
+
+def planted() -> np.ndarray:
+    """Return distances (26 queries, 26 references) in which queries 8 to 23 pass references 0 to 15 again."""
+    reference, query = np.mgrid[:26, :26]
+    distances = 1 + ((7 * reference**2 + 13 * query + 5 * reference * query + 3 * query**2) % 23) / 23
+    for q in range(8, 24):
+        distances[q - 8, q] -= 0.9
+    return distances.T
+
+
+def noise_with_path(queries: int, references: int, path: list[tuple[int, int]], seed: int = 0) -> np.ndarray:
+    distances = np.random.default_rng(seed).uniform(0.5, 1.5, (queries, references))
+    for query, reference in path:
+        distances[query, reference] = 0.3
+    return distances
+
+
+class Fixed:
+    """A method that always says the same."""
+
+    name = "fixed"
+
+    def __init__(self, scores: np.ndarray) -> None:
+        self.scores = scores
+
+    def score(self, *_: object) -> MethodResult:
+        return MethodResult(self.scores, {"fixed": 1.0}, ["as given"])
+
+
+def frames(count: int) -> list[Path]:
+    return [Path(f"{i}.png") for i in range(count)]
+
+
+def test_contrast_of_the_oracle() -> None:
+    enhanced = enhance_contrast(planted(), 10)
+    assert enhanced.sum() == pytest.approx(1803.062152404, abs=1e-8)
+    np.testing.assert_allclose(
+        enhanced[:6, 0], [1.3192073, 4.29075722, 3.31771609, 3.78610425, 1.98105652, 1.74793031], atol=1e-8
+    )
+    assert enhanced.min() == 0.0
+
+
+def test_matches_of_the_oracle() -> None:
+    match, ratio = best_matches(trajectory_costs(enhance_contrast(planted(), 10), OPEN_SEQSLAM), window=10)
+    expected = """5:7:.970799 6:8:.974159 7:19:.970108 8:7:.908976 9:7:.853456 10:8:.955933 11:5:.943301 12:5:.441713
+        13:5:.403547 14:6:.295662 15:7:.290555 16:8:.303895 17:9:.226682 18:10:.160210 19:11:.242648 20:12:.279916"""
+    found = [line.split(":") for line in expected.split()]
+    judged = np.flatnonzero(match >= 0)
+    np.testing.assert_array_equal(judged, [int(query) for query, _, _ in found])
+    np.testing.assert_array_equal(match[judged], [int(reference) for _, reference, _ in found])
+    np.testing.assert_allclose(ratio[judged], [float(score) for _, _, score in found], atol=1e-6)
+    assert np.isnan(ratio[match < 0]).all()
+    np.testing.assert_array_equal(judged[ratio[judged] < 0.45], np.arange(12, 21))
+
+
+def test_contrast_where_all_references_look_alike_is_zero_not_nan() -> None:
+    np.testing.assert_array_equal(enhance_contrast(np.full((4, 9), 0.1), 4), 0.0)
+
+
+def test_contrast_looks_at_valid_pairs_only() -> None:
+    distances = np.random.default_rng(0).random((12, 12))
+    valid = earlier(12, 2)
+    changed = np.where(valid, distances, 1e6)
+    np.testing.assert_allclose(enhance_contrast(changed, 6, valid), enhance_contrast(distances, 6, valid), atol=1e-12)
+    np.testing.assert_array_equal(np.isnan(enhance_contrast(distances, 6, valid)), ~valid)
+
+
+def test_contrast_without_any_valid_pair() -> None:
+    assert np.isnan(enhance_contrast(np.ones((3, 3)), 4, np.zeros((3, 3), bool))).all()
+
+
+def test_contrast_takes_a_query_of_many_like_places_down() -> None:
+    distances = noise_with_path(20, 20, [(i, i) for i in range(20)])
+    distances[7] += 5.0  # a query that is unlike everything, say at night
+    enhanced = enhance_contrast(distances, 10)
+    assert enhanced[7].mean() == pytest.approx(enhanced[6].mean(), abs=0.5)
+
+
+def test_costs_are_means_along_the_path() -> None:
+    distances = np.random.default_rng(1).random((9, 9))
+    settings = SequenceSettings(length=4, slowest=1.0, fastest=1.0, edges="drop")
+    costs = trajectory_costs(distances, settings)
+    assert costs[4, 3] == pytest.approx(np.mean([distances[4 + k, 3 + k] for k in range(-2, 3)]))
+    np.testing.assert_array_equal(np.isfinite(costs), np.pad(np.ones((5, 5), bool), 2))
+
+
+def test_short_trajectories_at_the_edges() -> None:
+    distances = np.random.default_rng(1).random((9, 9))
+    costs = trajectory_costs(distances, SequenceSettings(length=4, slowest=1.0, fastest=1.0))
+    assert costs[0, 0] == pytest.approx(np.mean([distances[k, k] for k in range(3)]))
+    assert costs[1, 5] == pytest.approx(np.mean([distances[1 + k, 5 + k] for k in range(-1, 3)]))
+    assert np.isnan(costs[0, 8])  # only one of five steps lies inside
+
+
+@pytest.mark.parametrize("velocity", [0.8, 1.0, 1.2])
+@pytest.mark.parametrize("anchor", ["centre", "start"])
+def test_a_drive_at_another_speed_is_found(velocity: float, anchor: str) -> None:
+    path = [(q, int(5 + velocity * q)) for q in range(30)]
+    costs = trajectory_costs(noise_with_path(30, 45, path), SequenceSettings(anchor=anchor, edges="drop"))
+    match, _ = best_matches(costs)
+    # From the start, half the length is added whatever the speed: one frame off at 0.8, and one by rounding.
+    off = np.abs(match[5:25] - [reference for _, reference in path[5:25]])
+    assert off.max() <= (1 if anchor == "centre" else 2)
+
+
+def test_a_drive_the_other_way_needs_both_directions() -> None:
+    distances = noise_with_path(30, 30, [(q, 29 - q) for q in range(30)])
+    for directions, found in (("forward", False), ("both", True)):
+        settings = SequenceSettings(directions=directions, edges="drop")
+        match, _ = best_matches(trajectory_costs(distances, settings))
+        assert np.all(match[5:25] == 29 - np.arange(5, 25)) == found
+
+
+def test_nan_is_outside() -> None:
+    distances = np.random.default_rng(2).random((15, 15))
+    distances[7, 7] = np.nan
+    settings = SequenceSettings(length=4, slowest=1.0, fastest=1.0, edges="drop")
+    costs = trajectory_costs(distances, settings)
+    assert np.isnan(costs[[5, 6, 7, 8, 9], [5, 6, 7, 8, 9]]).all()
+    assert np.isfinite(costs[[4, 10], [4, 10]]).all()
+
+
+def test_uniqueness() -> None:
+    costs = np.full((3, 20), 4.0)
+    costs[0, 5] = 1.0
+    costs[0, 10] = 2.0  # within the window of ten about 5: no rival
+    costs[1, [2, 12]] = 0.0
+    costs[2] = np.nan
+    match, ratio = best_matches(costs, window=10)
+    np.testing.assert_array_equal(match, [5, 2, -1])
+    np.testing.assert_array_equal(ratio, [0.25, 1.0, np.nan])
+
+
+def test_earlier_frames() -> None:
+    np.testing.assert_array_equal(np.argwhere(earlier(5, 2)), [[3, 0], [4, 0], [4, 1]])
+
+
+def two_laps() -> np.ndarray:
+    """Return scores (40, 40) of a sequence whose second half passes the first again; neighbours look alike too."""
+    scores = -noise_with_path(40, 40, [(q, q - 20) for q in range(20, 40)])
+    for gap in range(-3, 4):
+        near = np.arange(max(0, gap), min(40, 40 + gap))
+        scores[near, near - gap] = -0.1
+    return scores
+
+
+def test_one_sequence_never_matches_its_neighbours() -> None:
+    method = SeqSlam(Fixed(two_laps()), exclude_frames=5)
+    result = method.score(frames(40), None, [], silent)
+    assert not np.isfinite(result.scores[~earlier(40, 5)]).any()
+    best = np.argmax(np.nan_to_num(result.scores[20:], nan=-np.inf), axis=1)
+    assert np.mean(best == np.arange(20)) > 0.9
+    assert list(result.seconds) == ["fixed", "sequences"]
+    assert "as given" in result.notes
+
+
+def test_two_traverses_use_the_whole_matrix() -> None:
+    scores = -noise_with_path(30, 30, [(q, q) for q in range(30)])
+    noisy = scores + np.random.default_rng(9).normal(0, 0.3, scores.shape)
+    alone = np.argmax(noisy, axis=1) == np.arange(30)
+    result = SeqSlam(Fixed(noisy)).score(frames(30), frames(30), [], silent)
+    together = np.argmax(np.nan_to_num(result.scores, nan=-np.inf), axis=1) == np.arange(30)
+    assert together.mean() > 0.85 > 0.5 > alone.mean()  # what sequences are for
+
+
+def test_uniqueness_as_the_score() -> None:
+    result = SeqSlam(Fixed(two_laps()), exclude_frames=5, scored="uniqueness").score(frames(40), None, [], silent)
+    assert np.all(np.isfinite(result.scores).sum(axis=1) <= 1)
+    query, reference = np.argwhere(np.isfinite(result.scores)).T
+    second = query >= 20
+    assert np.mean(reference[second] == query[second] - 20) > 0.9
+    assert result.scores[query[second], reference[second]].min() > 0.3
+
+
+def test_uniqueness_of_scores_that_may_be_of_either_sign() -> None:
+    log_odds = 40.0 * (two_laps() + 1.0)
+    settings = SequenceSettings(contrast=0)
+    result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(
+        frames(40), None, [], silent
+    )
+    found = result.scores[np.isfinite(result.scores)]
+    assert len(found) > 20
+    assert np.all((found >= 0) & (found <= 1))
+
+
+def test_a_sequence_shorter_than_the_exclusion_has_no_scores() -> None:
+    for settings in (SequenceSettings(), SequenceSettings(contrast=0)):
+        for scored in ("cost", "uniqueness"):
+            method = SeqSlam(Fixed(np.zeros((4, 4))), settings, scored, exclude_frames=5)
+            assert np.isnan(method.score(frames(4), None, [], silent).scores).all()
+
+
+def test_the_command_line_builds_it() -> None:
+    method = make_method("seqslam:length=6,directions=both,width=32,patch=4", Setting(exclude_frames=7))
+    assert isinstance(method, SeqSlam)
+    assert (method.settings.length, method.settings.directions, method.exclude_frames) == (6, "both", 7)
+    assert method.name == "seqslam"
+    on_words = make_method("seqslam+bow:words=50")
+    assert isinstance(on_words, SeqSlam)
+    assert on_words.name == "seqslam+bow"
+    assert on_words.settings.contrast == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"directions": "backward"}, 'directions of SeqSLAM: "backward" is none of forward, both'),
+        ({"anchor": "end"}, "anchor of SeqSLAM"),
+        ({"edges": "pad"}, "edges of SeqSLAM"),
+        ({"length": 0}, "length >= 1"),
+        ({"slowest": 2.0}, "slowest <= fastest"),
+    ],
+)
+def test_settings_that_make_no_sense(settings: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        SequenceSettings(**settings)
+
+
+def test_an_unknown_score() -> None:
+    with pytest.raises(InputError, match='"cost" or "uniqueness", not "ratio"'):
+        SeqSlam(Fixed(np.eye(2)), scored="ratio")

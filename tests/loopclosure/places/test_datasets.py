@@ -1,0 +1,235 @@
+"""Data sets with their truth, on made-up files; on the real ones where they are at hand."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import scipy.io
+from scipy.spatial.transform import Rotation
+
+from loopclosure.errors import InputError
+from loopclosure.places.datasets import load_fabmap, load_folder, load_place_pairs, load_traverses, load_tum
+from loopclosure.places.frames import Selection
+from loopclosure.places.truth import Exclusion
+from paths import shared
+
+
+def write_images(folder: Path, names, width=8, height=6):
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, name in enumerate(names):
+        assert cv2.imwrite(str(folder / name), np.full((height, width, 3), number, np.uint8))
+    return folder
+
+
+@pytest.fixture
+def tum_folder(tmp_path):
+    """A camera that turns by 10 degrees each second for 72 s: two rounds on the spot."""
+    folder = write_images(tmp_path / "turn" / "rgb", [f"{i}.png" for i in range(72)]).parent
+    lines = [f"{i}.0 rgb/{i}.png" for i in range(72)] + ["100.0 rgb/0.png"]  # the last one has no pose
+    (folder / "rgb.txt").write_text("# made up\n" + "\n".join(lines) + "\n")
+    poses = []
+    for i in range(72):
+        x, y, z, w = Rotation.from_euler("y", 10 * i, degrees=True).as_quat()
+        poses.append(f"{i}.01 0 0 0 {x} {y} {z} {w}")
+    (folder / "groundtruth.txt").write_text("\n".join(poses) + "\n")
+    return folder
+
+
+def test_tum_truth_is_the_papers_rule(tum_folder):
+    data = load_tum(tum_folder)
+    assert len(data.query_images) == 72
+    assert data.reference_images is None
+    loops = {(int(i), int(j)) for i, j in np.argwhere(data.truth.hard & data.truth.judged)}
+    assert loops == {(i, j) for i in range(72) for j in range(72) if i - j in (35, 36, 37, 71)}
+    assert data.truth.judged[10, 0]
+    assert not data.truth.judged[9, 0]
+    assert data.exclude_frames == 9
+    assert "2 m" in data.truth.sentence
+    assert "less than 10 s apart" in data.truth.sentence
+    assert data.notes[0] == "frames without a pose, left out: 1"
+    assert data.notes[1].startswith("71 of 180 pairs")
+
+
+def test_tum_soft_truth_and_selection(tum_folder):
+    data = load_tum(tum_folder, Selection(stride=2), soft_angle_deg=25)
+    assert len(data.query_images) == 36
+    only_soft = {(int(i), int(j)) for i, j in np.argwhere(data.truth.soft & ~data.truth.hard & data.truth.judged)}
+    assert only_soft == {(i, j) for i in range(36) for j in range(36) if i - j in (17, 19, 35)}
+    assert "every 2nd" in data.name
+    with pytest.raises(InputError, match="narrower than hard truth"):
+        load_tum(tum_folder, soft_angle_deg=5)
+
+
+def test_tum_without_a_revisit_is_refused(tum_folder):
+    with pytest.raises(InputError, match="no judged pair shows the same place"):
+        load_tum(tum_folder, Selection(stop="40%"))
+
+
+@pytest.fixture
+def fabmap_folder(tmp_path):
+    """Twelve images, six places of a left and a right one; place 4 is place 0 again, seen by every camera."""
+    folder = write_images(tmp_path / "College", [f"{i + 1:04}.jpg" for i in range(12)])
+    truth = np.zeros((12, 12), np.uint8)
+    truth[8:10, 0:2] = 1
+    truth[10, 2] = 1  # place 5 is place 1 again, to the left camera alone
+    scipy.io.savemat(folder / "CollegeGroundTruth.mat", {"truth": truth})
+    (folder / "ImageCollectionCoordinates.txt").write_text(
+        "".join(f"{i + 1:04}.jpg {i // 2}.0 {10 + i // 2}.5\n" for i in range(12))
+    )
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("camera", "frames", "loops"),
+    [
+        ("left", ["0001", "0003", "0005", "0007", "0009", "0011"], {(4, 0), (5, 1)}),
+        ("right", ["0002", "0004", "0006", "0008", "0010", "0012"], {(4, 0)}),
+        ("both", [f"{i:04}" for i in range(1, 13)], {(8, 0), (9, 1), (10, 2)}),
+        ("joined", ["0001_0002", "0003_0004", "0005_0006", "0007_0008", "0009_0010", "0011_0012"], {(4, 0), (5, 1)}),
+    ],
+)
+def test_fabmap_cameras(fabmap_folder, tmp_path, camera, frames, loops):
+    data = load_fabmap(fabmap_folder, camera=camera, exclusion=Exclusion(frames=1), joined_folder=tmp_path / "joined")
+    assert [path.stem for path in data.query_images] == frames
+    assert {(int(i), int(j)) for i, j in np.argwhere(data.truth.hard & data.truth.judged)} == loops
+    assert data.positions is not None
+    assert data.positions.shape == (len(frames), 2)
+    np.testing.assert_allclose(data.positions[-1], [5.0, 15.5])
+    if camera == "joined":
+        assert cv2.imread(str(data.query_images[0])).shape == (6, 16, 3)
+    if camera == "both":
+        assert not data.truth.judged[9, 0]
+        assert "left with a right image" in data.notes[0]
+
+
+def test_fabmap_stride_and_limit_count_places(fabmap_folder):
+    data = load_fabmap(
+        fabmap_folder, camera="left", selection=Selection(stride=4, limit=2), exclusion=Exclusion(frames=0)
+    )
+    assert [path.stem for path in data.query_images] == ["0001", "0009"]
+    assert data.truth.positives == 1
+
+
+def test_fabmap_mask_of_places_for_images_of_both_cameras(fabmap_folder):
+    truth = np.zeros((6, 6), np.uint8)
+    truth[5, 2] = 1
+    np.save(fabmap_folder / "six.npy", truth)
+    data = load_fabmap(fabmap_folder, fabmap_folder / "six.npy", camera="right", exclusion=Exclusion(frames=1))
+    assert data.truth.hard[5, 2]
+    assert data.query_images[5].stem == "0012"
+
+
+def test_fabmap_faults(fabmap_folder, tmp_path):
+    with pytest.raises(InputError, match="unknown camera"):
+        load_fabmap(fabmap_folder, camera="front")
+    with pytest.raises(InputError, match="name a folder"):
+        load_fabmap(fabmap_folder, camera="joined")
+    np.save(tmp_path / "big.npy", np.eye(24, k=-20, dtype=np.uint8))
+    with pytest.raises(InputError, match="24 x 24, but there are 12 images; does the folder hold one camera's"):
+        load_fabmap(fabmap_folder, tmp_path / "big.npy")
+    (fabmap_folder / "ImageCollectionCoordinates.txt").write_text("1 2\n3 4\n")
+    with pytest.raises(InputError, match="has 2 rows, but there are 12 images"):
+        load_fabmap(fabmap_folder, camera="left", exclusion=Exclusion(frames=1))
+    (fabmap_folder / "CollegeGroundTruth.mat").unlink()
+    with pytest.raises(InputError, match="the mask of loops; name the file"):
+        load_fabmap(fabmap_folder)
+
+
+def test_folder_with_a_mask_in_natural_order(tmp_path):
+    folder = write_images(tmp_path / "walk", [f"{i + 1}.png" for i in range(12)])
+    truth = np.zeros((12, 12), np.uint8)
+    truth[11, 0], truth[10, 0] = 255, 128  # the grey one is soft
+    cv2.imwrite(str(tmp_path / "truth.bmp"), truth)
+    data = load_folder(folder, tmp_path / "truth.bmp", exclusion=Exclusion(frames=2))
+    assert [path.stem for path in data.query_images] == [str(i + 1) for i in range(12)]
+    assert np.argwhere(data.truth.hard).tolist() == [[11, 0]]
+    assert np.argwhere(data.truth.soft).tolist() == [[10, 0], [11, 0]]
+    assert "1 pairs that nearly show the same place are ignored" in data.truth.sentence
+
+
+def test_folder_masks_on_either_side_of_the_diagonal(tmp_path):
+    folder = write_images(tmp_path / "walk", [f"{i}.png" for i in range(6)])
+    lower = np.zeros((6, 6))
+    lower[5, 0] = 1
+    for matrix, notes in ((lower, 0), (lower + lower.T, 0), (lower.T, 1)):
+        np.savetxt(tmp_path / "truth.txt", matrix, fmt="%d")
+        data = load_folder(folder, tmp_path / "truth.txt", exclusion=Exclusion(frames=1))
+        assert np.argwhere(data.truth.hard).tolist() == [[5, 0]]
+        assert len(data.notes) == notes
+
+
+def test_folder_with_references(tmp_path):
+    queries = write_images(tmp_path / "night", ["a.png", "b.png"])
+    references = write_images(tmp_path / "day", ["a.png", "b.png", "c.png"])
+    np.save(tmp_path / "truth.npy", np.array([[1, 0, 0], [0, 0, 1]], bool))
+    data = load_folder(queries, tmp_path / "truth.npy", references)
+    assert data.reference_images is not None
+    assert data.truth.judged.all()
+    np.save(tmp_path / "turned.npy", np.ones((3, 2), bool))
+    with pytest.raises(InputError, match="2 queries and 3 references; transpose it"):
+        load_folder(queries, tmp_path / "turned.npy", references)
+
+
+def test_exclusion_that_takes_every_loop_is_refused(tmp_path):
+    folder = write_images(tmp_path / "walk", [f"{i}.png" for i in range(6)])
+    np.save(tmp_path / "truth.npy", np.eye(6, k=-3))
+    with pytest.raises(InputError, match=r"no judged pair shows the same place .*at most 3 frames apart excluded"):
+        load_folder(folder, tmp_path / "truth.npy", exclusion=Exclusion(frames=3))
+
+
+def test_traverses(tmp_path):
+    night = write_images(tmp_path / "night", [f"{i}.png" for i in range(10)])
+    day = write_images(tmp_path / "day", [f"{i}.png" for i in range(10)])
+    data = load_traverses(night, day, tolerance=2, soft_tolerance=4, selection=Selection(stride=2))
+    assert data.truth.hard.shape == (5, 5)
+    np.testing.assert_array_equal(data.truth.hard, np.abs(np.subtract.outer(np.arange(5), np.arange(5))) <= 1)
+    np.testing.assert_array_equal(data.truth.soft, np.abs(np.subtract.outer(np.arange(5), np.arange(5))) <= 2)
+    (day / "9.png").unlink()
+    with pytest.raises(InputError, match=r"10 queries .* 9 references"):
+        load_traverses(night, day)
+    with pytest.raises(InputError, match="0 <= tolerance <= soft"):
+        load_traverses(night, night, tolerance=2, soft_tolerance=1)
+
+
+def test_place_pairs(tmp_path):
+    write_images(tmp_path / "query", ["1.png", "2.png", "3.png"])
+    write_images(tmp_path / "ref", ["1.png", "2.png", "3.png"])
+    table = "place_id,query,ref,w\n7,query/1.png,ref/1.png,8\n8,query/2.png,ref/2.png,8\n7,query/3.png,ref/3.png,8\n"
+    (tmp_path / "pairs.csv").write_text(table)
+    data = load_place_pairs(tmp_path)
+    np.testing.assert_array_equal(data.truth.hard, [[1, 0, 1], [0, 1, 0], [1, 0, 1]])
+    (tmp_path / "ref" / "2.png").unlink()
+    with pytest.raises(InputError, match=r"pairs.csv:3:1: no such ref image"):
+        load_place_pairs(tmp_path)
+
+
+def test_new_college_mask():
+    from loopclosure.places.masks import read_truth_matrix
+
+    hard, soft = read_truth_matrix(shared("data/NewCollegeGroundTruth.mat"))
+    assert hard.shape == (2146, 2146)
+    assert int(hard.sum()) == 14832
+    assert int(hard.any(axis=1).sum()) == 853
+    assert np.array_equal(hard, soft)
+    assert not np.triu(hard).any()
+    rows, columns = np.nonzero(hard)
+    assert int((rows - columns).min()) == 142
+    assert int(hard[::2, ::2].sum()) == 3541
+    assert int(hard[1::2, 1::2].sum()) == 3543
+
+
+def test_corridor_loop():
+    folder = shared("data/corridor_loop")
+    data = load_folder(folder / "samples", folder / "samples_GT.bmp")
+    assert len(data.query_images) == 84
+    assert data.query_images[9].name == "10.jpg"
+    assert data.truth.positives == 228
+    assert int(data.truth.queries_with_a_loop.sum()) == 44
+    assert data.name == "corridor_loop/samples"
+
+
+def test_tum_fr1():
+    data = load_tum(shared("data/tum_fr1/rgbd_dataset_freiburg1_rpy"))
+    assert len(data.query_images) == 721
+    assert data.truth.positives > 0

@@ -1,0 +1,90 @@
+"""Masks and coordinates in every form they come in, and what is said of broken ones."""
+
+import cv2
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse
+
+from loopclosure.errors import InputError
+from loopclosure.places.masks import read_coordinates, read_place_pairs, read_truth_matrix
+
+MASK = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0]], np.uint8)
+
+
+def write(path, matrix):
+    if path.suffix == ".mat":
+        scipy.io.savemat(path, {"something": np.eye(2), "GT": matrix})
+    elif path.suffix == ".npy":
+        np.save(path, matrix)
+    elif path.suffix == ".txt":
+        np.savetxt(path, matrix, fmt="%d")
+    elif path.suffix == ".csv":
+        np.savetxt(path, matrix, fmt="%d", delimiter=",", header="a mask")
+    else:
+        cv2.imwrite(str(path), matrix * 255)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".npy", ".txt", ".csv", ".bmp", ".png"])
+def test_every_form(tmp_path, suffix):
+    hard, soft = read_truth_matrix(write(tmp_path / f"mask{suffix}", MASK))
+    np.testing.assert_array_equal(hard, MASK == 1)
+    np.testing.assert_array_equal(soft, hard)
+
+
+def test_sparse_and_bool_masks(tmp_path):
+    scipy.io.savemat(tmp_path / "sparse.mat", {"truth": scipy.sparse.csc_matrix(MASK.astype(float))})
+    np.testing.assert_array_equal(read_truth_matrix(tmp_path / "sparse.mat")[0], MASK == 1)
+    np.save(tmp_path / "bool.npy", MASK == 1)
+    np.testing.assert_array_equal(read_truth_matrix(tmp_path / "bool.npy")[0], MASK == 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("x.txt", "0 0\n1\n", r"x.txt:2:1: has 1 numbers, the rows above have 2"),
+        ("x.txt", "0 one\n", r"x.txt:1:1: expected numbers"),
+        ("x.txt", "# nothing\n", "is empty"),
+        ("x.txt", "0 7\n0 0\n", "largest entry is 7"),
+        ("x.txt", "0 -1\n1 0\n", "negative or not finite"),
+        ("x.txt", "0 0\n0 0\n", "largest entry is 0"),
+        ("x.jpg", "", "a JPEG has lost the exact values"),
+        ("x.npy", "no array", "cannot be read as .npy"),
+        ("x.mat", "no matlab", "cannot be read as .mat"),
+        ("x.png", "no image", "is not an image"),
+    ],
+)
+def test_broken_masks(tmp_path, name, content, sentence):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=sentence):
+        read_truth_matrix(tmp_path / name)
+
+
+def test_mat_without_the_variable_lists_what_it_has(tmp_path):
+    scipy.io.savemat(tmp_path / "x.mat", {"alpha": np.eye(2), "beta": np.eye(3)})
+    with pytest.raises(InputError, match=r'no variable "truth".*alpha 2x2, beta 3x3'):
+        read_truth_matrix(tmp_path / "x.mat")
+    with pytest.raises(InputError, match="no such file"):
+        read_truth_matrix(tmp_path / "absent.mat")
+
+
+def test_coordinates(tmp_path):
+    expected = [[1.5, 2.0], [3.0, -4.0]]
+    scipy.io.savemat(tmp_path / "a.mat", {"GPS": np.array(expected)})
+    (tmp_path / "b.txt").write_text("0001.jpg 1.5 2\n0002.jpg 3 -4\n")
+    (tmp_path / "c.txt").write_text("1.5, 2\n3, -4\n")
+    for name in ("a.mat", "b.txt", "c.txt"):
+        np.testing.assert_allclose(read_coordinates(tmp_path / name), expected)
+    np.save(tmp_path / "d.npy", np.zeros((2, 5)))
+    with pytest.raises(InputError, match="expected x and y"):
+        read_coordinates(tmp_path / "d.npy")
+
+
+def test_place_pairs_need_their_columns(tmp_path):
+    (tmp_path / "pairs.csv").write_text("place,query,ref\n")
+    with pytest.raises(InputError, match=r"pairs.csv:1:1: has no column place_id"):
+        read_place_pairs(tmp_path / "pairs.csv")
+    (tmp_path / "pairs.csv").write_text("place_id,query,ref\n")
+    with pytest.raises(InputError, match="has no row"):
+        read_place_pairs(tmp_path / "pairs.csv")

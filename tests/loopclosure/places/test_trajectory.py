@@ -1,0 +1,141 @@
+"""TUM RGB-D files: what they hold, and what a broken line says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopclosure.errors import InputError
+from loopclosure.places.trajectory import (
+    Frame,
+    Trajectory,
+    associate,
+    quaternions_from_matrices,
+    read_groundtruth,
+    read_rgb_list,
+    read_tum_sequence,
+    rotation_matrices,
+    write_groundtruth,
+    write_rgb_list,
+)
+from paths import shared
+
+GOOD_POSE = "1.5 0.1 0.2 0.3 0 0 0 1"
+
+
+def trajectory_at(*stamps: float) -> Trajectory:
+    count = len(stamps)
+    return Trajectory(np.array(stamps), np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_groundtruth_is_sorted_and_its_quaternions_are_normalised(tmp_path: Path) -> None:
+    path = write(tmp_path / "groundtruth.txt", "# comment\n\n2 1 2 3 0.7071 0 0 0.7071\n1 4 5 6 0 0 0.9998 0\n")
+    trajectory = read_groundtruth(path)
+    assert trajectory.stamps.tolist() == [1, 2]
+    assert trajectory.positions.tolist() == [[4, 5, 6], [1, 2, 3]]
+    np.testing.assert_allclose(trajectory.quaternions, [[0, 0, 1, 0], [0.5**0.5, 0, 0, 0.5**0.5]], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("line", "column", "words"),
+    [
+        ("1.5 0.1 0.2 0.3 0 0 0", 22, "expected the eight numbers"),
+        ("1.5 0.1 0.2 0.3 0 0 0 1 9", 25, "found 9"),
+        ("1.5 0.1 zwei 0.3 0 0 0 1", 9, 'expected a number for ty, found "zwei"'),
+        ("1.5 0.1 nan 0.3 0 0 0 1", 9, 'expected a number for ty, found "nan"'),
+        ("1.5 0.1 0.2 0.3 0 0 0 0", 17, "length 0, a rotation has length 1"),
+        ("1.5 0.1 0.2 0.3 90 0 0 1", 17, "length 90"),
+    ],
+)
+def test_a_broken_line_of_groundtruth_is_named_with_its_column(
+    tmp_path: Path, line: str, column: int, words: str
+) -> None:
+    path = write(tmp_path / "groundtruth.txt", f"# head\n{GOOD_POSE}\n{line}\n")
+    with pytest.raises(InputError) as caught:
+        read_groundtruth(path)
+    assert str(caught.value).startswith(f"{path}:3:{column}: ")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_broken_line_of_rgb_txt_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "rgb.txt", "1.0 rgb/a b.png\n")
+    with pytest.raises(InputError, match=r"rgb\.txt:1:11: expected \"timestamp filename\", found 3 fields"):
+        read_rgb_list(path)
+    write(path, "now rgb/a.png\n")
+    with pytest.raises(InputError, match=r"rgb\.txt:1:1: expected a number for the timestamp"):
+        read_rgb_list(path)
+
+
+def test_missing_empty_and_binary_files_are_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        read_tum_sequence(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"rgb\.txt: cannot be read \(No such file"):
+        read_tum_sequence(tmp_path)
+    write(tmp_path / "rgb.txt", "# nothing\n")
+    with pytest.raises(InputError, match=r"rgb\.txt: lists no image"):
+        read_tum_sequence(tmp_path)
+    write(tmp_path / "rgb.txt", "1.5 rgb/a.png\n")
+    (tmp_path / "groundtruth.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"groundtruth\.txt: is not a text file"):
+        read_tum_sequence(tmp_path)
+    write(tmp_path / "groundtruth.txt", "")
+    with pytest.raises(InputError, match=r"groundtruth\.txt: holds no pose"):
+        read_tum_sequence(tmp_path)
+
+
+def test_associate_takes_the_nearest_pose_within_the_limit() -> None:
+    trajectory = trajectory_at(1.0, 2.0, 3.0)
+    frames = np.array([0.5, 0.98, 1.02, 1.51, 2.49, 3.0, 3.03, 3.2])
+    assert associate(frames, trajectory, 0.05).tolist() == [-1, 0, 0, -1, -1, 2, 2, -1]
+    assert associate(frames, trajectory, 1.0).tolist() == [0, 0, 0, 1, 1, 2, 2, 2]
+
+
+def test_frames_without_a_pose_are_counted_and_left_out(tmp_path: Path) -> None:
+    write_rgb_list(tmp_path / "rgb.txt", [Frame(stamp, f"rgb/{stamp:g}.png") for stamp in (1.0, 1.01, 5.0, 2.0)])
+    write_groundtruth(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
+    sequence = read_tum_sequence(tmp_path)
+    assert sequence.name == tmp_path.name
+    assert [frame.path for frame in sequence.frames] == ["rgb/1.png", "rgb/1.01.png", "rgb/2.png"]
+    assert sequence.stamps.tolist() == [1.0, 1.01, 2.0]
+    assert sequence.dropped == 1
+    assert len(sequence.poses[np.array([0, 2])]) == 2
+
+
+def test_no_frame_with_a_pose_at_all_says_both_time_spans(tmp_path: Path) -> None:
+    write_rgb_list(tmp_path / "rgb.txt", [Frame(100.0, "rgb/a.png")])
+    write_groundtruth(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
+    with pytest.raises(InputError, match=r"images from 100\.000 to 100\.000 s, poses from 1\.000 to 2\.000 s"):
+        read_tum_sequence(tmp_path)
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    quaternions = rng.normal(size=(20, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    written = Trajectory(1e9 + np.arange(20) / 97, rng.normal(size=(20, 3)), quaternions)
+    write_groundtruth(tmp_path / "groundtruth.txt", written)
+    back = read_groundtruth(tmp_path / "groundtruth.txt")
+    np.testing.assert_allclose(back.stamps, written.stamps, atol=1e-6)
+    np.testing.assert_allclose(back.positions, written.positions, atol=1e-6)
+    np.testing.assert_allclose(back.quaternions, written.quaternions, atol=2e-6)
+
+
+def test_rotation_matrices_and_quaternions_agree() -> None:
+    turn_left = np.array([[0, 0, 0.5**0.5, 0.5**0.5]])  # by 90 degrees about z
+    matrix = rotation_matrices(turn_left)
+    np.testing.assert_allclose(matrix[0] @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(quaternions_from_matrices(matrix), turn_left, atol=1e-15)
+
+
+@pytest.mark.parametrize(("name", "posed", "listed"), [("xyz", 796, 798), ("rpy", 721, 723)])
+def test_tum_fr1_has_the_poses_its_readme_counts(name: str, posed: int, listed: int) -> None:
+    folder = shared("data", "tum_fr1", f"rgbd_dataset_freiburg1_{name}")
+    sequence = read_tum_sequence(folder, max_difference=0.03)
+    assert (len(sequence), len(sequence) + sequence.dropped) == (posed, listed)
+    np.testing.assert_allclose(np.linalg.norm(sequence.quaternions, axis=1), 1, atol=1e-12)

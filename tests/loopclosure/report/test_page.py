@@ -1,0 +1,176 @@
+"""The report: self-contained, the same in every form, and it says what it is judged by."""
+
+import csv
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from loopclosure.evaluate import evaluate, named_method
+from loopclosure.methods.base import MethodResult, Setting
+from loopclosure.places.datasets import load_traverses, load_tum
+from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
+from loopclosure.report.figures import best_true_references, decisions
+from loopclosure.report.files import figures_text
+from loopclosure.report.page import write_report
+
+
+class Says:
+    """A method that returns given scores."""
+
+    name = "says"
+
+    def __init__(self, scores):
+        self.scores = scores
+
+    def score(self, query_images, reference_images, train_images, progress):
+        return MethodResult(self.scores, {"vocabulary": 3.0, "looking": 0.4}, ["a <note>"], ("vocabulary",))
+
+
+@pytest.fixture(scope="module")
+def evaluation(two_laps, two_laps_features):
+    rng = np.random.default_rng(0)
+    methods = [
+        named_method(f"A net & more=features:{two_laps_features}", Setting()),
+        ("<noise>", Says(rng.normal(size=(40, 40)))),
+        ("silent", Says(np.full((40, 40), np.nan))),
+    ]
+    return evaluate(load_tum(two_laps), methods, train="nothing")
+
+
+@pytest.fixture(scope="module")
+def folder(evaluation, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report") / "made" / "here"
+    assert write_report(evaluation, folder, "A title", "loopclosure evaluate --x") == folder / "report.html"
+    return folder
+
+
+def rows(path):
+    with path.open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_the_page_stands_alone_and_says_what_it_judges_by(evaluation, folder):
+    page = (folder / "report.html").read_text()
+    assert set(re.findall(r'(?:src|href)="([^:]*:)', page)) == {"data:"}
+    assert "http" not in page
+    assert page.count("less than 10 s apart excluded") >= 2
+    for words in (ALL_PAIRS, BEST_MATCH, "A net &amp; more", "&lt;noise&gt;", "a &lt;note&gt;", "A title"):
+        assert words in page
+    assert "<noise>" not in page
+    assert "loopclosure evaluate --x" in page
+
+
+def test_pictures_are_written_and_in_the_page(folder):
+    page = (folder / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4
+    for name in ("precision_recall", "matrices", "matches", "map"):
+        image = cv2.imread(str(folder / f"{name}.png"))
+        assert image.shape[0] > 300
+        assert image.std() > 5
+
+
+def test_pairs_are_shown_for_each_method(folder):
+    page = (folder / "report.html").read_text()
+    sections = page[page.index("<h2>Pairs</h2>") : page.index("<h2>Settings</h2>")].split("<h3>")[1:]
+    net, noise, silent = sections
+    assert net.count('class="pair found"') == 4
+    assert "surest wrong" in net
+    assert noise.count('class="pair false"') == 4
+    assert silent.count("surest right: none") == 1
+    assert silent.count("no score") >= 4
+
+
+def test_figures_are_the_same_in_csv_json_and_text(evaluation, folder):
+    outcome = evaluation.outcomes[1]
+    summary = json.loads((folder / "report.json").read_text())
+    of_json = summary["methods"][1]["figures"]
+    table = rows(folder / "figures.csv")
+    for curve in (outcome.pairs, outcome.best):
+        expected = curve.average_precision
+        assert of_json[curve.convention]["average precision"] == pytest.approx(expected, abs=1e-6)
+        (cell,) = (
+            row
+            for row in table
+            if (row["method"], row["convention"], row["figure"]) == ("<noise>", curve.convention, "average precision")
+        )
+        assert float(cell["value"]) == pytest.approx(expected, abs=1e-6)
+        assert "less than 10 s apart excluded" in cell["truth and exclusion"]
+        assert f"{expected:.3f}" in figures_text(evaluation)
+    assert summary["truth_and_exclusion"] == evaluation.data.truth.sentence
+    assert summary["true_pairs"] == evaluation.data.truth.positives
+    assert summary["queries_with_a_loop"] == 20
+
+
+def test_times_leave_training_out_of_a_frame(folder):
+    table = {(row["method"], row["stage"]): row for row in rows(folder / "times.csv")}
+    assert table["<noise>", "vocabulary"]["milliseconds a frame"] == ""
+    assert float(table["<noise>", "looking"]["milliseconds a frame"]) == pytest.approx(10.0)
+    assert float(table["A net & more", "features"]["milliseconds a frame"]) == pytest.approx(4.0)
+
+
+def test_curves_hold_all_that_average_precision_needs(evaluation, folder):
+    for slug, outcome in (("a_net_more", evaluation.outcomes[0]), ("noise", evaluation.outcomes[1])):
+        table = rows(folder / f"curve_{slug}.csv")
+        for curve in (outcome.pairs, outcome.best):
+            points = [r for r in table if r["convention"] == curve.convention]
+            recall = np.array([float(r["recall"]) for r in points])
+            precision = np.array([float(r["precision"]) for r in points])
+            area = float(np.sum(np.diff(recall, prepend=0.0) * precision))
+            assert area == pytest.approx(curve.average_precision, abs=1e-6)
+
+
+def test_matches_name_their_images(folder):
+    table = rows(folder / "matches_a_net_more.csv")
+    by_query = {int(row["query"]): row for row in table}
+    assert by_query[25]["reference"] == "5"
+    assert by_query[25]["verdict"] == "right"
+    assert by_query[25]["reference image"].endswith("5.png")
+    assert by_query[15]["query has a loop"] == "0"
+    assert rows(folder / "matches_silent.csv") == []
+
+
+def test_the_same_evaluation_gives_the_same_bytes(evaluation, folder, tmp_path):
+    write_report(evaluation, tmp_path, "A title", "loopclosure evaluate --x")
+    for path in folder.iterdir():
+        assert (tmp_path / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_decisions_at_the_best_f1(evaluation):
+    truth = evaluation.data.truth
+    found, false, missed = decisions(evaluation.outcomes[0], truth)
+    assert found.tolist() == list(range(20, 40))
+    assert false.tolist() == []
+    assert missed.tolist() == []
+    assert best_true_references(evaluation.outcomes[0], truth, found).tolist() == list(range(20))
+    _, false, missed = decisions(evaluation.outcomes[2], truth)
+    assert false.tolist() == []
+    assert missed.tolist() == list(range(20, 40))
+
+
+def test_two_traverses_without_positions(tmp_path):
+    for folder in ("night", "day"):
+        (tmp_path / folder).mkdir()
+        for i in range(6):
+            cv2.imwrite(str(tmp_path / folder / f"{i}.png"), np.full((30 + i, 40, 3), 40 * i, np.uint8))
+    data = load_traverses(tmp_path / "night", tmp_path / "day", soft_tolerance=1)
+    evaluation = evaluate(data, [("one", Says(-np.abs(np.subtract.outer(np.arange(6.0), np.arange(6.0)))))])
+    page = write_report(evaluation, tmp_path / "out").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert not (tmp_path / "out" / "map.png").exists()
+    assert "6 queries, 6 references" in page
+    assert "10 pairs that nearly show the same place are ignored when found" in page
+
+
+def test_large_matrices_are_drawn_without_losing_loops():
+    from loopclosure.report.figures import _greatest_of_blocks
+
+    values = np.zeros((1001, 900))
+    values[700, 333] = 1.0
+    values[5, :] = np.nan
+    small = _greatest_of_blocks(values, 3)
+    assert small.shape == (334, 300)
+    assert np.argwhere(small == 1.0).tolist() == [[233, 111]]
+    assert not np.isnan(small).any()

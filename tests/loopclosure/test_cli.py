@@ -1,0 +1,197 @@
+"""The commands as a user calls them: what they write, and one line for what is wrong."""
+
+import csv
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from loopclosure.cli import main
+from paths import ROOT
+
+
+def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
+    code = main(
+        [
+            "evaluate",
+            "--tum",
+            str(two_laps),
+            "--method",
+            "thumbnails",
+            "--method",
+            f"net=features:{two_laps_features}",
+            "--soft-distance",
+            "3",
+            "--soft-angle",
+            "30",
+            "--out",
+            str(tmp_path / "r"),
+            "--title",
+            "Round trip",
+        ]
+    )
+    printed = capsys.readouterr().out
+    assert code == 0
+    assert "thumbnails" in printed
+    assert "less than 10 s apart excluded" in printed
+    assert f"report: {tmp_path / 'r' / 'report.html'}" in printed
+    summary = json.loads((tmp_path / "r" / "report.json").read_text())
+    assert [m["name"] for m in summary["methods"]] == ["thumbnails", "net"]
+    assert summary["command"].startswith("loopclosure evaluate --tum")
+
+
+def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
+    code = main(
+        [
+            "evaluate",
+            "--tum",
+            str(two_laps),
+            "--start",
+            "20",
+            "--exclude-seconds",
+            "0",
+            "--max-angle",
+            "19",
+            "--train",
+            str(two_laps),
+            "--train-stop",
+            "50%",
+            "--train-stride",
+            "2",
+            "--method",
+            "bow:words=20",
+            "--out",
+            str(tmp_path),
+        ]
+    )
+    assert code == 0
+    summary = json.loads((tmp_path / "report.json").read_text())
+    assert summary["training"] == "10 images of two_laps"
+    assert "vocabulary" not in summary["methods"][0]["milliseconds_a_frame"]
+
+
+def test_the_door(two_laps, two_laps_features, tmp_path):
+    done = subprocess.run(
+        [
+            sys.executable,
+            ROOT / "tools" / "evaluate_loops.py",
+            "--tum",
+            two_laps,
+            "--out",
+            tmp_path,
+            "--method",
+            f"features:{two_laps_features}",
+        ],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "report.html").is_file()
+
+
+def test_detect_writes_loops_and_a_pose_graph(two_laps, tmp_path, capsys):
+    code = main(
+        [
+            "detect",
+            str(two_laps),
+            "--metric",
+            "cosine",
+            "--threshold",
+            "0.9",
+            "--exclude-recent",
+            "10",
+            "--consistency",
+            "2",
+            "--out",
+            str(tmp_path),
+        ]
+    )
+    assert code == 0
+    with (tmp_path / "loops.csv").open() as stream:
+        loops = list(csv.DictReader(stream))
+    assert [(int(r["query_id"]), int(r["match_id"])) for r in loops] == [(i, i - 20) for i in range(22, 40)]
+    assert loops[0]["query_name"] == "rgb/22.png"
+    assert (tmp_path / "loops.g2o").read_text().count("EDGE_SE3:QUAT") == 39 + 18
+    assert "18 loops in 40 frames" in capsys.readouterr().out
+
+
+def test_detect_calibrates_saves_and_resumes(two_laps, two_laps_features, tmp_path, capsys):
+    features = ["--features", str(two_laps_features)]
+    code = main(
+        [
+            "detect",
+            str(two_laps),
+            "--stop",
+            "30",
+            "--calibrate",
+            str(two_laps),
+            "--exclude-recent",
+            "10",
+            *features,
+            "--calibrate-features",
+            str(two_laps_features),
+            "--save",
+            str(tmp_path / "d.npz"),
+            "--out",
+            str(tmp_path),
+        ]
+    )
+    assert code == 0
+    assert "10 loops in 30 frames" in capsys.readouterr().out
+    again = ["detect", str(two_laps), "--start", "30", "--resume", str(tmp_path / "d.npz"), *features]
+    assert main([*again, "--out", str(tmp_path)]) == 0
+    assert "10 loops in 10 frames" in capsys.readouterr().out
+    with (tmp_path / "loops.csv").open() as stream:
+        assert [int(row["query_id"]) for row in csv.DictReader(stream)] == list(range(20, 40))
+
+
+def test_similarity(two_laps_features, tmp_path, capsys):
+    assert main(["similarity", str(two_laps_features), "--out", str(tmp_path / "s.npy")]) == 0
+    matrix = np.load(tmp_path / "s.npy")
+    assert matrix.shape == (40, 40)
+    assert matrix[25, 5] > -0.2 > matrix[25, 6]
+    out = ["--top-k", "1", "--exclude-seconds", "10", "--out", str(tmp_path / "top.csv")]
+    assert main(["similarity", str(two_laps_features), *out]) == 0
+    with (tmp_path / "top.csv").open() as stream:
+        best = {int(row["query"]): int(row["reference"]) for row in csv.DictReader(stream)}
+    assert 9 not in best
+    assert all(best[i] == i - 20 for i in range(20, 40))
+    assert "pairs less than 10 s apart excluded" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("evaluate --tum NOWHERE --method thumbnails --out OUT", "NOWHERE: no such folder"),
+        ("evaluate --tum LAPS --method magic --out OUT", 'unknown method "magic"'),
+        ("evaluate --tum LAPS --camera left --method thumbnails --out OUT", "--camera means nothing to --tum"),
+        ("evaluate --tum LAPS --start 50% --method thumbnails --out OUT", "no judged pair shows the same place"),
+        ("evaluate --images LAPS --method thumbnails --out OUT", "--images needs --truth"),
+        ("evaluate --tum LAPS --method bow --train LAPS --out OUT", "test images are training images"),
+        ("evaluate --tum LAPS --method features:NOWHERE.npz --out OUT", "NOWHERE.npz: no such file"),
+        ("detect NOWHERE --threshold 1 --out OUT", "cannot be read"),
+        ("detect LAPS --threshold 1 --describe nothing --out OUT", "expected module:function"),
+        ("detect LAPS --threshold 1 --with width --out OUT", "expected KEY=VALUE"),
+        ("detect LAPS --resume OUT --metric cosine --out OUT", "leave out others"),
+        ("similarity NOWHERE.npz --out OUT", "no such file"),
+        ("similarity FEATURES --exclude-frames 3 --out OUT", "belongs to --top-k"),
+        ("similarity FEATURES --out OUT/no/folder.npy", "cannot be written"),
+    ],
+)
+def test_a_fault_is_one_line_and_status_1(words, sentence, two_laps, two_laps_features, tmp_path, capsys):
+    names = {"LAPS": two_laps, "OUT": tmp_path / "out", "FEATURES": two_laps_features}
+    arguments = [next((w.replace(k, str(v)) for k, v in names.items() if w.startswith(k)), w) for w in words.split()]
+    assert main(arguments) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert sentence in line
+
+
+@pytest.mark.parametrize("words", [[], ["evaluate"], ["detect", "x", "--out", "y"], ["evaluate", "--camera", "front"]])
+def test_wrong_usage_is_status_2(words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 2

@@ -1,0 +1,361 @@
+"""FAB-MAP against a compiled openFABMAP (the worked examples) and against itself (versions, online and offline)."""
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from loopclosure.errors import InputError
+from loopclosure.words.chow_liu import WordTree, learn_tree
+from loopclosure.words.fabmap import (
+    FabMap,
+    FabMapModel,
+    FabMapSettings,
+    Location,
+    mean_field_table,
+    place_table,
+    score_sequence,
+    score_sets,
+)
+
+
+def rows(text: str) -> np.ndarray:
+    return np.array([[int(digit) for digit in row] for row in text.split()])
+
+
+TRAIN_A = rows("11001 11000 11100 00110 00111 00100 10001 01010 00010 11001")
+PLACES_A = rows("11001 00110 10010")
+QUERY_A = rows("11000")[0]
+TRAIN_B = rows(
+    "111001 111111 100001 000110 101001 101000 111111 111111 000001 001001 111101 011000 011111 011001 011000 111001"
+)
+PLACES_B = rows("101001 010110 111000 000100")
+
+MEAN_FIELD = FabMapSettings(version=1, new_place="mean_field")
+ALL_SAMPLES = FabMapSettings(version=1, samples=0)
+
+
+def located(training: np.ndarray, places: np.ndarray, query: np.ndarray, settings: FabMapSettings) -> Location:
+    fabmap = FabMap(learn_tree(training), training, settings)
+    for place in places:
+        fabmap.add(place)
+    return fabmap.locate(query)
+
+
+def with_(settings: FabMapSettings, **changes: object) -> FabMapSettings:
+    return FabMapSettings(**{**settings.__dict__, **changes})
+
+
+def made_up_walk(images: int = 60, words: int = 80, seed: int = 0) -> tuple[WordTree, np.ndarray, np.ndarray]:
+    """Return the tree and words of a training walk, and the words of another one that passes its places twice."""
+    rng = np.random.default_rng(seed)
+    common = rng.random(words) * 0.3
+    training = rng.random((50, words)) < common
+    training[:, 1::2] |= training[:, ::2] & (rng.random((50, words // 2)) < 0.6)
+    lap = rng.random((images // 2, words)) < common
+    again = lap ^ (rng.random(lap.shape) < 0.03)
+    walk = np.concatenate([lap, again])
+    walk[7] = False  # an image without a single feature
+    return learn_tree(training), training, walk
+
+
+def test_table_of_example_b() -> None:
+    table = place_table(learn_tree(TRAIN_B), FabMapSettings()).reshape(6, 8)
+    np.testing.assert_allclose(
+        table[:2],
+        [
+            [0.911314161, 0.806296331, 0.088685839, 0.193703669, 0.797660032, 0.558058031, 0.202339968, 0.441941969],
+            [0.859894107, 0.674540418, 0.140105893, 0.325459582, 0.720609166, 0.350987868, 0.279390834, 0.649012132],
+        ],
+        atol=1e-9,
+    )
+
+
+@pytest.mark.parametrize("naive", [False, True])
+@pytest.mark.parametrize("false_alarm", [0.0, 0.005])
+def test_tables_are_probabilities(naive: bool, false_alarm: float) -> None:
+    settings = FabMapSettings(naive=naive, false_alarm=false_alarm)
+    tree = learn_tree(TRAIN_B)
+    np.testing.assert_allclose(place_table(tree, settings).sum(axis=2), 1.0, atol=1e-12)
+    np.testing.assert_allclose(mean_field_table(tree, settings).sum(axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("settings", "loglik", "loglik_new", "posterior"),
+    [
+        (
+            MEAN_FIELD,
+            [-2.225868004, -3.640167196, -2.508375798],
+            -3.023812125,
+            [0.184644406, 0.407037296, 0.100841365, 0.307476932],
+        ),
+        (
+            ALL_SAMPLES,
+            [-2.225868004, -3.640167196, -2.508375798],
+            -2.482579624,
+            [0.278924403, 0.359826167, 0.089364532, 0.271884898],
+        ),
+        (
+            FabMapSettings(version=2),
+            [1.246248452, -0.168050741, 0.963740657],
+            0.989536831,
+            [0.278924403, 0.359826167, 0.089364532, 0.271884898],
+        ),
+        (
+            with_(MEAN_FIELD, naive=True),
+            [-2.618275313, -4.933251681, -3.588805814],
+            -3.781093588,
+            [0.175368106, 0.555494020, 0.057118400, 0.212019473],
+        ),
+        (
+            with_(MEAN_FIELD, false_alarm=0.005),
+            [-2.226928171, -3.576031702, -2.486857249],
+            -2.994656026,
+            None,
+        ),
+        (
+            with_(ALL_SAMPLES, false_alarm=0.005),
+            [-2.226928171, -3.576031702, -2.486857249],
+            -2.488023845,
+            [0.274746820, 0.355972170, 0.094216402, 0.275064608],
+        ),
+    ],
+)
+def test_example_a(
+    settings: FabMapSettings, loglik: list[float], loglik_new: float, posterior: list[float] | None
+) -> None:
+    location = located(TRAIN_A, PLACES_A, QUERY_A, settings)
+    np.testing.assert_allclose(location.loglik, loglik, atol=1e-8)
+    assert location.loglik_new == pytest.approx(loglik_new, abs=1e-8)
+    if posterior is not None:
+        np.testing.assert_allclose([location.new, *location.places], posterior, atol=1e-8)
+
+
+def test_motion_model_of_example_a() -> None:
+    fabmap = FabMap(learn_tree(TRAIN_A), None, with_(MEAN_FIELD, motion=True))
+    expected = [
+        [1.0],
+        [0.735863694, 0.264136306],
+        [0.274942451, 0.111831447, 0.613226101],
+        [0.179924886, 0.563385570, 0.034151477, 0.222538067],
+        [0.261208680, 0.037565051, 0.539892087, 0.067428700, 0.093905482],
+    ]
+    for words, posterior in zip(rows("11001 00110 10010 11001 00110"), expected, strict=True):
+        location = fabmap.add(words)
+        np.testing.assert_allclose([location.new, *location.places], posterior, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("query", "false_alarm", "loglik", "mean_field", "sampled", "posterior"),
+    [
+        (
+            "101001",
+            0.0,
+            [-3.578212823, -5.751166035, -4.200327281, -5.563622487],
+            -4.754961862,
+            -4.237542590,
+            [0.224120534, 0.431469166, 0.050891167, 0.232542561, 0.060976572],
+        ),
+        (
+            "001110",
+            0.0,
+            [-7.153728089, -4.848873892, -7.707827001, -5.709479320],
+            -6.425613528,
+            -5.694138786,
+            [0.213574711, 0.051155507, 0.494671721, 0.030244252, 0.210353810],
+        ),
+        (
+            "101001",
+            0.005,
+            [-3.602161932, -5.696299984, -4.201771236, -5.514348257],
+            -4.740085907,
+            -4.241530121,
+            [0.224504996, 0.423709946, 0.053944700, 0.233529766, 0.064310592],
+        ),
+        (
+            "001110",
+            0.005,
+            [-6.935780247, -4.882726764, -7.466698597, -5.556951677],
+            -6.300240683,
+            -5.690150970,
+            [0.206478531, 0.060840695, 0.460466485, 0.036602134, 0.235612154],
+        ),
+    ],
+)
+def test_example_b(
+    query: str, false_alarm: float, loglik: list[float], mean_field: float, sampled: float, posterior: list[float]
+) -> None:
+    words = rows(query)[0]
+    averaged = located(TRAIN_B, PLACES_B, words, with_(MEAN_FIELD, false_alarm=false_alarm))
+    np.testing.assert_allclose(averaged.loglik, loglik, atol=1e-8)
+    assert averaged.loglik_new == pytest.approx(mean_field, abs=1e-8)
+    drawn = located(TRAIN_B, PLACES_B, words, with_(ALL_SAMPLES, false_alarm=false_alarm))
+    assert drawn.loglik_new == pytest.approx(sampled, abs=1e-8)
+    indexed = located(TRAIN_B, PLACES_B, words, FabMapSettings(false_alarm=false_alarm))
+    for location in (drawn, indexed):
+        np.testing.assert_allclose([location.new, *location.places], posterior, atol=1e-8)
+
+
+def test_naive_example_b() -> None:
+    location = located(TRAIN_B, PLACES_B, rows("101001")[0], with_(MEAN_FIELD, naive=True))
+    np.testing.assert_allclose(location.loglik, [-3.243459289, -5.910107902, -3.965532704, -5.228868953], atol=1e-8)
+    assert location.loglik_new == pytest.approx(-4.481134511, abs=1e-8)
+
+
+@pytest.mark.parametrize("naive", [False, True])
+@pytest.mark.parametrize("motion", [False, True])
+def test_version_2_is_version_1_that_samples_every_training_image_once(naive: bool, motion: bool) -> None:
+    tree, training, walk = made_up_walk()
+    first = FabMap(tree, training, with_(ALL_SAMPLES, naive=naive, motion=motion))
+    second = FabMap(tree, training, FabMapSettings(naive=naive, motion=motion))
+    for words in walk:
+        one, two = first.add(words), second.add(words)
+        assert one.new == pytest.approx(two.new, abs=1e-12)
+        np.testing.assert_allclose(one.places, two.places, atol=1e-12)
+        np.testing.assert_allclose(one.log_odds, two.log_odds, atol=1e-9)
+        # What version 2 leaves out is the same for all places.
+        np.testing.assert_allclose(np.ptp(one.loglik - two.loglik) if len(one.loglik) else 0.0, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        FabMapSettings(),
+        FabMapSettings(motion=True),
+        FabMapSettings(recent=5),
+        FabMapSettings(recent=5, motion=True),
+        MEAN_FIELD,
+        FabMapSettings(version=1, samples=40, seed=3),
+    ],
+)
+@pytest.mark.parametrize("only_new", [False, True])
+def test_offline_is_online(settings: FabMapSettings, only_new: bool) -> None:
+    tree, training, walk = made_up_walk()
+    fabmap = FabMap(tree, training, settings)
+    scores = score_sequence(FabMapModel(tree, training, settings), walk, only_new)
+    for i, words in enumerate(walk):
+        location = fabmap.add(words, only_new)
+        assert scores.new[i] == pytest.approx(location.new, abs=1e-12)
+        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(scores.posterior[i])), fabmap.images)
+        np.testing.assert_allclose(scores.posterior[i, fabmap.images], location.places, atol=1e-12)
+        np.testing.assert_allclose(scores.log_odds[i, fabmap.images], location.log_odds, atol=1e-9)
+    if only_new:
+        assert len(fabmap.images) < len(walk) - settings.recent
+
+
+def test_two_traverses_are_located_on_a_finished_map() -> None:
+    tree, training, walk = made_up_walk()
+    lap, again = walk[:30], walk[30:]
+    scores = score_sets(FabMapModel(tree, training), again, lap)
+    fabmap = FabMap(tree, training)
+    for words in lap:
+        fabmap.add(words)
+    for i, words in enumerate(again):
+        location = fabmap.locate(words)
+        np.testing.assert_allclose(scores.posterior[i], location.places, atol=1e-12)
+        np.testing.assert_allclose(scores.log_odds[i], location.log_odds, atol=1e-9)
+    assert np.mean(np.argmax(scores.log_odds, axis=1) == np.arange(30)) > 0.9
+
+
+def test_sampling_approaches_the_mean_of_all_and_follows_the_seed() -> None:
+    tree, training, walk = made_up_walk()
+    model = {seed: FabMapModel(tree, training, FabMapSettings(version=1, seed=seed)) for seed in (0, 1)}
+    drawn = [model[seed].new_place(walk, model[seed].draws()) for seed in (0, 0, 1)]
+    exact = logsumexp(model[0].likelihoods(walk, training), axis=1) - np.log(len(training))
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert not np.array_equal(drawn[0], drawn[2])
+    np.testing.assert_allclose(drawn[0], exact, atol=0.5)  # 3000 draws of 50 images
+
+
+def test_posteriors_sum_to_one() -> None:
+    tree, training, walk = made_up_walk()
+    fabmap = FabMap(tree, training, FabMapSettings(motion=True, recent=3))
+    for words in walk:
+        location = fabmap.add(words)
+        assert location.new + location.places.sum() == pytest.approx(1.0, abs=1e-12)
+        assert np.all(location.places > 0)
+
+
+def test_a_place_seen_again_unchanged_wins_among_places_with_as_many_words() -> None:
+    rng = np.random.default_rng(5)
+    places = np.zeros((40, 60), bool)
+    for place in places:
+        place[rng.choice(60, 12, replace=False)] = True
+    training = rng.random((80, 60)) < 0.2
+    model = FabMapModel(learn_tree(training), training)
+    np.testing.assert_array_equal(np.argmax(model.likelihoods(places, places), axis=1), np.arange(40))
+
+
+def test_a_word_of_every_image_says_less_than_a_rare_one() -> None:
+    rng = np.random.default_rng(6)
+    training = rng.random((100, 30)) < 0.2
+    training[:, 10] = True
+    training[:, 11] = np.arange(100) < 2
+    model = FabMapModel(learn_tree(training), training, FabMapSettings(naive=True))
+    place = rng.random(30) < 0.2
+    place[[10, 11]] = False
+
+    def log_odds(*words: int) -> float:
+        seen = place.copy()
+        seen[list(words)] = True
+        return float((model.likelihoods(seen[None], seen[None])[0] - model.new_place(seen[None], model.draws()))[0])
+
+    common, rare = log_odds(10) - log_odds(), log_odds(11) - log_odds()
+    assert abs(common) < 0.2 < rare
+
+
+def test_images_without_words_are_places_too() -> None:
+    tree, training, _ = made_up_walk()
+    nothing = np.zeros(len(tree), int)
+    for version in (1, 2):
+        fabmap = FabMap(tree, training, FabMapSettings(version=version, samples=0))
+        for words in (nothing, training[0], nothing):
+            location = fabmap.add(words)
+        assert location.places[0] > location.places[1]  # nothing looks more like nothing than like something
+        assert np.isfinite(location.log_odds).all()
+        assert fabmap.locate(training[0]).best == 1
+
+
+def test_the_matrix_that_openfabmap_writes() -> None:
+    tree, training, walk = made_up_walk()
+    scores = score_sequence(FabMapModel(tree, training), walk)
+    matrix = scores.openfabmap_matrix()
+    np.testing.assert_array_equal(np.diag(matrix), scores.new)
+    np.testing.assert_array_equal(np.triu(matrix, 1), 0.0)
+    np.testing.assert_allclose(matrix.sum(axis=1), 1.0, atol=1e-12)
+    assert np.mean(np.argmax(matrix[30:], axis=1) == np.arange(30)) > 0.8  # the second lap finds the first
+
+
+def test_recent_images_have_log_odds_but_no_posterior() -> None:
+    tree, training, walk = made_up_walk()
+    scores = score_sequence(FabMapModel(tree, training, FabMapSettings(recent=4)), walk)
+    np.testing.assert_array_equal(np.isfinite(scores.posterior), np.tri(60, 60, -5, dtype=bool))
+    np.testing.assert_array_equal(np.isfinite(scores.log_odds), np.tri(60, 60, -1, dtype=bool))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"version": 3}, "versions 1 and 2, not 3"),
+        ({"version": 2, "new_place": "mean_field"}, "no mean field"),
+        ({"new_place": "sample"}, 'not "sample"'),
+        ({"hit": 0.2, "false_alarm": 0.3}, "false_alarm < hit"),
+        ({"samples": -1}, "samples is -1"),
+        ({"recent": -1}, "recent is -1"),
+    ],
+)
+def test_settings_that_make_no_sense(settings: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        FabMapSettings(**settings)
+
+
+def test_a_sampled_new_place_needs_training_images() -> None:
+    with pytest.raises(InputError, match="needs the words of training images"):
+        FabMap(learn_tree(TRAIN_A), None)
+
+
+def test_words_of_another_vocabulary_are_refused() -> None:
+    fabmap = FabMap(learn_tree(TRAIN_A), TRAIN_A)
+    with pytest.raises(InputError, match=r"shape \(6,\), the vocabulary 5 words"):
+        fabmap.add(TRAIN_B[0])
+    with pytest.raises(InputError, match=r"shape \(16, 6\), the vocabulary 5 words"):
+        FabMap(learn_tree(TRAIN_A), TRAIN_B)

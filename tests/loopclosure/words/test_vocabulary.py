@@ -1,0 +1,142 @@
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from loopclosure.errors import InputError
+from loopclosure.words.vocabulary import Extractor, Vocabulary, founders, kmeans, nearest_centres, sequential_clusters
+
+
+def texture(seed: int) -> np.ndarray:
+    """Return a blotchy grey image (120, 160) that has features."""
+    noise = np.random.default_rng(seed).random((120, 160)).astype(np.float32)
+    blotches = cv2.GaussianBlur(noise, (0, 0), 2.5)
+    return cv2.normalize(blotches, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def unit_vectors(count: int, size: int = 8, seed: int = 0) -> np.ndarray:
+    vectors = np.random.default_rng(seed).normal(size=(count, size))
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
+@pytest.mark.parametrize("root", [True, False])
+def test_sift_descriptors_are_unit_vectors(root: bool) -> None:
+    found = Extractor(root=root)(texture(0))
+    assert found.dtype == np.float32
+    assert found.shape[1] == 128
+    assert len(found) > 20
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-5)
+
+
+def test_root_sift_is_the_root_of_the_shares() -> None:
+    plain, root = Extractor(root=False)(texture(0)), Extractor(root=True)(texture(0))
+    np.testing.assert_allclose(root**2, plain / plain.sum(axis=1, keepdims=True), atol=1e-6)
+
+
+def test_orb_descriptors_are_bits() -> None:
+    found = Extractor("orb", max_features=50)(texture(0))
+    assert found.shape[1] == 256
+    assert 0 < len(found) <= 50
+    assert set(np.unique(found)) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("kind", ["sift", "orb"])
+def test_a_blank_image_has_no_features_and_no_words(kind: str) -> None:
+    extractor = Extractor(kind)
+    blank = np.full((120, 160), 90, np.uint8)
+    assert extractor(blank).shape == (0, extractor.size)
+    vocabulary = Vocabulary(np.eye(3, extractor.size, dtype=np.float32), extractor)
+    np.testing.assert_array_equal(vocabulary.count(blank), [0, 0, 0])
+
+
+def test_no_more_features_than_asked_for_and_colour_is_taken_as_grey() -> None:
+    extractor = Extractor(max_features=15)
+    assert len(extractor(texture(1))) == 15
+    np.testing.assert_array_equal(extractor(cv2.cvtColor(texture(1), cv2.COLOR_GRAY2BGR)), extractor(texture(1)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"), [({"kind": "surf"}, '"surf"; known: sift, orb'), ({"max_features": 0}, "is 0")]
+)
+def test_extractors_that_are_none(settings: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Extractor(**settings)
+
+
+def test_nearest_centre_across_blocks() -> None:
+    descriptors, centres = unit_vectors(9000, seed=1), unit_vectors(30, seed=2) * 0.7
+    np.testing.assert_array_equal(nearest_centres(descriptors, centres), np.argmin(cdist(descriptors, centres), axis=1))
+
+
+def test_words_are_counted() -> None:
+    centres = unit_vectors(5, 128)
+    vocabulary = Vocabulary(centres, Extractor())
+    np.testing.assert_array_equal(vocabulary.nearest(centres[[3, 1, 3]]), [3, 1, 3])
+    np.testing.assert_array_equal(vocabulary.count_descriptors(centres[[3, 1, 3]]), [0, 1, 0, 2, 0])
+    assert len(vocabulary) == 5
+
+
+def test_kmeans_finds_clusters_and_follows_the_seed() -> None:
+    heaps = unit_vectors(10, 16, seed=4)
+    points = np.repeat(heaps, 200, axis=0) + np.random.default_rng(0).normal(0, 0.01, (2000, 16)).astype(np.float32)
+    centres = kmeans(points, 10, seed=1)
+    assert centres.shape == (10, 16)
+    assert centres.dtype == np.float32
+    spread = np.linalg.norm(points - centres[nearest_centres(points, centres)], axis=1)
+    assert spread.mean() < 0.2
+    np.testing.assert_array_equal(centres, kmeans(points, 10, seed=1))
+
+
+def test_kmeans_needs_as_many_descriptors_as_words() -> None:
+    with pytest.raises(InputError, match="7 descriptors cannot make 8 words"):
+        kmeans(unit_vectors(7), 8)
+
+
+def founders_one_by_one(descriptors: np.ndarray, radius: float) -> list[int]:
+    chosen: list[int] = []
+    for i, descriptor in enumerate(descriptors):
+        if all(np.linalg.norm(descriptor - descriptors[j]) > radius for j in chosen):
+            chosen.append(i)
+    return chosen
+
+
+def test_founders_are_those_of_the_plain_loop() -> None:
+    descriptors = unit_vectors(600)
+    np.testing.assert_array_equal(founders(descriptors, 0.6), founders_one_by_one(descriptors, 0.6))
+
+
+def test_founders_lie_apart_and_cover_all_across_blocks() -> None:
+    descriptors, radius = unit_vectors(10_000, seed=3), 0.7
+    centres = descriptors[founders(descriptors, radius)]
+    apart = cdist(centres, centres)
+    np.fill_diagonal(apart, np.inf)
+    assert apart.min() > radius
+    assert cdist(descriptors, centres).min(axis=1).max() <= radius + 1e-6
+
+
+def test_sequential_words_are_the_means_of_their_clusters() -> None:
+    descriptors = unit_vectors(3000, seed=5)
+    words = sequential_clusters(descriptors, 0.8, seed=None)
+    nearest = np.argmin(cdist(descriptors, descriptors[founders(descriptors, 0.8)]), axis=1)
+    means = np.stack([descriptors[nearest == k].mean(axis=0) for k in range(nearest.max() + 1)])
+    np.testing.assert_allclose(words, means, atol=1e-6)
+
+
+def test_sequential_clustering_follows_the_seed() -> None:
+    descriptors = unit_vectors(500)
+    np.testing.assert_array_equal(sequential_clusters(descriptors, 0.7, 2), sequential_clusters(descriptors, 0.7, 2))
+    shuffled = sequential_clusters(descriptors, 0.7, 3)
+    assert shuffled.shape != (0, 8)
+    assert not np.array_equal(shuffled, sequential_clusters(descriptors, 0.7, 2))
+
+
+def test_one_cluster_where_all_are_near() -> None:
+    descriptors = unit_vectors(1).repeat(40, axis=0)
+    np.testing.assert_allclose(sequential_clusters(descriptors, 0.1), descriptors[:1], atol=1e-6)
+
+
+def test_nothing_to_cluster() -> None:
+    with pytest.raises(InputError, match="no descriptors to cluster"):
+        sequential_clusters(np.zeros((0, 128), np.float32), 0.6)
+    with pytest.raises(InputError, match="must be positive"):
+        sequential_clusters(unit_vectors(4), 0.0)

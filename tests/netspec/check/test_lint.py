@@ -1,0 +1,165 @@
+"""What ``check`` warns of, rule by rule: said where it stands, and not said where all is well."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from netspec.check.check import check_file
+from paths import GOLDEN
+
+DATA = """layer { name: "d" type: "Data" top: "pair" top: "sim"
+  data_param { source: "%s" batch_size: 10 backend: LMDB } }
+layer { name: "cut" type: "Slice" bottom: "pair" top: "a" top: "b" }
+"""
+TOWER = """layer { name: "ip%(k)s" type: "InnerProduct" bottom: "%(in)s" top: "f%(k)s" %(param)s
+  inner_product_param { num_output: 2 weight_filler { type: "xavier" } } }
+"""
+LOSS = 'layer { name: "loss" type: "ContrastiveLoss" bottom: "f1" bottom: "f2" bottom: "sim" top: "loss" }\n'
+SHARED = ('param { name: "w" } param { name: "b" }',) * 2
+
+
+def siamese(params: tuple[str, str] = SHARED, extra: str = "", source: str = "nowhere") -> str:
+    towers = "".join(TOWER % {"k": k, "in": blob, "param": p} for k, blob, p in zip("12", "ab", params, strict=True))
+    return DATA % source + towers + LOSS + extra
+
+
+@pytest.fixture
+def advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    """``advice(net, solver=None, phase=0)``: what is said of a net's text, or of a solver's that trains it."""
+    monkeypatch.chdir(tmp_path)
+
+    def check(net: str, solver: str | None = None, phase: int = 0) -> list[str]:
+        Path("net.prototxt").write_text(net)
+        if solver is not None:
+            Path("solver.prototxt").write_text('net: "net.prototxt"\n' + solver)
+        path = "net.prototxt" if solver is None else "solver.prototxt"
+        shapes = {"pair": (10, 2, 4, 4), "sim": (10,)} if "pair" in net else {}
+        checked = check_file(path, phase, shapes=shapes)
+        assert not [fault for part in checked for fault in part.faults]
+        return [line for part in checked for line in part.advice]
+
+    return check
+
+
+def test_nothing_is_said_of_a_sound_net(advice: Callable[..., list[str]]) -> None:
+    assert advice(siamese()) == []
+
+
+def test_towers_that_share_only_some_of_their_parameters(advice: Callable[..., list[str]]) -> None:
+    assert advice(siamese(('param { name: "w" }', 'param { name: "w" }'))) == [
+        'net.prototxt:6:1: layer "ip2" (InnerProduct): 1 of its 2 parameter blobs are not shared with the other tower '
+        'of "loss"; give them the same param { name }'
+    ]
+
+
+def test_a_loss_that_nothing_reaches(advice: Callable[..., list[str]]) -> None:
+    fixed = 'param { name: "w" lr_mult: 0 } param { name: "b" lr_mult: 0 }'
+    assert advice(siamese((fixed, fixed))) == [
+        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): nothing that learns reaches this loss'
+    ]
+    assert advice(siamese((fixed, fixed)), phase=1) == []
+
+
+def test_a_blob_used_by_nothing(advice: Callable[..., list[str]]) -> None:
+    spare = 'layer { name: "spare" type: "ReLU" bottom: "f1" top: "spare" }\n'
+    assert advice(siamese(extra=spare)) == ['net.prototxt:9:1: layer "spare" (ReLU): blob "spare" is used by nothing']
+    score = 'layer { name: "score" type: "Accuracy" bottom: "f1" bottom: "sim" top: "score" }\n'
+    assert advice(siamese(extra=score)) == []
+    silent = 'layer { name: "hush" type: "Silence" bottom: "spare" }\n'
+    assert advice(siamese(extra=spare + silent)) == []
+
+
+def test_the_outputs_of_a_net_without_a_loss_are_what_it_is_for(advice: Callable[..., list[str]]) -> None:
+    assert advice('layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }') == []
+
+
+def test_a_batch_norm_without_scale(advice: Callable[..., list[str]]) -> None:
+    norm = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 } } }\n'
+    norm += 'layer { name: "bn" type: "BatchNorm" bottom: "x" top: "y" }\n'
+    assert advice(norm) == [
+        'net.prototxt:2:1: layer "bn" (BatchNorm): no Scale layer follows; Caffe\'s BatchNorm has no scale and shift '
+        "of its own"
+    ]
+    assert advice(norm + 'layer { name: "s" type: "Scale" bottom: "y" top: "y" }') == []
+
+
+def test_two_layers_of_one_name(advice: Callable[..., list[str]]) -> None:
+    said = advice(siamese().replace('"ip2"', '"ip1"'))
+    assert said == [
+        'net.prototxt:6:1: layer "ip1" (InnerProduct): an earlier layer has this name, and gets the weights that are '
+        "loaded by it"
+    ]
+
+
+def test_a_phase_without_its_data_layer(advice: Callable[..., list[str]], tmp_path: Path) -> None:
+    net = (DATA % "nowhere").replace('top: "sim"', 'top: "sim" include { phase: TRAIN }')
+    Path("net.prototxt").write_text(net)
+    (checked,) = check_file("net.prototxt", 1)
+    assert [str(fault) for fault in checked.faults] == [
+        'net.prototxt:3:35: layer "cut" (Slice): unknown bottom blob "pair"; available: none'
+    ]
+    assert checked.advice == [
+        'net.prototxt:1:1: layer "d" (Data): no data layer is left in this phase; add one with include { phase: ... }'
+    ]
+
+
+SOLVER = 'base_lr: 0.1 lr_policy: "fixed" max_iter: 100 snapshot_prefix: "s"\n'
+
+
+def test_nothing_is_said_of_a_sound_solver(advice: Callable[..., list[str]]) -> None:
+    assert advice(siamese(), SOLVER + "snapshot: 50") == []
+
+
+def test_no_snapshot_is_ever_taken(advice: Callable[..., list[str]]) -> None:
+    without = SOLVER + "snapshot_after_train: false\n"
+    assert advice(siamese(), without + "snapshot: 101") == [
+        "solver.prototxt:4:1: snapshot 101 never fires in max_iter 100"
+    ]
+    assert advice(siamese(), SOLVER + "snapshot: 101") == [
+        "solver.prototxt:3:1: snapshot 101 never fires in max_iter 100"
+    ]
+    assert advice(siamese(), without) == [
+        "solver.prototxt: no snapshot is ever taken; set snapshot, or snapshot_after_train: true"
+    ]
+    assert advice(siamese(), without + "snapshot: 100") == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("gamma: 0.1", ["3:1: gamma has no effect with type SGD and lr_policy fixed"]),
+        ("stepvalue: 10 stepvalue: 20", ["3:1: stepvalue has no effect with type SGD and lr_policy fixed"]),
+        ('type: "Adam" momentum2: 0.9 delta: 1e-8', []),
+        ('type: "adagrad" delta: 1e-8', []),
+        ('type: "RMSProp" rms_decay: 0.9 momentum2: 0.9',
+         ["3:32: momentum2 has no effect with type RMSProp and lr_policy fixed"]),
+    ],
+)  # fmt: skip
+def test_settings_that_the_policy_and_the_rule_do_not_read(
+    advice: Callable[..., list[str]], settings: str, said: list[str]
+) -> None:
+    assert advice(siamese(), SOLVER + settings) == [f"solver.prototxt:{line}" for line in said]
+
+
+def test_every_policy_and_rule_finds_its_own_settings_sound(advice: Callable[..., list[str]]) -> None:
+    for policy in (
+        'lr_policy: "step" gamma: 0.1 stepsize: 10', 'lr_policy: "exp" gamma: 0.9', 'lr_policy: "poly" power: 2',
+        'lr_policy: "inv" gamma: 0.1 power: 1', 'lr_policy: "multistep" gamma: 0.1 stepvalue: 9',
+        'lr_policy: "sigmoid" gamma: 0.1 stepsize: 50',
+    ):  # fmt: skip
+        assert advice(siamese(), SOLVER.replace('lr_policy: "fixed"', policy)) == []
+
+
+@pytest.mark.parametrize(("iterations", "far"), [(20, False), (19, False), (22, False), (4, True), (64, True)])
+def test_a_test_that_reads_far_more_or_less_than_there_is(
+    advice: Callable[..., list[str]], iterations: int, far: bool
+) -> None:
+    source = str(GOLDEN / "pairs" / "test_lmdb")
+    said = advice(siamese(source=source), SOLVER + f"test_interval: 10\ntest_iter: {iterations}")
+    read = f"test_iter {iterations} x batch 10 = {10 * iterations}"
+    assert said == ([f'solver.prototxt:4:1: {read}, but "{source}" has 200 records'] if far else [])
+
+
+def test_of_data_that_is_not_at_hand_nothing_is_said(advice: Callable[..., list[str]]) -> None:
+    assert advice(siamese(), SOLVER + "test_interval: 10 test_iter: 1") == []

@@ -1,0 +1,299 @@
+"""The commands, called as ``netspec`` calls them: what they do, say and end with."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lmdb
+import numpy as np
+import pytest
+import torch
+
+import netspec
+from netspec.layers import layer_types
+from netspec.proto.text import read_net, read_solver
+from paths import GOLDEN, ROOT
+
+NET = "sgd_step/train_val.prototxt"
+SOLVER = "sgd_step/solver.prototxt"
+INIT = "sgd_step/init.caffemodel"
+Run = Callable[..., Any]  # the fixtures of conftest.py
+Edit = Callable[..., str]
+
+
+# train
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--solver", SOLVER, "--weights", INIT],
+        ["-solver", SOLVER, "-weights", INIT],
+        [f"--solver={SOLVER}", f"--weights={INIT}"],
+        [f"-solver={SOLVER}", f"-weights={INIT}"],
+        [SOLVER, "-weights", INIT],
+    ],
+    ids=["two dashes", "one dash", "two dashes =", "one dash =", "position"],
+)
+def test_train_takes_its_arguments_in_each_spelling(run: Run, edited: Edit, words: list[str]) -> None:
+    solver = edited(SOLVER, "max_iter: 60", "max_iter: 1", "snapshot_after_train: false", "")
+    result = run("train", *[word.replace(SOLVER, solver) for word in words])
+    assert result.status == 0
+    assert f"Finetuning from {INIT}" in result.messages
+    assert result.messages[-1] == "Optimization Done."
+    assert Path("sgd_step/ref_iter_1.caffemodel").is_file()
+
+
+def test_the_door_tools_train(run: Run, edited: Edit) -> None:
+    solver = edited(SOLVER, "max_iter: 60", "max_iter: 2")
+    door = [sys.executable, str(ROOT / "tools" / "train.py"), solver]
+    done = subprocess.run(door, capture_output=True, text=True, check=False, timeout=100)
+    assert done.returncode == 0
+    assert done.stderr.splitlines()[-1].endswith("caffe.cpp:250] Optimization Done.")
+
+
+def test_train_goes_on_from_a_snapshot(run: Run, edited: Edit) -> None:
+    solver = edited(SOLVER, "max_iter: 60", "max_iter: 62", "snapshot_after_train: false", "")
+    result = run("train", "--solver", solver, "--snapshot", "sgd_step/ref_iter_60.solverstate")
+    assert result.status == 0
+    assert "Resuming from sgd_step/ref_iter_60.solverstate" in result.messages
+    assert Path("sgd_step/ref_iter_62.solverstate").is_file()
+
+
+def test_train_gives_level_and_stages_to_the_training_net_only(run: Run, edited: Edit) -> None:
+    stage = (
+        'layer { name: "extra" type: "Power" bottom: "data" top: "extra" include { stage: "a" min_level: 2 } }\nlayer {'
+    )
+    net = edited(NET, 'layer {\n  name: "conv1"', stage + '\n  name: "conv1"')
+    Path("net.prototxt").write_text(Path(net).read_text())
+    solver = edited(SOLVER, NET, "net.prototxt", "max_iter: 60", "max_iter: 1")
+    created = [
+        [m for m in run("train", solver, *words).messages if m == "Creating Layer extra"]
+        for words in ([], ["--stage", "b,a"], ["--stage=a,b", "-level", "2"])
+    ]
+    assert [len(lines) for lines in created] == [0, 0, 1]
+
+
+def test_train_leaves_the_handlers_of_signals_as_they_were(run: Run) -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGHUP)
+    assert run("train", "nowhere.prototxt").fault == "nowhere.prototxt: cannot be read: No such file or directory"
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGHUP)) == before
+
+
+# test and time
+
+
+def test_test_scores_a_net_on_its_test_data(run: Run) -> None:
+    result = run("test", "-model", NET, "-weights", INIT, "-iterations", "3")
+    assert result.status == 0
+    batches = [line for line in result.messages if line.startswith("Batch ")]
+    scores = [float(line.rpartition(" ")[2]) for line in batches]
+    assert [line.rpartition(" ")[0] for line in batches] == [f"Batch {i}, loss =" for i in range(3)]
+    assert scores[0] == pytest.approx(0.141718, rel=1e-4)
+    mean = f"{np.mean(scores):.4g}"
+    assert result.messages[-1].startswith(f"loss = {mean}")
+    assert result.messages[-2].startswith(f"Loss: {mean}")
+
+
+def test_test_loads_several_weights_the_last_one_winning(run: Run) -> None:
+    one = run("test", "--model", NET, "--weights", "sgd_step/ref_iter_60.caffemodel", "--iterations", 1)
+    two = run("test", "--model", NET, "--weights", f"{INIT},sgd_step/ref_iter_60.caffemodel", "--iterations", 1)
+    assert one.messages[-1] == two.messages[-1]
+
+
+def test_time_measures_each_layer(run: Run) -> None:
+    result = run("time", "--model", NET, "--phase", "test", "--iterations=2")
+    assert result.status == 0
+    times = [line for line in result.messages if line.endswith(" ms.")]
+    for name in ("slice_pair", "conv1", "loss"):
+        assert sum(line.split()[0] == name for line in times) == 2
+    assert sum(line.startswith("Iteration: ") for line in times) == 2
+    assert (
+        "The NetState phase (1) differed from the phase (0) specified by a rule in layer pair_data" in result.messages
+    )
+
+
+# The other commands
+
+
+def test_upgrades_write_the_current_format(run: Run) -> None:
+    old = 'input: "x" input_shape { dim: 1 dim: 2 } layers { name: "r" type: RELU bottom: "x" top: "x" blobs_lr: 1 }'
+    Path("old.prototxt").write_text(old)
+    Path("solver.prototxt").write_text('net: "old.prototxt" solver_type: ADAM')
+    assert run("upgrade_net_proto_text", "old.prototxt", "new.prototxt").status == 0
+    assert [(layer.name, layer.type) for layer in read_net("new.prototxt").layer] == [("input", "Input"), ("r", "ReLU")]
+    assert "layers" not in Path("new.prototxt").read_text()
+    result = run("upgrade_solver_proto_text", "solver.prototxt", "new_solver.prototxt")
+    assert result.messages[-1] == "Wrote upgraded SolverParameter text proto to new_solver.prototxt"
+    assert read_solver("new_solver.prototxt").type == "Adam"
+    assert "solver_type" not in Path("new_solver.prototxt").read_text()
+    assert run("upgrade_net_proto_binary", INIT, "new.caffemodel").status == 0
+    netspec.load_weights(netspec.load_net(NET), "new.caffemodel")
+    assert run("upgrade_net_proto_text", "old.prototxt", "nowhere/new").fault.startswith(
+        "nowhere/new: cannot be written"
+    )
+
+
+def test_layers_prints_what_each_says_of_itself(run: Run) -> None:
+    rows = [line.split(maxsplit=1) for line in run("layers").out.splitlines()]
+    assert [row[0] for row in rows] == layer_types()
+    assert dict(rows)["Silence"] == "Use blobs that would otherwise be the net's outputs."
+    assert all(len(row) == 2 for row in rows)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a GPU")
+def test_without_a_gpu_the_cpu_is_used_and_a_wish_for_a_gpu_refused(run: Run, edited: Edit) -> None:
+    assert run("device_query").fault == "torch finds no GPU on this machine"
+    refused = "this machine has no GPU(s) that torch can use; leave --gpu out for the CPU"
+    for words in (["train", SOLVER], ["test", "--model", NET, "--weights", INIT], ["time", "--model", NET]):
+        assert run(*words, "-gpu", "0").fault == f"--gpu 0: {refused}"
+    result = run("train", edited(SOLVER, "solver_mode: CPU", "solver_mode: GPU", "max_iter: 60", "max_iter: 0"))
+    assert result.status == 0
+    warnings = [line for line in result.messages if "solver_mode" in line and "running on the CPU" in line]
+    assert warnings == ["edited.prototxt:11:1: solver_mode GPU, but torch finds no GPU here: running on the CPU"]
+
+
+# What is wrong, in one line
+
+
+def test_gpus_that_are_not_numbers_or_not_there(run: Run) -> None:
+    fault = "--gpu first: expected the number of a GPU, several separated by commas, or all"
+    assert run("train", SOLVER, "--gpu=first").fault == fault
+    count = torch.cuda.device_count()
+    assert f"this machine has {count or 'no'} GPU(s)" in run("train", SOLVER, "--gpu", f"0,{count + 1}").fault
+
+
+def test_a_typo_in_a_field_a_type_or_a_blob(run: Run, edited: Edit) -> None:
+    def fault(*changes: str) -> str:
+        Path("net.prototxt").write_text(Path(edited(NET, *changes)).read_text())
+        return run("train", edited(SOLVER, NET, "net.prototxt")).fault
+
+    assert fault("num_output: 6", "num_outputs: 6") == (
+        'net.prototxt:35:23: layer "conv1" (Convolution): ConvolutionParameter has no field "num_outputs"; '
+        'did you mean "num_output"?'
+    )
+    assert fault('type: "ReLU"', 'type: "Relu"') == (
+        'net.prototxt:71:3: layer "relu1" (Relu): unknown layer type "Relu"; did you mean "ReLU"?'
+    )
+    assert fault('bottom: "pool1"', 'bottom: "pol1"') == (
+        'net.prototxt:47:3: layer "conv2" (Convolution): unknown bottom blob "pol1"; did you mean "pool1"? '
+        "available: pair_data, sim, data, data_p, conv1, pool1"
+    )
+
+
+def test_a_database_that_is_missing_empty_or_of_another_shape(run: Run, edited: Edit) -> None:
+    lmdb.open("empty_lmdb").close()
+    Path("hollow_lmdb").mkdir()
+    Path("net.prototxt").write_text(Path(NET).read_text())
+
+    def fault(source: str) -> str:
+        Path("net.prototxt").write_text(Path(edited(NET, "pairs/train_lmdb", source)).read_text())
+        return run("train", edited(SOLVER, NET, "net.prototxt"), "--weights", INIT).fault
+
+    place = 'net.prototxt:9:16: layer "pair_data" (Data): database '
+    assert fault("nowhere") == f'{place}"nowhere" is not there (relative paths start from {os.getcwd()})'
+    assert fault("empty_lmdb") == f'{place}"empty_lmdb" is empty: it holds no record'
+    assert fault("hollow_lmdb").startswith(f'{place}"hollow_lmdb" is a folder without data.mdb')
+    assert fault(f"{GOLDEN}/images/lmdb_gray").startswith(
+        'net.prototxt:26:30: layer "slice_pair" (Slice): found slice_point [1]'
+    )
+    shutil.copytree(GOLDEN / "images" / "lmdb_plain", "colour_lmdb")
+    assert "cannot share param " in fault("colour_lmdb")
+
+
+def test_a_solver_that_names_no_net(run: Run, edited: Edit) -> None:
+    solver = edited(SOLVER, f'net: "{NET}"', "")
+    assert run("train", solver).fault.startswith(
+        "edited.prototxt: the solver names no net to train, expected exactly one"
+    )
+    assert run("check", solver).fault.startswith(
+        "edited.prototxt: the solver names no net to train, expected exactly one"
+    )
+    assert run("train", edited(SOLVER, NET, "nowhere.prototxt")).fault == (
+        'edited.prototxt:1:1: net "nowhere.prototxt" is not a file; paths are relative to the working directory'
+    )
+
+
+def test_a_prefix_that_cannot_be_written_to(run: Run, edited: Edit) -> None:
+    solver = edited(SOLVER, "sgd_step/ref", "nowhere/ref", "display: 10", "display: 10 snapshot: 5")
+    fault = run("train", solver).fault
+    assert fault.startswith(
+        'edited.prototxt:9:1: cannot write to snapshot prefix "nowhere/ref": No such file or directory'
+    )
+
+
+def test_weights_that_are_missing_or_no_weights(run: Run) -> None:
+    missing = "nowhere.caffemodel: cannot be read: No such file or directory"
+    assert run("train", SOLVER, "--weights", "nowhere.caffemodel").fault == missing
+    assert run("test", "--model", NET, "--weights", "nowhere.caffemodel").fault == missing
+    Path("broken.caffemodel").write_bytes(Path(INIT).read_bytes()[:1000])
+    assert run("test", "--model", NET, "--weights", "broken.caffemodel").fault.startswith("broken.caffemodel: ")
+    assert run("train", SOLVER, "--snapshot", "nowhere.solverstate").fault.startswith(
+        "nowhere.solverstate: cannot be read"
+    )
+    assert run("train", SOLVER, "--snapshot", INIT).fault.startswith(f"{INIT}: ")
+
+
+def test_a_file_that_is_no_prototxt(run: Run) -> None:
+    assert run("check", INIT).fault.startswith(f"{INIT}:2:1: unexpected character 0x08")
+    assert run("test", "--model", INIT, "--weights", INIT).fault.startswith(f"{INIT}:2:1: unexpected character 0x08")
+    assert run("check", "nowhere.prototxt").fault == "nowhere.prototxt: cannot be read: No such file or directory"
+
+
+def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
+    deploy = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 } } }'
+    Path("net.prototxt").write_text(deploy)
+    expected = "net.prototxt: no value for input 'x'; this net's inputs: x"
+    assert run("test", "--model", "net.prototxt", "--weights", INIT).fault == expected
+    assert run("train", edited(SOLVER, NET, "net.prototxt", "test_iter: 4", "")).fault == expected
+    assert run("time", "--model", "net.prototxt", "--iterations", 1).status == 0
+
+
+# Usage
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["fit"], "invalid choice: 'fit'"),
+        (["train"], "netspec train: error: need one solver definition: netspec train solver.prototxt"),
+        (["train", "a", "--solver", "b"], "need one solver definition"),
+        (
+            ["train", "s", "--snapshot", "a", "--weights", "b"],
+            "give a snapshot to resume training or weights to fine-tune",
+        ),
+        (["train", "s", "--momentum", "0.9"], "unrecognized arguments: --momentum"),
+        (["train", "s", "-sigint_effect", "die"], "argument --sigint_effect: invalid choice: 'die'"),
+        (["test", "--model", "m"], "the following arguments are required: --weights"),
+        (["test", "--model", "m", "--weights", "w", "--iterations", "0"], "found 0, expected a positive number"),
+        (["check", "net", "--shape", "data=1x2"], "found 'data=1x2', expected BLOB=N,C,H,W, e.g. data=32,3,224,224"),
+        (["check", "net", "--phase", "VAL"], "argument --phase: invalid choice: 'VAL'"),
+        (["extract", "--model", "m", "--blob", "b", "--out", "o", "--source", "db"], "found 'db', expected LAYER=DB"),
+        (
+            ["extract", "--model", "m", "--blob", "a", "b", "--out", "o", "--images", "i"],
+            "--images takes one --blob, found 2",
+        ),
+        (
+            ["extract", "--model", "m", "--blob", "a", "--out", "o", "--images", "i", "--shape", "b=1"],
+            "--shape names b, expected the input blob data",
+        ),
+    ],
+)
+def test_wrong_usage_ends_with_status_2(run: Run, words: list[str], said: str) -> None:
+    result = run(*words)
+    assert result.status == 2
+    assert said in result.err
+    assert "Traceback" not in result.err
+
+
+def test_help_is_no_fault(run: Run) -> None:
+    assert "caffe train" in run("--help").out
+    result = run("train", "--help")
+    assert result.status == 0
+    assert "--sighup_effect" in result.out

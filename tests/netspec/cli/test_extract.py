@@ -1,0 +1,212 @@
+"""The commands ``extract`` and ``extract_features``: blobs over records and over images."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import netspec
+from netspec.data.database import open_reader
+from netspec.data.datum import datum_to_array, parse_datum
+from paths import GOLDEN
+
+NET = "sgd_step/train_val.prototxt"
+INIT = "sgd_step/init.caffemodel"
+Run = Callable[..., Any]  # the fixtures of conftest.py
+
+
+def forward(names: list[str], **inputs: np.ndarray) -> dict[str, np.ndarray]:
+    net = netspec.load_net(NET, weights=INIT)
+    net.keep = names
+    with torch.no_grad():
+        net(**inputs)
+    net.close()
+    return {name: net.blobs[name].numpy() for name in names}
+
+
+def test_extract_writes_blobs_and_keys_over_all_records(run: Run) -> None:
+    words = ["--model", NET, "--weights", INIT, "--blob", "feat", "pool1", "--blob", "sim", "--out", "f.npz"]
+    assert run("extract", *words).status == 0
+    found = np.load("f.npz")
+    assert found["feat"].shape == (200, 8)
+    assert found["pool1"].shape == (200, 6 * 12 * 12)
+    assert found["feat"].dtype == np.float32
+    assert found["keys"].tolist() == [f"{i:08d}" for i in range(200)]
+    first = forward(["feat", "sim"])
+    np.testing.assert_allclose(found["feat"][:50], first["feat"], rtol=1e-5)
+    np.testing.assert_array_equal(found["sim"][:50, 0], first["sim"])
+
+
+def test_extract_reads_another_database_and_as_many_batches_as_asked(run: Run) -> None:
+    words = [
+        "--model",
+        NET,
+        "--weights",
+        INIT,
+        "--blob",
+        "sim",
+        "--out",
+        "f.npz",
+        "--source",
+        "pair_data=pairs/train_lmdb",
+    ]
+    assert run("extract", *words, "--iterations", "13").status == 0
+    found = np.load("f.npz")
+    labels = [parse_datum(open_reader("pairs/train_lmdb").record(i % 640)).label for i in range(650)]
+    assert found["sim"][:, 0].tolist() == labels
+    assert found["keys"].tolist()[638:642] == ["00000638", "00000639", "00000000", "00000001"]
+
+
+def test_extract_without_weights_warns_of_random_ones(run: Run) -> None:
+    result = run("extract", "--model", NET, "--blob", "feat", "--out", "f.npz", "--iterations", 1)
+    assert result.status == 0
+    assert "no --weights: the net has random ones" in result.messages
+
+
+@pytest.fixture
+def images(run: Run) -> Path:
+    """A folder of images in another order than that of their names, and a list with stamps in the form of TUM RGB-D."""
+    folder = Path("walk")
+    (folder / "rgb").mkdir(parents=True)
+    random = np.random.default_rng(3)
+    for name in ("2.png", "10.png", "1.png"):
+        cv2.imwrite(str(folder / "rgb" / name), random.integers(0, 255, (35, 40, 3), np.uint8))
+    (folder / "rgb.txt").write_text("# color images\n1.5 rgb/10.png\n2.25 rgb/1.png\n")
+    return folder
+
+
+def features_of(path: Path) -> np.ndarray:
+    image = cv2.resize(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (28, 28))
+    pair = np.stack([image, image])[None].astype(np.float32) * 0.00390625
+    net = netspec.load_net(NET, weights=INIT)
+    layers = dict(zip([node.name for node in net.plan.nodes], net.layers, strict=True))
+    net.close()
+    blob = torch.from_numpy(pair[:, :1])
+    with torch.no_grad():
+        for name in ("conv1", "pool1", "conv2", "pool2", "ip1", "relu1", "feat"):
+            (blob,) = layers[name].run(blob)
+    return blob.numpy()[0]
+
+
+IMAGES = ("--model", NET, "--weights", INIT, "--blob", "feat", "--out", "f.npz")
+
+
+def test_extract_runs_a_training_nets_tower_over_a_folder_of_images(run: Run, images: Path) -> None:
+    assert run("extract", *IMAGES, "--images", images / "rgb").status == 0
+    found = np.load("f.npz")
+    assert found["names"].tolist() == ["1.png", "2.png", "10.png"]
+    assert "stamps" not in found
+    assert 0 < float(found["seconds_per_image"]) < 10
+    for row, name in zip(found["features"], found["names"], strict=True):
+        np.testing.assert_allclose(row, features_of(images / "rgb" / str(name)), rtol=1e-4, atol=1e-6)
+
+
+def test_extract_describes_the_middle_of_each_image_too(run: Run, images: Path) -> None:
+    whole = images / "rgb" / "1.png"
+    middle = cv2.imread(str(whole))[9:26, 10:30]  # round(35 / 4) and round(40 / 4) off each side
+    cv2.imwrite("middle.png", middle)
+    assert run("extract", *IMAGES, "--images", images / "rgb", "--zooms", "1,0.5").status == 0
+    found = np.load("f.npz")
+    assert found["zooms"].tolist() == [1, 0.5]
+    np.testing.assert_allclose(
+        found["features"][0], [*features_of(whole), *features_of(Path("middle.png"))], rtol=1e-4, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("where", ["walk", "walk/rgb.txt"])
+def test_extract_keeps_the_order_and_the_stamps_of_a_tum_list(run: Run, images: Path, where: str) -> None:
+    assert run("extract", *IMAGES, "--images", where).status == 0
+    found = np.load("f.npz")
+    assert found["names"].tolist() == ["rgb/10.png", "rgb/1.png"]
+    assert found["stamps"].tolist() == [1.5, 2.25]
+    np.testing.assert_allclose(found["features"][1], features_of(images / "rgb" / "1.png"), rtol=1e-4, atol=1e-6)
+
+
+def test_extract_reads_a_list_of_caffes_with_labels(run: Run, images: Path) -> None:
+    (images / "rgb" / "list.txt").write_text("2.png 1\n10.png 0\n")
+    assert run("extract", *IMAGES, "--images", images / "rgb" / "list.txt").status == 0
+    assert np.load("f.npz")["names"].tolist() == ["2.png", "10.png"]
+
+
+def test_extract_can_feed_the_other_tower(run: Run, images: Path) -> None:
+    words = ["--model", NET, "--weights", INIT, "--blob", "feat_p", "--out", "g.npz", "--images", images / "rgb"]
+    assert run("extract", *words, "--input", "data_p").status == 0
+    assert run("extract", *IMAGES, "--images", images / "rgb").status == 0
+    np.testing.assert_allclose(np.load("g.npz")["features"], np.load("f.npz")["features"], rtol=1e-5)
+
+
+def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run, images: Path) -> None:
+    Path("pairs").unlink()
+    words = [*IMAGES, "--images", images / "rgb"]
+    assert 'database "pairs/test_lmdb" is not there' in run("extract", *words).fault
+    assert run("extract", *words, "--shape", "data=1,1,28,28").status == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["--images", "nowhere"], "nowhere: cannot read the image list: "),
+        (["--images", "list.txt"], "list.txt:2:1: image 'b.png' is missing in ."),
+        (["--images", "empty"], "empty: no image files in this folder"),
+        (
+            ["--images", "walk/rgb", "--input", "dat"],
+            f'{NET}: no blob "dat" in this net; did you mean "data"? it has: ',
+        ),
+        (
+            ["--images", "walk/rgb", "--input", "sim"],
+            f'{NET}: input blob "sim" has shape (50,), expected N x 1 or 3 x ',
+        ),
+        (
+            ["--source", "pair=pairs/train_lmdb"],
+            f'{NET}: no data layer "pair" to give a source to; this net\'s: pair_data',
+        ),
+        (["--source", "pair_data=nowhere"], 'database "nowhere" is not there'),
+        (["--images", "walk/rgb", "--zooms", "1,2"], "found zoom 2, expected more than 0 and at most 1"),
+        (["--out", "nowhere/f.npz"], "--out nowhere/f.npz: there is no folder nowhere; make it first"),
+        (["--weights", "nowhere.caffemodel"], "nowhere.caffemodel: cannot be read: No such file or directory"),
+    ],
+)
+def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: list[str], fault: str) -> None:
+    Path("empty").mkdir()
+    Path("list.txt").write_text("walk/rgb/1.png\nb.png\n")
+    assert fault in run("extract", *IMAGES, *words).fault
+
+
+def test_extract_knows_no_such_blob(run: Run) -> None:
+    words = ["--model", NET, "--blob", "feet", "--out", "f.npz", "--weights", INIT]
+    expected = f'{NET}: no blob "feet" in this net; did you mean "feat"? it has: pair_data, sim, data, '
+    assert run("extract", *words).fault.startswith(expected)
+    assert run("extract", *words, "--images", "pairs", "--shape", "data=1,1,28,28").status == 1
+    assert not Path("f.npz").exists()
+
+
+# extract_features
+
+
+def test_extract_features_writes_what_caffes_did(run: Run) -> None:
+    result = run("extract_features", INIT, NET, "feat,sim", "feat_lmdb,sim_lmdb", 4, "lmdb", "CPU")
+    assert result.status == 0
+    golden = (GOLDEN / "log" / "extract_features.log").read_text().splitlines()
+    told = [line for line in result.messages if "blob sim" not in line]
+    assert told == [line.partition("] ")[2] for line in golden]
+    ours, caffes = open_reader("feat_lmdb"), open_reader(str(GOLDEN / "features" / "feat_lmdb"))
+    assert len(ours) == len(caffes) == 200
+    for i in range(200):
+        assert ours.key(i) == caffes.key(i)
+        found, expected = (datum_to_array(parse_datum(db.record(i))) for db in (ours, caffes))
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_extract_features_says_in_one_line_what_is_wrong(run: Run) -> None:
+    def fault(*words: str) -> str:
+        return run("extract_features", INIT, NET, *words).fault
+
+    assert 'no blob "feet" in this net; it has: pair_data, ' in fault("feet", "db", "1", "lmdb")
+    assert "found 2 blob names and 1 databases, expected as many" in fault("feat,sim", "db", "1", "lmdb")
+    Path("db").mkdir()
+    assert fault("feat", "db", "1", "lmdb").startswith("db: exists already; ")

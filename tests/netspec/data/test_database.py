@@ -1,0 +1,273 @@
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+
+import lmdb
+import numpy as np
+import pytest
+
+from netspec.data import database
+from netspec.data.database import Writer, open_reader
+from netspec.errors import SpecError, Where
+from paths import GOLDEN
+
+PLACE = Where("net.prototxt", 7, 3)
+
+
+def write(path: Path, records: dict[bytes, bytes], backend: str = "lmdb") -> None:
+    with Writer(str(path), backend) as writer:
+        for key, value in records.items():
+            writer.put(key, value)
+
+
+def test_records_come_in_the_order_of_their_keys(tmp_path: Path) -> None:
+    write(tmp_path / "db", {b"b": b"2", b"a": b"1", b"c": b"3"})
+    reader = open_reader(str(tmp_path / "db"))
+    assert [(reader.key(i), reader.record(i)) for i in range(len(reader))] == [(b"a", b"1"), (b"b", b"2"), (b"c", b"3")]
+
+
+def test_any_record_is_found_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "_SCAN", 10)  # keys are listed in several goes
+    reader = open_reader(str(GOLDEN / "pairs" / "train_lmdb"))
+    for i in (639, 5, 300):
+        assert reader.key(i) == b"%08d" % i
+        assert len(reader.record(i)) == 1579
+
+
+def test_caffes_own_database_is_read_without_leaving_a_lock_beside_it() -> None:
+    assert len(open_reader(str(GOLDEN / "features" / "feat_lmdb"))) == 200
+    assert os.listdir(GOLDEN / "features" / "feat_lmdb") == ["data.mdb"]
+
+
+def test_readers_work_in_threads() -> None:
+    path = str(GOLDEN / "pairs" / "train_lmdb")
+    expected = [open_reader(path).record(i) for i in range(640)]
+    found: dict[int, list[bytes]] = {}
+
+    def read(number: int) -> None:
+        reader = open_reader(path)
+        found[number] = [reader.record(i) for i in range(640)]
+
+    threads = [threading.Thread(target=read, args=(n,)) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert list(found.values()) == [expected] * 4
+
+
+def test_a_reader_works_in_a_forked_worker() -> None:
+    reader = open_reader(str(GOLDEN / "pairs" / "test_lmdb"))
+    expected = reader.record(3)
+    child = os.fork()
+    if not child:
+        os._exit(0 if reader.record(3) == expected and reader.key(199) == b"00000199" else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_two_layers_may_read_one_database() -> None:
+    path = str(GOLDEN / "pairs" / "test_lmdb")
+    first, second = open_reader(path), open_reader(path)
+    assert first.record(0) == second.record(0)
+
+
+def test_readers_come_and_go_in_threads() -> None:  # liblmdb must not open what is still being closed
+    faults: list[Exception] = []
+
+    def come_and_go() -> None:
+        for _ in range(200):
+            try:
+                open_reader(str(GOLDEN / "pairs" / "test_lmdb")).record(5)
+            except SpecError as fault:
+                faults.append(fault)
+
+    threads = [threading.Thread(target=come_and_go) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not faults
+
+
+def test_a_database_that_other_code_holds_open_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object, **options: object) -> None:
+        raise lmdb.Error("The environment is already open in this process.")
+
+    monkeypatch.setattr(database, "_PATIENCE", 0.02)
+    monkeypatch.setattr(database.lmdb, "open", refuse)
+    with pytest.raises(SpecError, match="already open in this process"):
+        open_reader(str(GOLDEN / "images" / "lmdb_gray"))
+
+
+def test_a_database_made_anew_at_the_same_path_is_read_anew(tmp_path: Path) -> None:
+    write(tmp_path / "db", {b"a": b"old"})
+    old = open_reader(str(tmp_path / "db"))
+    (tmp_path / "db").rename(tmp_path / "before")
+    write(tmp_path / "db", {b"a": b"new"})
+    assert (open_reader(str(tmp_path / "db")).record(0), old.record(0)) == (b"new", b"old")
+
+
+# What is wrong with a source, in one line at the place that names it
+
+
+def make_nothing(path: Path) -> None:
+    pass
+
+
+def make_file(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def make_empty_folder(path: Path) -> None:
+    path.mkdir()
+
+
+def make_never_written(path: Path) -> None:
+    path.mkdir()
+    (path / "data.mdb").write_bytes(b"")
+
+
+def make_no_lmdb(path: Path) -> None:
+    path.mkdir()
+    (path / "data.mdb").write_bytes(b"hello" * 4000)
+
+
+def make_without_records(path: Path) -> None:
+    write(path, {})
+
+
+def make_cut_short(path: Path) -> None:
+    write(path, {b"%08d" % i: bytes(3000) for i in range(100)})
+    os.truncate(path / "data.mdb", 100_000)
+
+
+def make_leveldb(path: Path) -> None:
+    path.mkdir()
+    (path / "CURRENT").write_text("MANIFEST-000002\n")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (make_nothing, "is not there"),
+        (make_file, "is a file"),
+        (make_empty_folder, "without data.mdb"),
+        (make_never_written, "empty data.mdb"),
+        (make_no_lmdb, "cannot be opened as an LMDB"),
+        (make_without_records, "is empty: it holds no record"),
+        (make_cut_short, "is cut short"),
+        (make_leveldb, "is of backend LEVELDB, not LMDB; say backend: LEVELDB"),
+    ],
+)
+def test_a_bad_source_is_refused_in_one_line(tmp_path: Path, make: object, message: str) -> None:
+    assert callable(make)
+    make(tmp_path / "db")
+    with pytest.raises(SpecError) as fault:
+        open_reader(str(tmp_path / "db"), "lmdb", PLACE)
+    assert str(fault.value).startswith(f'net.prototxt:7:3: database "{tmp_path}/db" ')
+    assert message in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_an_lmdb_taken_for_a_leveldb_says_what_to_write() -> None:
+    with pytest.raises(SpecError, match=r"LEVELDB is Caffe's default\); say backend: LMDB"):
+        open_reader(str(GOLDEN / "pairs" / "test_lmdb"), "leveldb", PLACE)
+
+
+# Writing
+
+
+def test_the_map_grows_with_the_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "_FIRST_MAP_SIZE", 1 << 20)
+    rng = np.random.default_rng(0)
+    records = {b"%08d" % i: rng.bytes(int(size)) for i, size in enumerate(rng.integers(1, 60_000, 300))}
+    records[b"large"] = rng.bytes(5_000_000)
+    write(tmp_path / "db", records)
+    reader = open_reader(str(tmp_path / "db"))
+    assert {reader.key(i): reader.record(i) for i in range(len(reader))} == records
+
+
+def test_records_may_come_in_any_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "_FIRST_MAP_SIZE", 1 << 20)
+    rng = np.random.default_rng(0)
+    records = {b"%08d" % i: rng.bytes(3000) for i in rng.permutation(2500)}
+    write(tmp_path / "db", records)
+    reader = open_reader(str(tmp_path / "db"))
+    assert [reader.key(i) for i in range(2500)] == sorted(records)
+    assert all(reader.record(i) == records[reader.key(i)] for i in range(0, 2500, 7))
+
+
+def test_the_file_is_one_that_plain_liblmdb_opens(tmp_path: Path) -> None:
+    write(tmp_path / "db", {b"a": b"1"})
+    assert os.listdir(tmp_path / "db") == ["data.mdb"]
+    with lmdb.open(str(tmp_path / "db"), map_size=1 << 40) as env, env.begin() as transaction:  # Caffe's map size
+        assert transaction.get(b"a") == b"1"
+
+
+def test_an_existing_path_is_refused_and_kept(tmp_path: Path) -> None:
+    write(tmp_path / "db", {b"a": b"1"})
+    with pytest.raises(SpecError, match="exists already"):
+        write(tmp_path / "db", {b"a": b"2"})
+    assert open_reader(str(tmp_path / "db")).record(0) == b"1"
+
+
+def test_the_database_appears_only_when_it_is_whole(tmp_path: Path) -> None:
+    with Writer(str(tmp_path / "db")) as writer:
+        writer.put(b"a", b"1")
+        writer.commit()
+        assert not (tmp_path / "db").exists()
+    assert (tmp_path / "db").exists()
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
+    def put_and_fail(writer: Writer) -> None:
+        writer.put(b"a", b"1")
+        raise RuntimeError("image 2")
+
+    with pytest.raises(RuntimeError, match="image 2"), Writer(str(tmp_path / "db")) as writer:
+        put_and_fail(writer)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_key_that_lmdb_cannot_hold_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match=r'cannot write record "xxx'), Writer(str(tmp_path / "db")) as writer:
+        writer.put(b"x" * 600, b"1")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_missing_folder_is_made_and_one_that_cannot_be_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "new" / "folder" / "db", {})
+    assert os.listdir(tmp_path / "new" / "folder") == ["db"]
+    (tmp_path / "file").touch()
+    with pytest.raises(SpecError, match="cannot write a database here"):
+        write(tmp_path / "file" / "db", {})
+
+
+def test_an_unknown_backend_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match='unknown backend "sqlite"; expected one of: lmdb, leveldb'):
+        write(tmp_path / "db", {}, "sqlite")
+
+
+# LevelDB
+
+
+def test_leveldb_goes_there_and_back(tmp_path: Path) -> None:
+    pytest.importorskip("plyvel")
+    records = {b"%08d" % i: bytes([i % 256]) * i for i in range(2500)}
+    write(tmp_path / "db", records, "leveldb")
+    reader = open_reader(str(tmp_path / "db"), "LEVELDB")
+    assert {reader.key(i): reader.record(i) for i in range(len(reader))} == records
+    assert open_reader(str(tmp_path / "db"), "leveldb").record(3) == b"\x03" * 3  # LevelDB itself would refuse a second
+
+
+def test_without_plyvel_leveldb_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "plyvel", None)
+    make_leveldb(tmp_path / "db")
+    with pytest.raises(SpecError, match="pip install plyvel"):
+        open_reader(str(tmp_path / "db"), "leveldb", PLACE)
+    with pytest.raises(SpecError, match="pip install plyvel"):
+        write(tmp_path / "new", {}, "leveldb")
+    assert os.listdir(tmp_path) == ["db"]

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from netspec.data.images import list_lines, read_image, read_image_list
+from netspec.errors import SpecError, Where
+from paths import GOLDEN
+
+PNG = GOLDEN / "images" / "png"
+
+
+def test_an_image_is_planar_and_blue_green_red() -> None:
+    image = read_image(str(PNG / "0.png"))
+    assert image.shape == (3, 48, 64)
+    assert image.flags.c_contiguous
+    assert (image.transpose(1, 2, 0) == cv2.imread(str(PNG / "0.png"))).all()
+
+
+def test_an_image_is_resized_without_antialiasing(tmp_path: Path) -> None:
+    found = read_image(str(PNG / "0.png"), size=(12, 16))
+    assert (found.transpose(1, 2, 0) == cv2.resize(cv2.imread(str(PNG / "0.png")), (16, 12))).all()
+    stripes = np.zeros((8, 2), np.uint8)
+    stripes[::4] = (
+        255  # bilinear looks between rows 1 and 2, 5 and 6; an average over the area would see the bright ones
+    )
+    cv2.imwrite(str(tmp_path / "stripes.png"), stripes)
+    assert not read_image(str(tmp_path / "stripes.png"), size=(2, 2)).any()
+
+
+def test_a_grey_image_has_one_channel_also_when_resized() -> None:
+    assert read_image(str(PNG / "0.png"), color=False).shape == (1, 48, 64)
+    assert read_image(str(PNG / "0.png"), color=False, size=(5, 6)).shape == (1, 5, 6)
+
+
+def test_a_missing_and_a_broken_image_are_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r'image ".*nix.png" cannot be read: No such file'):
+        read_image(str(tmp_path / "nix.png"))
+    (tmp_path / "text.png").write_text("hello")
+    with pytest.raises(ValueError, match=r'image ".*text.png" cannot be decoded as an image'):
+        read_image(str(tmp_path / "text.png"))
+
+
+def test_lists_are_split_at_the_last_blank(tmp_path: Path) -> None:
+    (tmp_path / "l").write_text("# what this is\n\na b.png 3\n  c.png -1  \r\nd.png\t7\n")
+    images = read_image_list(str(tmp_path / "l"))
+    assert [(image.name, image.label, image.where.line) for image in images] == [
+        ("a b.png", 3, 3),
+        ("c.png", -1, 4),
+        ("d.png", 7, 5),
+    ]
+
+
+@pytest.mark.parametrize("line", ["a.png", "a.png x", "a.png 1.5", "3"])
+def test_a_line_without_a_label_is_named(tmp_path: Path, line: str) -> None:
+    (tmp_path / "l").write_text(f"ok.png 1\n{line}\n")
+    with pytest.raises(SpecError, match=f'l:2:1: found "{line}", expected an image name'):
+        read_image_list(str(tmp_path / "l"))
+
+
+def test_a_list_without_lines_or_without_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "l").write_text("# nothing\n")
+    with pytest.raises(SpecError, match="is empty"):
+        read_image_list(str(tmp_path / "l"))
+    with pytest.raises(SpecError, match=r'^n:4:2: list file ".*nix" cannot be read: No such file'):
+        list(list_lines(str(tmp_path / "nix"), Where("n", 4, 2)))
+    (tmp_path / "l").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SpecError, match="is not UTF-8 text"):
+        list(list_lines(str(tmp_path / "l")))

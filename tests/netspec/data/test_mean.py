@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from netspec.data.database import Writer, open_reader
+from netspec.data.datum import array_to_datum
+from netspec.data.mean import channel_means, compute_mean, read_mean, write_mean
+from netspec.errors import SpecError, Where
+from netspec.proto.schema import BlobProto, BlobShape
+from paths import GOLDEN
+
+PLACE = Where("db")
+
+
+@pytest.mark.parametrize("database", ["lmdb_plain", "lmdb_encoded"])  # the same images
+def test_the_mean_is_caffes_byte_for_byte(tmp_path: Path, database: str) -> None:
+    mean = compute_mean(open_reader(str(GOLDEN / "images" / database)), PLACE)
+    write_mean(str(tmp_path / "mean.binaryproto"), mean)
+    assert (tmp_path / "mean.binaryproto").read_bytes() == (GOLDEN / "images" / "mean.binaryproto").read_bytes()
+    assert (read_mean(str(tmp_path / "mean.binaryproto")) == mean).all()
+
+
+def test_float_records_count_too() -> None:
+    reader = open_reader(str(GOLDEN / "features" / "feat_lmdb"))
+    assert compute_mean(reader, PLACE).shape == (8, 1, 1)
+
+
+def test_channel_means_are_summed_as_caffe_sums_them(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    means = channel_means(read_mean(str(GOLDEN / "images" / "mean.binaryproto")))
+    assert [f"{mean:g}" for mean in means] == ["110.656", "128.153", "122.765"]
+    assert caplog.messages[-1] == "mean_value channel [2]: 122.765"
+    plane = np.random.default_rng(0).uniform(100, 200, 300).astype(np.float32)
+    total = np.float32(0)
+    for value in plane:
+        total += value
+    assert channel_means(plane.reshape(1, 15, 20)) == [float(total / np.float32(300))]
+
+
+def test_an_image_of_another_size_is_named(tmp_path: Path) -> None:
+    with Writer(str(tmp_path / "db")) as writer:
+        for i, width in enumerate((4, 4, 5)):
+            writer.put(b"%08d" % i, array_to_datum(np.zeros((1, 3, width), np.uint8)).SerializeToString())
+    with pytest.raises(
+        SpecError, match=r'^db: record "00000002" is 1 x 3 x 5, but the first one, "00000000", 1 x 3 x 4'
+    ):
+        compute_mean(open_reader(str(tmp_path / "db")), PLACE)
+
+
+def test_means_with_a_new_shape_field_are_read(tmp_path: Path) -> None:
+    proto = BlobProto(shape=BlobShape(dim=[1, 2, 1, 2]), data=[1, 2, 3, 4])
+    (tmp_path / "m").write_bytes(proto.SerializeToString())
+    assert read_mean(str(tmp_path / "m")).tolist() == [[[1, 2]], [[3, 4]]]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\xff\xff", "is no BlobProto of a mean image"),
+        (BlobProto(shape=BlobShape(dim=[2, 2]), data=[1]).SerializeToString(), "1 numbers in data, expected 4"),
+        (BlobProto(shape=BlobShape(dim=[2]), data=[1, 2]).SerializeToString(), r"holds a blob of shape \(2,\)"),
+    ],
+)
+def test_what_is_no_mean_image_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "m").write_bytes(content)
+    with pytest.raises(SpecError, match=message):
+        read_mean(str(tmp_path / "m"), Where("net.prototxt", 2, 5))

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from netspec.data.prefetch import Feed
+from paths import ROOT
+
+
+def slow_square(i: int) -> int:
+    time.sleep(0.002 * (i % 3))
+    return i * i
+
+
+@pytest.mark.parametrize(("ahead", "workers"), [(0, 1), (1, 1), (4, 3)])
+def test_batches_come_in_order_however_many_threads_make_them(ahead: int, workers: int) -> None:
+    feed = Feed(slow_square, ahead, workers)
+    assert [feed.next() for _ in range(20)] == [i * i for i in range(20)]
+    assert feed.position == 20
+    feed.close()
+
+
+def test_batches_are_made_ahead_but_not_far() -> None:
+    made: list[int] = []
+    feed = Feed(made.append, ahead=3, workers=1)
+    feed.next()
+    deadline = time.monotonic() + 5
+    while len(made) < 4 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    time.sleep(0.05)
+    assert made == [0, 1, 2, 3]
+    feed.close()
+
+
+def test_no_thread_runs_before_the_first_batch_or_after_close() -> None:
+    before = set(threading.enumerate())
+    feed = Feed(slow_square, 2, 2)
+    assert not set(threading.enumerate()) - before
+    feed.next()
+    assert set(threading.enumerate()) - before
+    feed.close()
+    assert not set(threading.enumerate()) - before
+    assert feed.next() == 1  # it goes on where it was
+    feed.close()
+
+
+def test_a_feed_that_nobody_needs_any_more_ends_its_threads() -> None:
+    before = set(threading.enumerate())
+    feed = Feed(slow_square, 2, 2)
+    feed.next()
+    threads = set(threading.enumerate()) - before
+    del feed
+    for thread in threads:
+        thread.join(timeout=5)
+        assert not thread.is_alive()
+
+
+def test_restart_goes_anywhere() -> None:
+    feed = Feed(slow_square, 3, 2)
+    feed.next()
+    feed.restart()
+    assert [feed.next(), feed.next()] == [0, 1]
+    feed.restart(100)
+    assert feed.next() == 10_000
+    feed.close()
+
+
+@pytest.mark.parametrize("ahead", [0, 3])
+def test_a_fault_surfaces_in_its_own_turn(ahead: int) -> None:
+    def make(i: int) -> int:
+        if i == 2:
+            raise ValueError(f"record {i}")
+        return i
+
+    feed = Feed(make, ahead, 2)
+    assert [feed.next(), feed.next()] == [0, 1]
+    with pytest.raises(ValueError, match="record 2"):
+        feed.next()
+    assert feed.next() == 3
+    feed.close()
+
+
+def test_the_interpreter_ends_though_nobody_closed_the_feed() -> None:
+    feed = "Feed(lambda i: time.sleep(0.05), 4, 4)"
+    code = f"import time; from netspec.data.prefetch import Feed; {feed}.next(); print('end')"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "end\n", "")

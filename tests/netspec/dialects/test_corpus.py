@@ -1,0 +1,29 @@
+"""Public nets that need a dialect: they build with what their authors' Caffe made of them."""
+
+from pathlib import Path
+
+import pytest
+
+from netspec.check.check import check_file
+from netspec.dialects import use_dialect
+from netspec.proto.text import parse_net
+from paths import SHARED
+
+SENET = SHARED / "corpus" / "hujie-frank+SENet" / "models"
+#: Parameters as the SENet paper has them (table 2 and section 4), in millions, without the batch norms' statistics.
+PARAMETERS = {"SE-ResNet-50": 28.1, "SE-ResNet-101": 49.3, "SE-ResNet-152": 66.8, "SE-ResNeXt-50": 27.6}
+
+
+@pytest.mark.parametrize("path", sorted(SENET.glob("*.prototxt")), ids=lambda path: path.stem)
+def test_senets_build(path: Path) -> None:
+    net, _ = parse_net(path)
+    if any(layer.type == "Axpy" for layer in net.layer):
+        (refused,) = check_file(path, phase=1)
+        assert 'unknown layer type "Axpy"; dialect "blocks" has "Axpy"; add --plugin blocks' in str(refused.faults[0])
+    use_dialect("blocks")
+    (checked,) = check_file(path, phase=1)
+    assert checked.faults == []
+    assert checked.net.shapes["prob"] == (1, 1000)
+    learned = sum(p.parameter.numel() for p in checked.net.learnable if p.lr_mult)
+    if path.stem in PARAMETERS:
+        assert learned / 1e6 == pytest.approx(PARAMETERS[path.stem], abs=0.1)

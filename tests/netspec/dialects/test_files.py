@@ -1,0 +1,263 @@
+"""Dialects are found by name, by entry point and by path; what is wrong with one is said in one line."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netspec
+import netspec.dialects
+from netspec.cli import main
+from netspec.dialects import use_dialect
+from netspec.errors import SpecError
+from netspec.layers import layer_class, layer_types
+from netspec.proto.dialect import files as dialect_files
+from netspec.proto.dialect import registry as dialect
+from netspec.proto.dialect.files import find_file, known_files, read_dialect
+from netspec.proto.text import parse_net_text
+from paths import ROOT
+
+NET = """
+layer { name: "in" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 } } }
+layer { name: "times" type: "Times" bottom: "x" top: "y" times_param { factor: 5 } }
+"""
+
+
+def example() -> str:
+    """The file that the documentation shows."""
+    shown = str(netspec.dialects.__doc__).split("pass ``--plugin doubling.py``::")[1]
+    lines = shown.split("``DECLARATIONS`` is in")[0].splitlines()
+    return "\n".join(line.removeprefix("    ") for line in lines)
+
+
+@pytest.fixture(scope="module")
+def fork(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One file for all tests: what its declarations add stays in the schema's pool, unseen, after a test."""
+    path = tmp_path_factory.mktemp("fork") / "doubling.py"
+    path.write_text(example())
+    path.with_name("net.prototxt").write_text(NET)
+    return path
+
+
+@pytest.fixture
+def files_afresh() -> Iterator[None]:
+    known_files.cache_clear()
+    dialect_files.announce_known.cache_clear()
+    yield
+    known_files.cache_clear()
+    dialect_files.announce_known.cache_clear()
+
+
+# ---- One's own file ----
+
+
+def test_the_documented_example_runs_from_the_command_line(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    net = str(fork.with_name("net.prototxt"))
+    assert main(["check", net]) == 1
+    assert 'LayerParameter has no field "times_param"' in capsys.readouterr().err
+    assert main(["check", net, "--plugin", str(fork)]) == 0
+    assert re.search(r"times +Times +2x3", capsys.readouterr().out)
+    assert main(["-plugin", str(fork), "check", net]) == 2  # an option of the command
+    assert main(["layers", "--plugin", str(fork)]) == 0
+    assert re.search(r"^Times +Multiply by a number\.$", capsys.readouterr().out, re.MULTILINE)
+    assert dialect.active() == ["doubling"]
+
+
+def test_the_documented_example_computes(fork: Path) -> None:
+    netspec.use_dialect(fork)
+    netspec.use_dialect(str(fork))  # again: nothing happens
+    net = netspec.load_net(fork.with_name("net.prototxt"))
+    x = np.arange(6, dtype=np.float32).reshape(2, 3)
+    np.testing.assert_array_equal(net(x=x)["y"].numpy(), 5 * x)
+
+
+def test_upgrading_keeps_a_dialects_fields(fork: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.prototxt"
+    net = str(fork.with_name("net.prototxt"))
+    assert main(["upgrade_net_proto_text", net, str(out), "--plugin", str(fork)]) == 0
+    assert "times_param {\n    factor: 5" in out.read_text()
+
+
+def test_several_plugins_at_once(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["layers", "--plugin", str(fork), "--plugin", "ssd", "--plugin", "blocks"]) == 0
+    found = {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+    assert {"Times", "PriorBox", "MultiBoxLoss", "Axpy", "Convolution"} <= found
+    assert dialect.active() == ["blocks", "doubling", "ssd"]
+
+
+FAULTS = {
+    "no such dialect": (None, "ssdd", 'there is no dialect "ssdd"; did you mean "ssd"?'),
+    "nothing like it": (
+        None,
+        "x" * 20,
+        f'there is no dialect "{"x" * 20}"; known ones: blocks, rcnn, ssd, or the path',
+    ),
+    "no such file": (None, "{path}", "{path}: cannot be read: No such file or directory"),
+    "not text": (b"\xff\xfe", "{path}", "{path}: cannot be read: 'utf-8' codec can't decode"),
+    "not Python": (b"a = 1\nclass B(:\n", "{path}", "{path}:2:9: this is not Python: "),
+    "nothing in it": (b"a = 1\n", "{path}", "{path}: declares no dialect: neither DECLARATIONS nor a layer"),
+    "declarations that are computed": (
+        b"import os\nDECLARATIONS = os.linesep\n",
+        "{path}",
+        "{path}:2:1: DECLARATIONS must be one plain string: it is read without running the file",
+    ),
+    "declarations that are none": (
+        b'"""Mine."""\n\nDECLARATIONS = """\nmessage A {\n  int32 x = 1;\n}\n"""\n',
+        "{path}",
+        '{path}:5:3: expected optional, repeated or required, found "int32"',
+    ),
+    "a field that Caffe has": (
+        b'DECLARATIONS = "extend LayerParameter { optional int32 name = 990; }"\n',
+        "{path}",
+        '{path}: caffe.LayerParameter has a field "name" already',
+    ),
+    "a type that Caffe has": (
+        b'from netspec.layers import *\n@register("ReLU")\nclass A(Layer): pass\n',
+        "{path}",
+        '{path}: layer type "ReLU" is there already, from netspec.layers.activation',
+    ),
+    "a fault when it runs": (
+        b'from netspec.layers import register\n\nregister("Mine")(1 / 0)\n',
+        "{path}",
+        "{path}:3:1: cannot be loaded: ZeroDivisionError: division by zero",
+    ),
+}
+
+
+@pytest.mark.parametrize(("content", "name", "message"), FAULTS.values(), ids=FAULTS.keys())
+def test_faults_are_one_line(
+    content: bytes | None, name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"faulty_{abs(hash(message))}.py"
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["layers", "--plugin", name.format(path=path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(message.format(path=path))
+    assert dialect.active() == []
+
+
+def test_two_dialects_with_one_type_number_or_name_do_not_go_together(fork: Path, tmp_path: Path) -> None:
+    use_dialect(fork)
+    other = tmp_path / "tripling.py"
+    other.write_text('from netspec.layers import Layer, register\n@register("Times")\nclass A(Layer): pass\n')
+    with pytest.raises(SpecError, match='layer type "Times" is there already, from netspec_dialect_doubling'):
+        use_dialect(other)
+    third = tmp_path / "same_number.py"
+    third.write_text('DECLARATIONS = "extend LayerParameter { optional int32 even_more = 1000; }"\n')
+    with pytest.raises(
+        SpecError, match=r'number 1000 of caffe\.LayerParameter is taken, by "times_param" of dialect "doub'
+    ):
+        use_dialect(third)
+    namesake = tmp_path / "elsewhere" / "doubling.py"
+    namesake.parent.mkdir()
+    namesake.write_text('DECLARATIONS = "extend LayerParameter { optional int32 more = 1001; }"\n')
+    with pytest.raises(SpecError, match=rf'^{namesake}: another dialect "doubling" is active, from {fork}$'):
+        use_dialect(namesake)
+
+
+def test_a_file_name_that_is_no_word_will_do(tmp_path: Path) -> None:
+    path = tmp_path / "my-fork 2.py"
+    path.write_text('DECLARATIONS = "extend LayerParameter { optional int32 my_fork = 1002; }"\n')
+    use_dialect(path)
+    assert dialect.active() == ["my_fork_2"]
+    parse_net_text("layer { my_fork: 3 }", "f")
+
+
+# ---- Found without being asked for ----
+
+HINTS = """
+import sys
+from netspec.errors import SpecError
+from netspec.proto.text import parse_net_text
+for text in sys.argv[1:]:
+    try:
+        parse_net_text(text, "f")
+    except SpecError as fault:
+        print(fault)
+print("torch" in sys.modules)
+"""
+
+
+def test_an_unknown_field_names_the_dialect_without_torch() -> None:
+    texts = [
+        "layer { prior_box_param {} }",
+        "layer { dropout_param { scale_train: true } }",
+        "layer { interp_param {} }",
+    ]
+    command = [sys.executable, "-c", HINTS, *texts]
+    lines = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    advice = 'add --plugin ssd, in Python netspec.use_dialect("ssd")'
+    assert (
+        lines[0]
+        == f'f:1:9: LayerParameter has no field "prior_box_param"; dialect "ssd" has "prior_box_param"; {advice}'
+    )
+    assert 'DropoutParameter has no field "scale_train"; dialect "rcnn" has "scale_train"' in lines[1]
+    assert 'dialect "blocks" has "interp_param"; add --plugin blocks' in lines[2]
+    assert lines[3] == "False"
+
+
+def test_an_unknown_type_names_the_dialect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    net = tmp_path / "net.prototxt"
+    for kind, fork in (("MultiBoxLoss", "ssd"), ("Axpy", "blocks"), ("PSROIPooling", "rcnn")):
+        net.write_text(f'layer {{ name: "l" type: "{kind}" top: "x" }}')
+        assert main(["check", str(net)]) == 1
+        assert (
+            f'unknown layer type "{kind}"; dialect "{fork}" has "{kind}"; add --plugin {fork}'
+            in capsys.readouterr().err
+        )
+    net.write_text('layer { name: "l" type: "Convolutoin" top: "x" }')
+    assert main(["check", str(net)]) == 1
+    assert 'unknown layer type "Convolutoin"; did you mean "Convolution"?' in capsys.readouterr().err
+
+
+def test_what_is_read_from_a_files_syntax_is_what_running_it_registers() -> None:
+    for name in known_files():
+        before = set(layer_types())
+        declared = read_dialect(find_file(name))
+        use_dialect(name)
+        assert set(layer_types()) - before == set(declared.layer_types), name
+        assert declared.fields()
+
+
+# ---- Entry points ----
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_afresh: None) -> Iterator[Path]:
+    """An installed package with three entry points: a dialect, one that does not exist, and one that is none."""
+    folder = tmp_path / "site" / "forky"
+    info = tmp_path / "site" / "forky-1.0.dist-info"
+    for made in (folder, info):
+        made.mkdir(parents=True)
+    (folder / "__init__.py").write_text("")
+    renamed = example().replace("Times", "Thrice").replace("times_param", "thrice_param").replace("1000", "1003")
+    (folder / "doubling.py").write_text(renamed)
+    (folder / "nothing.py").write_text("")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: forky\nVersion: 1.0\n")
+    points = "doubling_too = forky.doubling\nabsent = forky.absent\nnothing = forky.nothing\n"
+    (info / "entry_points.txt").write_text(f"[netspec.dialects]\n{points}")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    yield folder
+    for name in [name for name in sys.modules if name.partition(".")[0] == "forky"]:
+        del sys.modules[name]
+
+
+@pytest.mark.usefixtures("package")
+def test_a_packages_entry_point_is_hinted_at_and_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    net = tmp_path / "net.prototxt"
+    net.write_text(NET.replace("Times", "Thrice").replace("times_param", "thrice_param"))
+    assert main(["check", str(net)]) == 1
+    error = capsys.readouterr().err
+    assert 'dialect "doubling_too" has "thrice_param"; add --plugin doubling_too' in error
+    assert 'dialect "absent": there is no module forky.absent; it is left out' in error
+    assert 'dialect "nothing" is left out: ' in error
+    assert "forky.doubling" not in sys.modules
+    assert main(["check", str(net), "--plugin", "doubling_too"]) == 0
+    cls = layer_class("Thrice")
+    assert cls is not None
+    assert cls.__module__ == "forky.doubling"

@@ -1,0 +1,198 @@
+"""The activations: their functions, their gradients, and what Caffe does at the corners."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+
+X = torch.tensor([-70.0, -3.0, -0.4, 0.0, 0.2, 1.0, 2.5, 70.0])
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+ORACLES = {
+    'type: "ReLU"': lambda x: np.maximum(x, 0),
+    'type: "ReLU" relu_param { negative_slope: 0.1 }': lambda x: np.where(x > 0, x, 0.1 * x),
+    'type: "PReLU" prelu_param { channel_shared: true }': lambda x: np.where(x > 0, x, 0.25 * x),
+    'type: "ELU" elu_param { alpha: 2 }': lambda x: np.where(x > 0, x, 2 * (np.exp(np.minimum(x, 0)) - 1)),
+    'type: "Sigmoid"': sigmoid,
+    'type: "TanH"': np.tanh,
+    'type: "AbsVal"': np.abs,
+    'type: "Power" power_param { power: 2 scale: 3 shift: -1 }': lambda x: (3 * x - 1) ** 2,
+    'type: "Power" power_param { scale: 3 shift: -1 }': lambda x: 3 * x - 1,
+    'type: "Exp" exp_param { scale: 0.1 shift: 0.5 }': lambda x: np.exp(0.1 * x + 0.5),
+    'type: "Exp" exp_param { base: 2 scale: 0.5 shift: 1 }': lambda x: 2.0 ** (0.5 * x + 1),
+    'type: "Log" log_param { shift: 71 }': lambda x: np.log(x + 71),
+    'type: "Log" log_param { base: 10 scale: -2 shift: 141 }': lambda x: np.log10(141 - 2 * x),
+    'type: "BNLL"': lambda x: np.logaddexp(x, 0),
+    'type: "Threshold" threshold_param { threshold: 0.3 }': lambda x: (x > 0.3) * 1.0,
+    'type: "Clip" clip_param { min: -0.5 max: 1.5 }': lambda x: np.clip(x, -0.5, 1.5),
+    'type: "Swish"': lambda x: x * sigmoid(x),
+    'type: "Swish" swish_param { beta: 0.5 }': lambda x: x * sigmoid(0.5 * x),
+}
+
+
+@pytest.mark.parametrize("text", ORACLES)
+def test_activation_is_its_formula(build, text: str) -> None:
+    layer = build(text, (2, 4))
+    top = layer.run(X.reshape(2, 4))[0]
+    assert layer.top_shapes == [(2, 4)]
+    expected = ORACLES[text](X.double().numpy()).reshape(2, 4)
+    np.testing.assert_allclose(top.detach().numpy(), expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("text", [t for t in ORACLES if "Threshold" not in t])
+def test_activation_gradient_is_the_derivative(build, gradcheck, text: str) -> None:
+    gradcheck(build(text, (3, 2)), torch.tensor([[-3.0, -0.4], [0.2, 1.0], [2.5, 4.0]]))
+
+
+@pytest.mark.parametrize("text", ORACLES)
+def test_activation_takes_batches_of_other_sizes(build, text: str) -> None:
+    layer = build(text, (2, 4))
+    assert layer.run(X.reshape(4, 2))[0].shape == (4, 2)
+    assert layer.top_shapes == [(4, 2)]
+
+
+def gradient_at(layer, x: float) -> float:
+    bottom = torch.tensor([[x]], requires_grad=True)
+    layer.run(bottom)[0].sum().backward()
+    assert bottom.grad is not None
+    return bottom.grad.item()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('type: "ReLU"', 0),
+        ('type: "ReLU" relu_param { negative_slope: 0.5 }', 0.5),
+        ('type: "PReLU"', 0.25),
+        ('type: "ELU" elu_param { alpha: 3 }', 3),
+        ('type: "AbsVal"', 0),
+    ],
+)
+def test_gradient_at_zero_is_the_negative_sides(build, text: str, expected: float) -> None:
+    assert gradient_at(build(text, (1, 1)), 0.0) == expected
+
+
+def test_elu_takes_exp_minus_one_not_expm1(build) -> None:
+    x = torch.tensor([[-1e-4]])
+    assert build('type: "ELU"', (1, 1)).run(x)[0].item() == (torch.exp(x) - 1).item() != torch.expm1(x).item()
+
+
+def test_threshold_is_strict(build) -> None:
+    layer = build('type: "Threshold" threshold_param { threshold: 0.5 }', (3,))
+    top = layer.run(torch.tensor([0.4, 0.5, 0.6], requires_grad=True))[0]
+    assert top.tolist() == [0, 0, 1]
+    assert not top.requires_grad
+
+
+def test_clip_passes_gradients_at_both_ends(build) -> None:
+    layer = build('type: "Clip" clip_param { min: -0.5 max: 0.75 }', (1, 1))
+    assert [gradient_at(layer, x) for x in (-0.75, -0.5, 0.0, 0.75, 1.0)] == [0, 1, 1, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("power: 0 shift: -2", 1), ("power: 3 scale: 0 shift: 2", 8), ("power: 0 scale: 0", 1)],
+)
+def test_power_ignores_the_bottom_where_scale_or_power_is_zero(build, text: str, value: float) -> None:
+    layer = build(f'type: "Power" power_param {{ {text} }}', (3,))
+    assert layer.run(torch.tensor([math.nan, math.inf, 1.0]))[0].tolist() == [value] * 3
+
+
+def test_power_without_shift_has_a_gradient_at_zero(build) -> None:
+    # Caffe's is power * top / bottom: 0 / 0.
+    assert gradient_at(build('type: "Power" power_param { power: 3 }', (1, 1)), 0.0) == 0
+    assert gradient_at(build('type: "Power" power_param { power: 2 scale: 5 }', (1, 1)), 0.0) == 0
+
+
+def test_exp_with_a_large_shift_overflows_to_infinity_only_where_the_result_does(build) -> None:
+    layer = build('type: "Exp" exp_param { shift: 1000 }', (2,))
+    top = layer.run(torch.tensor([-1000.0, 0.0]))[0]
+    assert top.tolist() == [1, math.inf]
+
+
+def test_prelu_learns_one_slope_a_channel_or_one_for_all(build, gradcheck) -> None:
+    bottom = torch.tensor([[[-1.0, 2.0], [-3.0, -4.0], [5.0, -6.0]]])
+    layer = build('type: "PReLU"', (1, 3, 2))
+    assert layer.blob_shapes == [(3,)]
+    assert layer.blobs[0].tolist() == [0.25] * 3
+    layer.run(bottom)[0].sum().backward()
+    assert layer.blobs[0].grad.tolist() == [-1, -7, -6]
+
+    shared = build('type: "PReLU" prelu_param { channel_shared: true filler { value: 0.5 } }', (1, 3, 2))
+    assert shared.blob_shapes == [()]
+    shared.run(bottom)[0].sum().backward()
+    assert (shared.blobs[0].item(), shared.blobs[0].grad.item()) == (0.5, -14)
+    gradcheck(layer, torch.randn(2, 3, 4))
+
+
+@pytest.mark.parametrize(
+    ("text", "shapes", "message"),
+    [
+        ('type: "PReLU"', [(3,)], "bottom: bottom has shape (3,), expected at least 2 axes (N, C, ...)"),
+        (
+            'type: "Exp" exp_param { base: -2 }',
+            [(3,)],
+            "exp_param.base: found base -2, expected a positive one, or -1 for e",
+        ),
+        (
+            'type: "Log" log_param { base: 1 }',
+            [(3,)],
+            "log_param.base: found base 1, expected a positive one other than 1, or -1 for e",
+        ),
+        ('type: "ReLU"', [(3,), (3,)], "bottom: found 2 bottom blob(s), expected 1"),
+    ],
+)
+def test_bad_activation_is_refused(build, text: str, shapes: list, message: str) -> None:
+    with pytest.raises(SpecError) as fault:
+        build(text, *shapes)
+    assert str(fault.value) == message
+
+
+def test_clip_without_both_ends_is_refused(build) -> None:
+    from netspec.layers import layer_class
+    from netspec.proto.schema import LayerParameter
+
+    param = LayerParameter(type="Clip", bottom=["x"], top=["y"])
+    param.clip_param.min = 0
+    with pytest.raises(SpecError, match="clip_param has no max; both min and max are required"):
+        layer_class("Clip")(param, [(3,)])
+
+
+# What Caffe's backward makes of memory that was written over (net/in_place.py): bottom and top are any data.
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('type: "ReLU"', lambda b, t: b > 0),
+        ('type: "ReLU" relu_param { negative_slope: 0.1 }', lambda b, t: np.where(b > 0, 1, 0.1)),
+        ('type: "ELU" elu_param { alpha: 2 }', lambda b, t: np.where(b > 0, 1, 2 + t)),
+        ('type: "Sigmoid"', lambda b, t: t * (1 - t)),
+        ('type: "TanH"', lambda b, t: 1 - t**2),
+        ('type: "Power" power_param { power: 3 scale: 2 shift: 1 }', lambda b, t: 6 * t / (2 * b + 1)),
+        ('type: "Power" power_param { power: 3 scale: 2 }', lambda b, t: 3 * t / b),
+        ('type: "Power" power_param { power: 2 scale: 2 shift: 1 }', lambda b, t: 4 * (2 * b + 1)),
+        ('type: "Power" power_param { scale: 2 shift: 1 }', lambda b, t: 0 * b + 2),
+        ('type: "Power" power_param { power: 0 }', lambda b, t: 0 * b),
+        ('type: "Exp" exp_param { base: 2 scale: 3 shift: 1 }', lambda b, t: t * 3 * math.log(2)),
+        ('type: "Log" log_param { base: 2 scale: 3 shift: 5 }', lambda b, t: 3 / math.log(2) / (3 * b + 5)),
+        ('type: "BNLL"', lambda b, t: sigmoid(b)),
+        ('type: "Swish" swish_param { beta: 2 }', lambda b, t: 2 * t + sigmoid(2 * b) * (1 - 2 * t)),
+        ('type: "Clip" clip_param { min: -0.5 max: 0.75 }', lambda b, t: (b >= -0.5) & (b <= 0.75)),
+    ],
+)
+def test_gradient_is_made_of_what_memory_holds(build, text: str, expected) -> None:
+    bottom = torch.tensor([-1.5, -0.4, 0.25, 0.75, 2.0], dtype=torch.double)
+    top = torch.tensor([0.3, -0.2, 0.5, 1.5, -4.0], dtype=torch.double)
+    diff = torch.tensor([1.0, 2.0, -3.0, 0.5, 4.0], dtype=torch.double)
+    layer = build(text, (5,))
+    assert layer.gradient_reads
+    found = layer.gradient_in_place(bottom, top, diff).numpy()
+    np.testing.assert_allclose(found, diff.numpy() * expected(bottom.numpy(), top.numpy()), rtol=1e-6)

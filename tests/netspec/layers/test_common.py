@@ -1,0 +1,138 @@
+"""InnerProduct, Dropout and Embed."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+from netspec.proto.schema import TEST, TRAIN
+
+FILL = 'weight_filler { type: "gaussian" } bias_filler { type: "gaussian" }'
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2, 3, -1, -2])
+@pytest.mark.parametrize("transpose", [False, True])
+def test_inner_product_flattens_from_axis_on(build, axis: int, transpose: bool) -> None:
+    settings = f"num_output: 6 axis: {axis} transpose: {str(transpose).lower()} {FILL}"
+    data = torch.randn(2, 3, 4, 5)
+    layer = build(f'type: "InnerProduct" inner_product_param {{ {settings} }}', data.shape)
+    outer, length = data.shape[:axis], math.prod(data.shape[axis:])
+    assert layer.blob_shapes == [(length, 6) if transpose else (6, length), (6,)]
+    weight, bias = (blob.detach().numpy() for blob in layer.blobs)
+    rows = data.numpy().reshape(-1, length)
+    expected = rows @ (weight if transpose else weight.T) + bias
+    (top,) = layer.run(data)
+    assert layer.top_shapes == [(*outer, 6)] == [tuple(top.shape)]
+    np.testing.assert_allclose(top.detach().numpy().reshape(-1, 6), expected, atol=1e-4)
+    assert layer.multiply_adds() == math.prod(outer) * 6 * length
+
+
+@pytest.mark.parametrize("settings", ["", "transpose: true", "bias_term: false", "axis: 2"])
+def test_inner_product_gradients(build, gradcheck, settings: str) -> None:
+    layer = build(f'type: "InnerProduct" inner_product_param {{ num_output: 3 {settings} {FILL} }}', (2, 3, 2, 2))
+    gradcheck(layer, torch.randn(2, 3, 2, 2))
+
+
+def test_inner_product_takes_another_batch_but_no_other_length(build) -> None:
+    layer = build('type: "InnerProduct" inner_product_param { num_output: 3 }', (2, 3, 4))
+    assert layer.run(torch.randn(7, 4, 3))[0].shape == (7, 3)  # only the count matters
+    with pytest.raises(SpecError, match=r"^bottom: .* has 15 values from axis 1 on, the weights 12"):
+        layer.run(torch.randn(2, 3, 5))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ("", "inner_product_param.num_output: num_output must be at least 1"),
+        ("num_output: 3 axis: 2", "inner_product_param.axis: axis 2 is out of range"),
+        ('num_output: 3 weight_filler { type: "gauss" }', 'unknown filler "gauss"; did you mean'),
+    ],
+)
+def test_a_wrong_inner_product_is_refused(build, settings: str, words: str) -> None:
+    with pytest.raises(SpecError) as error:
+        build(f'type: "InnerProduct" inner_product_param {{ {settings} }}', (2, 3))
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.5, 0.8])
+def test_dropout_zeroes_a_share_and_scales_the_rest_in_training(build, ratio: float) -> None:
+    layer = build(f'type: "Dropout" dropout_param {{ dropout_ratio: {ratio} }}', (40, 1000), phase=TRAIN)
+    data = (torch.rand(40, 1000) + 1).requires_grad_()
+    (top,) = layer.run(data)
+    kept = top != 0
+    assert float(kept.float().mean()) == pytest.approx(1 - ratio, abs=6 * 0.5 / math.sqrt(40000))
+    torch.testing.assert_close(top, torch.where(kept, data / (1 - ratio), 0))
+    top.sum().backward()
+    torch.testing.assert_close(data.grad, kept / (1 - ratio))  # the same mask backward
+    assert not torch.equal(kept, layer.run(data)[0] != 0)  # another one next time
+
+
+def test_dropout_repeats_itself_from_its_seed(build) -> None:
+    text, data = 'type: "Dropout"', torch.ones(50, 50)
+    first = build(text, (50, 50), phase=TRAIN, seed=3).run(data)[0]
+    assert torch.equal(first, build(text, (50, 50), phase=TRAIN, seed=3).run(data)[0])
+    assert not torch.equal(first, build(text, (50, 50), phase=TRAIN, seed=4).run(data)[0])
+    assert set(first.flatten().tolist()) == {0.0, 2.0}  # 0.5 is the default ratio
+
+
+def test_dropout_changes_nothing_in_the_test_phase(build) -> None:
+    data = torch.randn(3, 4)
+    assert torch.equal(build('type: "Dropout"', (3, 4), phase=TEST).run(data)[0], data)
+
+
+def test_the_phase_of_a_layer_wins_over_the_nets(build) -> None:
+    data = torch.ones(10, 100)
+    assert torch.equal(build('type: "Dropout" phase: TEST', data.shape, phase=TRAIN).run(data)[0], data)
+
+
+@pytest.mark.parametrize("ratio", [-0.1, 1, 1.5])
+def test_an_impossible_dropout_ratio_is_refused(build, ratio: float) -> None:
+    with pytest.raises(SpecError, match=r"^dropout_param\.dropout_ratio: dropout_ratio must be at least 0 and less"):
+        build(f'type: "Dropout" dropout_param {{ dropout_ratio: {ratio} }}', (2, 3))
+
+
+def test_embed_looks_rows_up_and_adds_up_their_gradients(build) -> None:
+    layer = build(f'type: "Embed" embed_param {{ num_output: 3 input_dim: 5 {FILL} }}', (2, 4))
+    index = torch.tensor([[0, 4, 2, 2], [1, 2, 0, 4]])
+    rows, bias = layer.blobs
+    (top,) = layer.run(index.float())
+    assert layer.top_shapes == [(2, 4, 3)]
+    torch.testing.assert_close(top, rows[index] + bias)
+    top.backward(torch.ones_like(top))
+    assert rows.grad[:, 0].tolist() == [2, 1, 3, 0, 2]
+    assert bias.grad.tolist() == [8, 8, 8]
+
+
+def test_embed_without_bias_takes_another_shape(build) -> None:
+    layer = build(f'type: "Embed" embed_param {{ num_output: 3 input_dim: 5 bias_term: false {FILL} }}', (2,))
+    assert len(layer.blobs) == 1
+    torch.testing.assert_close(layer.run(torch.tensor([[3.0]]))[0], layer.blobs[0][3].reshape(1, 1, 3))
+
+
+@pytest.mark.parametrize("index", [-1.0, 5.0, 1.5, math.nan])
+def test_embed_refuses_what_is_no_index(build, index: float) -> None:
+    layer = build('type: "Embed" embed_param { num_output: 3 input_dim: 5 }', (2,))
+    with pytest.raises(SpecError, match=rf"^bottom: found the index {index:g}, expected whole numbers from 0 to 4"):
+        layer.run(torch.tensor([1.0, index]))
+
+
+@pytest.mark.parametrize("missing", ["num_output", "input_dim"])
+def test_embed_needs_both_its_sizes(build, missing: str) -> None:
+    given = "input_dim" if missing == "num_output" else "num_output"
+    with pytest.raises(SpecError, match=rf"^embed_param\.{missing}: {missing} must be at least 1"):
+        build(f'type: "Embed" embed_param {{ {given}: 4 }}', (2,))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'type: "Input" input_param { shape { dim: 2 dim: -3 } }',
+        'type: "DummyData" dummy_data_param { shape { dim: 2 dim: -3 } }',
+        'type: "Parameter" parameter_param { shape { dim: 2 dim: -3 } }',
+    ],
+)
+def test_no_blob_has_a_size_below_0(build, text: str) -> None:
+    with pytest.raises(SpecError, match=r"found shape \(2, -3\), expected no size below 0"):
+        build(text)

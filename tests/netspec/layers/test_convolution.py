@@ -1,0 +1,283 @@
+"""Convolution, Deconvolution, Im2col and Crop beside plain loops, at random settings; their corners; their refusals."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+
+FILL = 'weight_filler { type: "gaussian" } bias_filler { type: "gaussian" }'
+
+
+def positions(bottom: tuple, kernel: tuple, stride: tuple, pad: tuple, dilation: tuple) -> tuple[int, ...]:
+    """Return how often a filter fits along each axis; the quotient rounds towards zero, as in C++."""
+    sizes = zip(bottom, kernel, stride, pad, dilation, strict=True)
+    return tuple(math.trunc((n + 2 * p - d * (k - 1) - 1) / s) + 1 for n, k, s, p, d in sizes)
+
+
+def taps(bottom: tuple, top: tuple, kernel: tuple, stride: tuple, pad: tuple, dilation: tuple):
+    """Yield (top position, filter position, bottom position) of each pixel that a sliding filter meets."""
+    for y in np.ndindex(*top):
+        for k in np.ndindex(*kernel):
+            x = tuple(i * s - p + j * d for i, s, p, j, d in zip(y, stride, pad, k, dilation, strict=True))
+            if all(0 <= i < n for i, n in zip(x, bottom, strict=True)):
+                yield y, k, x
+
+
+def correlate(data: np.ndarray, weight: np.ndarray, bias: np.ndarray, group: int, *geometry: tuple) -> np.ndarray:
+    top = positions(data.shape[2:], weight.shape[2:], *geometry)
+    result = np.zeros((data.shape[0], weight.shape[0], *top)) + bias.reshape(1, -1, *(1,) * len(top))
+    for y, k, x in taps(data.shape[2:], top, weight.shape[2:], *geometry):
+        for g in range(group):
+            inside = slice(g * weight.shape[1], (g + 1) * weight.shape[1])
+            out = slice(g * weight.shape[0] // group, (g + 1) * weight.shape[0] // group)
+            result[(slice(None), out, *y)] += data[(slice(None), inside, *x)] @ weight[(out, slice(None), *k)].T
+    return result
+
+
+def spread(data: np.ndarray, weight: np.ndarray, bias: np.ndarray, group: int, *geometry: tuple) -> np.ndarray:
+    stride, pad, dilation = geometry
+    sizes = zip(data.shape[2:], weight.shape[2:], stride, pad, dilation, strict=True)
+    top = tuple(s * (n - 1) + d * (k - 1) + 1 - 2 * p for n, k, s, p, d in sizes)
+    result = np.zeros((data.shape[0], weight.shape[1] * group, *top)) + bias.reshape(1, -1, *(1,) * len(top))
+    for x, k, y in taps(top, data.shape[2:], weight.shape[2:], *geometry):  # the same pairs, walked the other way
+        for g in range(group):
+            inside = slice(g * weight.shape[0] // group, (g + 1) * weight.shape[0] // group)
+            out = slice(g * weight.shape[1], (g + 1) * weight.shape[1])
+            result[(slice(None), out, *y)] += data[(slice(None), inside, *x)] @ weight[(inside, slice(None), *k)]
+    return result
+
+
+def repeated(name: str, values: tuple) -> str:
+    return " ".join(f"{name}: {v}" for v in values)
+
+
+def geometry_text(kernel: tuple, stride: tuple, pad: tuple, dilation: tuple) -> str:
+    names = ("kernel_size", "stride", "pad", "dilation")
+    return " ".join(map(repeated, names, (kernel, stride, pad, dilation)))
+
+
+@pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
+@pytest.mark.parametrize("axes", [1, 2, 3])
+def test_filters_agree_with_plain_loops_at_random_settings(build, kind: str, axes: int) -> None:
+    random = np.random.default_rng(axes)
+    for _ in range(12):
+        group = int(random.integers(1, 4))
+        channels, outputs = (int(group * random.integers(1, 3)) for _ in range(2))
+        kernel, stride, dilation = (tuple(map(int, random.integers(1, 4, axes))) for _ in range(3))
+        pad = tuple(int(random.integers(0, k)) for k in kernel)
+        data = random.standard_normal((2, channels, *map(int, random.integers(4, 8, axes)))).astype(np.float32)
+        if kind == "Convolution" and min(positions(data.shape[2:], kernel, stride, pad, dilation)) < 1:
+            continue
+        text = f"{geometry_text(kernel, stride, pad, dilation)} num_output: {outputs} group: {group} {FILL}"
+        layer = build(f'type: "{kind}" convolution_param {{ {text} }}', data.shape)
+        weight, bias = (blob.detach().numpy() for blob in layer.blobs)
+        oracle = correlate if kind == "Convolution" else spread
+        expected = oracle(data, weight, bias, group, stride, pad, dilation)
+        (top,) = layer.run(torch.from_numpy(data))
+        assert layer.top_shapes == [expected.shape] == [top.shape], text
+        np.testing.assert_allclose(top.detach(), expected, atol=2e-5, err_msg=text)
+        assert layer.multiply_adds() == len(data) * np.prod(weight.shape) * np.prod(
+            expected.shape[2:] if kind == "Convolution" else data.shape[2:]
+        )
+
+
+@pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        "kernel_size: 3 stride: 2 pad: 1",
+        "kernel_size: 2 dilation: 2 group: 2",
+        "kernel_h: 1 kernel_w: 3 bias_term: false",
+    ],
+)
+def test_gradients_of_bottom_filters_and_bias(build, gradcheck, kind: str, settings: str) -> None:
+    layer = build(f'type: "{kind}" convolution_param {{ num_output: 2 {settings} {FILL} }}', (2, 4, 4, 5))
+    gradcheck(layer, torch.randn(2, 4, 4, 5))
+
+
+@pytest.mark.parametrize("size", [40, 250])
+def test_the_way_to_sum_does_not_show(build, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = f"num_output: 3 kernel_h: 3 kernel_w: 5 stride: 2 pad: 1 dilation: 2 {FILL}"
+    layer = build(f'type: "Convolution" convolution_param {{ {text} }}', (2, 4, size, size))
+    data = torch.randn(2, 4, size, size, requires_grad=True)
+    found = []
+    for limit in (0, 10**9):
+        monkeypatch.setattr("netspec.exact.functions.MOST_WORK", limit)
+        (top,) = layer.run(data)
+        found.append([top, *torch.autograd.grad(top.square().sum(), [data, *layer.blobs])])
+    for torchs, caffes in zip(*found, strict=True):
+        torch.testing.assert_close(torchs, caffes, rtol=1e-4, atol=1e-4 * float(torchs.detach().abs().max()))
+
+
+def test_bottoms_share_the_filters_and_each_has_its_top(build) -> None:
+    layer = build(
+        f'type: "Convolution" convolution_param {{ num_output: 4 kernel_size: 3 {FILL} }}', *[(2, 3, 6, 6)] * 3, tops=3
+    )
+    assert len(layer.blobs) == 2
+    bottoms = [torch.randn(2, 3, 6, 6) for _ in range(3)]
+    tops = layer.run(*bottoms)
+    for bottom, top in zip(bottoms, tops, strict=True):
+        torch.testing.assert_close(top, torch.nn.functional.conv2d(bottom, *layer.blobs))
+    assert layer.multiply_adds() == 3 * 2 * 16 * 4 * 27
+
+
+def test_axis_says_where_the_channels_are_and_axes_before_it_are_images(build) -> None:
+    text = 'type: "Convolution" convolution_param { num_output: 2 kernel_size: 3 axis: %d ' + FILL + " }"
+    data = torch.randn(2, 5, 3, 6, 7)
+    layer = build(text % -3, data.shape)
+    assert layer.blob_shapes == [(2, 3, 3, 3), (2,)]
+    (top,) = layer.run(data)
+    assert layer.top_shapes == [(2, 5, 2, 4, 5)]
+    torch.testing.assert_close(top[1, 4], torch.nn.functional.conv2d(data[1, 4], *layer.blobs))
+    one_image = build(text % 0, (3, 6, 7))
+    torch.testing.assert_close(one_image.run(data[0, 0])[0], torch.nn.functional.conv2d(data[0, 0], *one_image.blobs))
+
+
+@pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
+def test_a_map_without_spatial_axes_is_a_single_pixel(build, kind: str) -> None:
+    layer = build(f'type: "{kind}" convolution_param {{ num_output: 5 kernel_size: 3 {FILL} }}', (4, 3))
+    weight = layer.blobs[0] if kind == "Convolution" else layer.blobs[0].t()
+    data = torch.randn(4, 3)
+    torch.testing.assert_close(layer.run(data)[0], torch.nn.functional.linear(data, weight, layer.blobs[1]))
+
+
+def test_a_filter_too_long_by_less_than_its_stride_fits_once_over_zeros(build) -> None:
+    """C++ rounds (4 + 0 - 5) / 2 to 0, so Caffe places one filter of 5 on 4 pixels."""
+    text = f"convolution_param {{ num_output: 1 kernel_size: 5 stride: 2 {FILL} }}"
+    data = torch.randn(1, 1, 4, 6)
+    layer = build(f'type: "Convolution" {text}', data.shape)
+    assert layer.top_shapes == [(1, 1, 1, 1)]
+    expected = (data[..., :5] * layer.blobs[0][..., :4, :]).sum() + layer.blobs[1]
+    torch.testing.assert_close(layer.run(data)[0].flatten(), expected)
+    columns = build('type: "Im2col" convolution_param { kernel_size: 5 stride: 2 }', data.shape).run(data)[0]
+    assert columns.flatten()[:20].tolist() == data[..., :5].flatten().tolist()
+    assert columns.flatten()[20:].tolist() == [0] * 5
+
+
+def test_another_batch_or_map_size_is_taken_as_it_comes(build) -> None:
+    layer = build(f'type: "Convolution" convolution_param {{ num_output: 4 kernel_size: 3 {FILL} }}', (2, 3, 6, 6))
+    for shape in ((5, 3, 6, 6), (1, 3, 9, 4), (0, 3, 6, 6)):
+        (top,) = layer.run(torch.randn(shape))
+        assert layer.top_shapes == [tuple(top.shape)] == [(shape[0], 4, shape[2] - 2, shape[3] - 2)]
+    with pytest.raises(SpecError, match=r"^bottom: bottom of shape \(2, 4, 6, 6\) does not suit the filters"):
+        layer.run(torch.randn(2, 4, 6, 6))
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3, 4])
+def test_im2col_agrees_with_plain_loops_at_random_settings(build, axes: int) -> None:
+    random = np.random.default_rng(axes)
+    for _ in range(6):
+        kernel, stride, dilation = (tuple(map(int, random.integers(1, 3, axes))) for _ in range(3))
+        pad = tuple(map(int, random.integers(0, 2, axes)))
+        data = random.standard_normal((2, 3, *map(int, random.integers(3, 6, axes)))).astype(np.float32)
+        top_size = positions(data.shape[2:], kernel, stride, pad, dilation)
+        expected = np.zeros((2, 3, *kernel, *top_size), np.float32)
+        for y, k, x in taps(data.shape[2:], top_size, kernel, stride, pad, dilation):
+            expected[(slice(None), slice(None), *k, *y)] = data[(slice(None), slice(None), *x)]
+        expected = expected.reshape(2, -1, *top_size)
+        text = geometry_text(kernel, stride, pad, dilation)
+        layer = build(f'type: "Im2col" convolution_param {{ {text} }}', data.shape)
+        assert layer.top_shapes == [expected.shape]
+        np.testing.assert_array_equal(layer.run(torch.from_numpy(data))[0], expected, err_msg=text)
+
+
+def test_im2col_gradient(build, gradcheck) -> None:
+    layer = build('type: "Im2col" convolution_param { kernel_size: 3 stride: 2 pad: 1 dilation: 2 }', (2, 2, 6, 5))
+    gradcheck(layer, torch.randn(2, 2, 6, 5))
+
+
+@pytest.mark.parametrize("kind", ["Convolution", "Deconvolution", "Im2col"])
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ("stride: 2", "convolution_param: kernel_size (or kernel_h and kernel_w) is missing"),
+        ("kernel_size: 0", "convolution_param.kernel_size: kernel_size must be at least 1, found 0 x 0"),
+        ("kernel_h: 3", "convolution_param.kernel_h: kernel_h and kernel_w must be at least 1, found 3 x 0"),
+        ("kernel_size: 3 kernel_h: 3", "convolution_param.kernel_h: found both kernel_size and kernel_h"),
+        ("kernel_size: 3 stride: 1 stride_w: 2", "convolution_param.stride_w: found both stride and stride_w"),
+        ("kernel_size: 3 stride_h: 2", "stride_h and stride_w must be at least 1, found 2 x 0"),
+        ("kernel_size: 3 pad: 1 pad_h: 1", "convolution_param.pad_h: found both pad and pad_h"),
+        (
+            "kernel_size: 3 pad: 1 pad: 1 pad: 1",
+            "convolution_param.pad.2: found pad 3 times, expected once or once",
+        ),
+        ("kernel_size: 3 dilation: 0", "convolution_param.dilation: dilation must be at least 1"),
+        ("kernel_size: 3 axis: 4", "convolution_param.axis: axis 4 is out of range"),
+    ],
+)
+def test_a_wrong_geometry_is_refused_at_its_field(build, kind: str, settings: str, words: str) -> None:
+    num_output = "" if kind == "Im2col" else "num_output: 2"
+    with pytest.raises(SpecError) as error:
+        build(f'type: "{kind}" convolution_param {{ {num_output} {settings} }}', (2, 4, 6, 6))
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
+@pytest.mark.parametrize(
+    ("settings", "shape", "words"),
+    [
+        ("kernel_size: 3", (2, 4, 6, 6), "convolution_param.num_output: num_output must be at least 1"),
+        ("num_output: 3 kernel_size: 3 group: 2", (2, 4, 6, 6), "num_output, 3, must be a multiple of group, 2"),
+        (
+            "num_output: 3 kernel_size: 3 group: 3",
+            (2, 4, 6, 6),
+            "channels of the bottom, 4, must be a multiple of",
+        ),
+        ("num_output: 3 kernel_size: 3 group: 0", (2, 4, 6, 6), "must be a multiple of group, 0"),
+        ("num_output: 3 kernel_h: 3 kernel_w: 3", (2, 4, 6), "kernel_h is for 2 spatial axes, the bottom has 1"),
+        ("num_output: 3 kernel_size: 3", (2, 4, 6, 6, 6, 6), "4 spatial axes"),
+        ('num_output: 3 kernel_size: 3 weight_filler { type: "x" }', (2, 4, 6, 6), 'unknown filler "x"'),
+    ],
+)
+def test_wrong_filters_are_refused(build, kind: str, settings: str, shape: tuple, words: str) -> None:
+    with pytest.raises(SpecError) as error:
+        build(f'type: "{kind}" convolution_param {{ {settings} }}', shape)
+    assert words in str(error.value)
+
+
+def test_a_top_without_a_pixel_and_unlike_bottoms_are_refused(build) -> None:
+    text = 'type: "{}" convolution_param {{ num_output: 1 {} }}'
+    with pytest.raises(SpecError, match=r"^convolution_param: the filter does not fit: .*a map of 0 x 3 "):
+        build(text.format("Convolution", "kernel_size: 4"), (1, 1, 3, 6))
+    with pytest.raises(SpecError, match="does not fit"):
+        build(text.format("Deconvolution", "kernel_size: 1 pad: 2"), (1, 1, 4, 4))
+    with pytest.raises(SpecError, match=r"^bottom\.1: all bottoms must have one shape"):
+        build(text.format("Convolution", "kernel_size: 1"), (1, 1, 4, 4), (1, 1, 4, 5), tops=2)
+    with pytest.raises(SpecError, match="1 top blob"):
+        build(text.format("Convolution", "kernel_size: 1"), (1, 1, 4, 4), (1, 1, 4, 4))
+
+
+@pytest.mark.parametrize(
+    ("settings", "window"),
+    [
+        ("", np.s_[:, :, 0:5, 0:6]),  # axis 2 is the default, offset 0
+        ("offset: 2", np.s_[:, :, 2:7, 2:8]),
+        ("offset: 3 offset: 1", np.s_[:, :, 3:8, 1:7]),
+        ("axis: -1 offset: 3", np.s_[:, :, :, 3:9]),
+        ("axis: 1 offset: 1 offset: 0 offset: 2", np.s_[:, 1:3, 0:5, 2:8]),
+    ],
+)
+def test_crop_cuts_the_axes_from_axis_on(build, gradcheck, settings: str, window: tuple) -> None:
+    data, wanted = torch.randn(2, 3, 8, 9), torch.randn(2, 2, 5, 6)
+    layer = build(f'type: "Crop" crop_param {{ {settings} }}', data.shape, wanted.shape)
+    assert torch.equal(layer.run(data, wanted)[0], data[window])
+    gradcheck(layer, data, wanted)
+
+
+@pytest.mark.parametrize(
+    ("settings", "wanted", "words"),
+    [
+        ("offset: 4", (2, 3, 5, 5), "crop_param.offset.0: offset 4 and size 5 of the crop leave axis 2, of size 8"),
+        ("offset: 0 offset: 5", (2, 3, 5, 5), "crop_param.offset.1: offset 5 and size 5 of the crop leave axis 3"),
+        ("axis: 1 offset: 1 offset: 1", (2, 3, 5, 5), "found offset 2 times, expected once or once for each of 3"),
+        ("axis: 4", (2, 3, 5, 5), "crop_param.axis: axis 4 is out of range"),
+        ("", (5, 5), "fewer axes"),
+    ],
+)
+def test_a_crop_that_leaves_the_blob_is_refused(build, settings: str, wanted: tuple, words: str) -> None:
+    with pytest.raises(SpecError) as error:
+        build(f'type: "Crop" crop_param {{ {settings} }}', (2, 3, 8, 9), wanted)
+    assert words in str(error.value)

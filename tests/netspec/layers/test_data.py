@@ -1,0 +1,454 @@
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from google.protobuf import text_format
+
+from netspec.data.database import Writer, open_reader
+from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
+from netspec.errors import SpecError, Where
+from netspec.layers import Context, Layer, Random, layer_class
+from netspec.layers.data.files import ReadingLayer
+from netspec.layers.data.memory import MemoryData
+from netspec.proto.schema import TEST, TRAIN, LayerParameter
+from paths import GOLDEN
+
+PAIRS = GOLDEN / "pairs" / "train_lmdb"
+IMAGES = GOLDEN / "images"
+
+
+def data_layer(text: str, phase: int = TEST, seed: int = 0, device: str = "cpu", **context: Any) -> Layer:
+    param = text_format.Merge(text, LayerParameter())
+    cls = layer_class(param.type)
+    assert cls is not None
+    at = lambda *path: Where("net.prototxt", 1, 2, ".".join(map(str, path)))  # noqa: E731
+    return cls(param, [], Context(phase=phase, random=Random(seed), at=at, device=torch.device(device), **context))
+
+
+def reading(text: str, **context: Any) -> ReadingLayer:
+    layer = data_layer(text, **context)
+    assert isinstance(layer, ReadingLayer)
+    return layer
+
+
+def pairs(
+    batch_size: int = 32, more: str = "", transform: str = "", source: object = PAIRS, **context: Any
+) -> ReadingLayer:
+    return reading(
+        f'name: "pair_data" type: "Data" top: "pair_data" top: "sim" transform_param {{ {transform} }}'
+        f' data_param {{ source: "{source}" batch_size: {batch_size} backend: LMDB {more} }}',
+        **context,
+    )
+
+
+def golden_records() -> list[tuple[np.ndarray, int]]:
+    reader = open_reader(str(PAIRS))
+    datums = [parse_datum(reader.record(i)) for i in range(len(reader))]
+    return [(datum_to_array(datum), datum.label) for datum in datums]
+
+
+# Data
+
+
+def test_data_hands_out_the_records_in_order() -> None:
+    layer = pairs(transform="scale: 0.00390625")
+    assert layer.top_shapes == [(32, 2, 28, 28), (32,)]
+    records = golden_records()
+    for i in range(21):
+        images, labels = layer.run()
+        here = [records[(32 * i + j) % 640] for j in range(32)]
+        assert images.dtype == labels.dtype == torch.float32
+        assert (images.numpy() == np.stack([image for image, _ in here]) / np.float32(256)).all()
+        assert labels.tolist() == [label for _, label in here]
+    assert layer.keys(20) == [f"{k:08d}" for k in range(32)]
+    assert layer.num_records == 640
+    layer.close()
+
+
+@pytest.mark.parametrize("prefetch", [0, 1, 7])
+def test_batches_do_not_depend_on_the_threads(prefetch: int) -> None:
+    transform = "mirror: true crop_size: 20"
+    expected = pairs(50, "prefetch: 0", transform, phase=TRAIN, seed=3)
+    layer = pairs(50, f"prefetch: {prefetch}", transform, phase=TRAIN, seed=3)
+    for _ in range(15):
+        assert torch.equal(layer.run()[0], expected.run()[0])
+    layer.close()
+
+
+def test_restart_returns_to_the_first_record_or_to_any_iteration() -> None:
+    layer = pairs(transform="mirror: true", phase=TRAIN)
+    batches = [layer.run()[0] for _ in range(5)]
+    layer.restart()
+    assert torch.equal(layer.run()[0], batches[0])
+    layer.restart(4)
+    assert layer.iteration == 4
+    assert torch.equal(layer.run()[0], batches[4])
+    layer.close()
+
+
+def test_seed_and_phase_change_the_draws_but_not_the_records() -> None:
+    first, other, test = (
+        pairs(64, transform="crop_size: 20", phase=phase, seed=seed).run()
+        for phase, seed in ((TRAIN, 0), (TRAIN, 1), (TEST, 0))
+    )
+    assert not torch.equal(first[0], other[0])
+    assert not torch.equal(first[0], test[0])
+    assert torch.equal(first[1], other[1])
+
+
+def test_the_log_is_caffes(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    layer = pairs(32)
+    assert caplog.messages == [f"Opened lmdb {PAIRS}", "output data size: 32,2,28,28"]
+    caplog.clear()
+    for _ in range(60):
+        layer.run()
+    # golden/log/caffe_train.log: 60 iterations of 32 pass the last of 640 records three times
+    assert caplog.messages == ["Restarting data prefetching from start."] * 3
+    assert caplog.records[0].__dict__["site"] == "data_layer.cpp:73"
+    layer.close()
+
+
+def test_threads_start_with_the_first_batch_and_end_with_close() -> None:
+    def prefetching() -> int:
+        return sum(thread.name.startswith("prefetch") for thread in threading.enumerate())
+
+    before = prefetching()
+    layer = pairs()
+    assert prefetching() == before
+    layer.run()
+    assert prefetching() > before
+    layer.close()
+    assert prefetching() == before
+
+
+def test_a_label_top_may_be_left_out() -> None:
+    text = f'name: "d" type: "Data" top: "data" data_param {{ source: "{PAIRS}" batch_size: 3 backend: LMDB }}'
+    layer = reading(text)
+    assert layer.top_shapes == [(3, 2, 28, 28)]
+    assert len(layer.run()) == 1
+    layer.close()
+
+
+def test_encoded_records_come_out_as_the_raw_ones() -> None:
+    raw, encoded = (pairs(6, source=IMAGES / name).run()[0] for name in ("lmdb_plain", "lmdb_encoded"))
+    assert torch.equal(raw, encoded)
+    grey = pairs(6, transform="force_gray: true", source=IMAGES / "lmdb_encoded")
+    assert grey.top_shapes[0] == (6, 1, 48, 64)
+
+
+def test_rand_skip_passes_over_the_first_records() -> None:
+    layer = pairs(1, "rand_skip: 500", seed=4)
+    skipped = int(layer.keys(0)[0])
+    assert 0 < skipped < 500
+    assert pairs(1, "rand_skip: 500", seed=4).keys(0) == [f"{skipped:08d}"]
+
+
+def test_a_missing_database_is_refused_at_construction() -> None:
+    with pytest.raises(
+        SpecError, match=r'^net.prototxt:1:2: layer "data_param.source": database "nowhere" is not there'
+    ):
+        pairs(source="nowhere")
+
+
+def test_an_lmdb_without_backend_says_what_to_write() -> None:
+    with pytest.raises(SpecError, match="LEVELDB is Caffe's default"):
+        reading(f'name: "d" type: "Data" top: "data" data_param {{ source: "{PAIRS}" batch_size: 3 }}')
+
+
+def test_a_record_of_another_shape_surfaces_from_the_threads(tmp_path: Path) -> None:
+    with Writer(str(tmp_path / "db")) as writer:
+        for i in range(20):
+            shape = (3, 8, 8) if i != 13 else (3, 8, 9)
+            writer.put(b"%08d" % i, array_to_datum(np.zeros(shape, np.uint8)).SerializeToString())
+    layer = pairs(5, source=tmp_path / "db")
+    layer.run()
+    layer.run()
+    with pytest.raises(SpecError, match='record "00000013" gives 3 x 8 x 9, but the first one, "00000000", 3 x 8 x 8'):
+        layer.run()
+    layer.close()
+
+
+def test_a_batch_of_one_takes_the_shape_of_its_image(tmp_path: Path) -> None:
+    with Writer(str(tmp_path / "db")) as writer:
+        for i, width in enumerate((8, 9)):
+            writer.put(b"%08d" % i, array_to_datum(np.zeros((3, 8, width), np.uint8)).SerializeToString())
+    layer = pairs(1, source=tmp_path / "db")
+    shapes = []
+    for _ in range(2):
+        layer.run()
+        shapes.append(layer.top_shapes[0])
+    assert shapes == [(1, 3, 8, 8), (1, 3, 8, 9)]
+    layer.close()
+
+
+@pytest.mark.parametrize(
+    ("param", "place", "message"),
+    [
+        ('source: "x" backend: LMDB', "batch_size", "batch_size must be above 0, found 0"),
+        ("batch_size: 1 backend: LMDB", "source", "source is missing"),
+        (
+            f'batch_size: 1 backend: LMDB rand_skip: 9999999 source: "{PAIRS}"',
+            "rand_skip",
+            "not enough records to skip",
+        ),
+    ],
+)
+def test_bad_data_params_are_refused_where_they_stand(param: str, place: str, message: str) -> None:
+    with pytest.raises(SpecError, match=f'^net.prototxt:1:2: layer "data_param.{place}": {message}'):
+        reading(f'name: "d" type: "Data" top: "data" data_param {{ {param} }}')
+
+
+# Without opening data
+
+DATA = 'name: "d" type: "Data" top: "data" top: "label" data_param { source: "x" batch_size: 8 }'
+LIST = 'name: "d" type: "ImageData" top: "data" top: "label" '
+ROWS = 'name: "d" type: "HDF5Data" top: "data" top: "label" hdf5_data_param { source: "x" batch_size: 8 }'
+CUT = "transform_param { crop_size: 6 mean_value: 1 mean_value: 2 mean_value: 3 }"
+WINDOWS = 'name: "d" type: "WindowData" top: "data" top: "label" window_data_param { source: "x" batch_size: 8 }'
+IMAGE_BATCH, GREY_BATCH, LABELS = [(8, 3, 6, 6), (8,)], [(8, 1, 5, 4), (8,)], [(2, 5), (2,)]
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "expected"),
+    [
+        (DATA, {"data": (2, 5)}, LABELS),  # the label follows
+        (DATA, {"data": (2, 5), "label": (2, 1)}, [(2, 5), (2, 1)]),
+        (DATA + CUT, {}, IMAGE_BATCH),
+        (LIST + "image_data_param { batch_size: 8 new_height: 5 new_width: 4 is_color: false }", {}, GREY_BATCH),
+        (
+            LIST + "image_data_param { batch_size: 8 new_height: 5 new_width: 4 } transform_param { crop_size: 6 }",
+            {},
+            IMAGE_BATCH,
+        ),
+        (ROWS, {"data": (2, 5), "label": (2,)}, LABELS),
+        (WINDOWS + "transform_param { crop_size: 6 }", {}, IMAGE_BATCH),
+    ],
+)
+def test_shapes_are_known_without_data(text: str, given: Mapping[str, tuple[int, ...]], expected: list) -> None:
+    assert data_layer(text, open_data=False, given_shapes=given, device="meta").top_shapes == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        (DATA, "--shape data=8,C,H,W"),
+        (LIST + "image_data_param { batch_size: 8 }", "--shape data=8,C,H,W"),
+        (ROWS, "--shape data=8,..."),
+    ],
+)
+def test_a_shape_that_only_the_data_knows_is_asked_for(text: str, wanted: str) -> None:
+    with pytest.raises(SpecError, match=f'the shape of "data" is known by its data only; say {wanted}$'):
+        data_layer(text, open_data=False)
+
+
+def test_a_net_built_without_data_says_so_when_it_is_run() -> None:
+    with pytest.raises(SpecError, match="built without opening its data"):
+        data_layer(DATA + CUT, open_data=False).run()
+
+
+# ImageData
+
+
+def image_data(tmp_path: Path, more: str = "", batch_size: int = 4) -> ReadingLayer:
+    (tmp_path / "list.txt").write_text((IMAGES / "list.txt").read_text())
+    source = f'source: "{tmp_path}/list.txt" root_folder: "{IMAGES}/png/"'
+    return reading(f"{LIST} image_data_param {{ {source} batch_size: {batch_size} {more} }}")
+
+
+@pytest.mark.parametrize(
+    ("more", "database"),
+    [("", "lmdb_plain"), ("is_color: false", "lmdb_gray"), ("new_width: 28 new_height: 20", "lmdb_resized")],
+)
+def test_image_data_reads_what_convert_imageset_stores(tmp_path: Path, more: str, database: str) -> None:
+    found, stored = image_data(tmp_path, more, 6).run(), pairs(6, source=IMAGES / database).run()
+    assert torch.equal(found[0], stored[0])
+    assert torch.equal(found[1], stored[1])
+
+
+def test_image_data_is_shuffled_anew_each_epoch(tmp_path: Path) -> None:
+    layer = image_data(tmp_path, "shuffle: true", 6)
+    epochs = [layer.keys(i) for i in range(6)]
+    assert all(sorted(epoch) == [f"{i}.png" for i in range(6)] for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 3
+
+
+def test_image_data_names_a_missing_image_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("0.png 0\nnix.png 1\n")
+    source = f'source: "{tmp_path}/list.txt" root_folder: "{IMAGES}/png/"'
+    layer = reading(LIST + f"image_data_param {{ {source} batch_size: 1 }}")
+    layer.run()
+    with pytest.raises(SpecError, match=r'list.txt:2:1: image ".*/png/nix.png" cannot be read: No such file'):
+        layer.run()
+    layer.close()
+
+
+def test_image_data_wants_both_sides_or_none(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match="new_height and new_width must be given together"):
+        image_data(tmp_path, "new_height: 5")
+
+
+# HDF5
+
+
+def test_hdf5_rows_go_through(tmp_path: Path, build: Callable[..., Layer]) -> None:
+    with h5py.File(tmp_path / "in.h5", "w") as file:
+        file["data"], file["label"] = np.arange(30.0).reshape(5, 2, 3), np.arange(5)
+    (tmp_path / "list.txt").write_text(f"{tmp_path}/in.h5\n")
+    layer = reading(
+        'name: "h" type: "HDF5Data" top: "data" top: "label"'
+        f' hdf5_data_param {{ source: "{tmp_path}/list.txt" batch_size: 3 }}'
+    )
+    assert layer.top_shapes == [(3, 2, 3), (3,)]
+    sink = build(f'type: "HDF5Output" hdf5_output_param {{ file_name: "{tmp_path}/out.h5" }}', (3, 2, 3), (3,), tops=0)
+    for _ in range(2):
+        assert sink.run(*layer.run()) == ()
+    layer.close()
+    sink.close()
+    with h5py.File(tmp_path / "out.h5") as file:
+        label, data = np.asarray(file["label"]), np.asarray(file["data"])
+    assert label.ravel().tolist() == [0, 1, 2, 3, 4, 0]
+    assert data.shape == (6, 2, 3, 1)
+
+
+def test_hdf5_data_does_not_transform(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match="HDF5Data does not transform data"):
+        data_layer(ROWS + "transform_param { scale: 2 }")
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"), [([(3, 2), (4,)], "expected as many"), ([(3, 1, 1, 1, 1), (3,)], "at most 4 axes")]
+)
+def test_hdf5_output_checks_its_bottoms(
+    tmp_path: Path, build: Callable[..., Layer], shapes: list, message: str
+) -> None:
+    with pytest.raises(SpecError, match=message):
+        build(f'type: "HDF5Output" hdf5_output_param {{ file_name: "{tmp_path}/out.h5" }}', *shapes, tops=0)
+
+
+# WindowData
+
+
+def test_window_data_gives_windows_and_takes_no_scale_of_transform_param(tmp_path: Path) -> None:
+    windows = f"# 0\n{IMAGES}/png/0.png\n3\n48\n64\n2\n4 0.9 0 0 20 20\n0 0.1 10 10 40 40\n"
+    (tmp_path / "w.txt").write_text(windows)
+    layer = reading(
+        'name: "w" type: "WindowData" top: "data" top: "label" transform_param { crop_size: 9 scale: 0.5 }'
+        f' window_data_param {{ source: "{tmp_path}/w.txt" batch_size: 4 }}'
+    )
+    data, label = layer.run()
+    layer.close()
+    assert data.shape == (4, 3, 9, 9)
+    assert data.max() > 128
+    assert label.tolist() == [0, 0, 0, 4]
+    assert "transform_param.scale" in layer.ignores
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("", "crop_size must be above 0"),
+        ('transform_param { crop_size: 8 } window_data_param { crop_mode: "round" }', "unknown crop_mode"),
+        ("transform_param { crop_size: 8 } window_data_param { context_pad: 4 }", "leaves nothing of crop_size 8"),
+    ],
+)
+def test_bad_window_params_are_refused(more: str, message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        data_layer(WINDOWS + more)
+
+
+# Layers without files
+
+
+def test_input_takes_one_shape_for_all_or_one_each(build: Callable[..., Layer]) -> None:
+    one = 'type: "Input" input_param { shape { dim: 2 dim: 3 } }'
+    assert build(one, tops=2).top_shapes == [(2, 3), (2, 3)]
+    two = 'type: "Input" input_param { shape { dim: 2 } shape { dim: 1 dim: 4 } }'
+    layer = build(two, tops=2)
+    assert layer.top_shapes == [(2,), (1, 4)]
+    assert layer.is_input
+    assert [top.tolist() for top in layer.run()] == [[0, 0], [[0, 0, 0, 0]]]
+    with pytest.raises(SpecError, match=r"found 2 shapes, expected 1 or one a top \(3\)"):
+        build(two, tops=3)
+
+
+def test_input_without_a_shape_takes_a_given_one() -> None:
+    text = 'name: "d" type: "Input" top: "data"'
+    assert data_layer(text, given_shapes={"data": (1, 3)}).top_shapes == [(1, 3)]
+    with pytest.raises(SpecError, match="found 0 shapes"):
+        data_layer(text)
+
+
+def test_dummy_data_fills_constants_once_and_draws_the_rest(build: Callable[..., Layer]) -> None:
+    layer = build(
+        'type: "DummyData" dummy_data_param { shape { dim: 2 dim: 50 } shape { dim: 3 }'
+        ' data_filler { type: "gaussian" std: 2 } data_filler { type: "constant" value: 7 } }',
+        tops=2,
+    )
+    first, second = layer.run(), layer.run()
+    assert not torch.equal(first[0], second[0])
+    assert 1 < float(first[0].std()) < 3
+    assert first[1] is second[1]
+    assert first[1].tolist() == [7, 7, 7]
+
+
+def test_dummy_data_without_filler_is_zero_and_takes_the_old_axes(build: Callable[..., Layer]) -> None:
+    layer = build('type: "DummyData" dummy_data_param { num: 2 channels: 3 channels: 1 height: 4 width: 5 }', tops=2)
+    assert layer.top_shapes == [(2, 3, 4, 5), (2, 1, 4, 5)]
+    assert not any(top.any() for top in layer.run())
+
+
+@pytest.mark.parametrize(
+    ("param", "message"),
+    [
+        ("", r"found 0 shape, expected 1 or one a top \(2\)"),
+        ("num: 1 channels: 1 height: 1", "found 0 width"),
+        ("num: 1 channels: 1 height: 1 width: 1 shape { dim: 1 }", "both shape and the old"),
+        ("shape { dim: 1 } data_filler { } data_filler { } data_filler { }", "found 3 data_filler"),
+        ('shape { dim: 1 } data_filler { type: "gausian" }', 'did you mean "gaussian"'),
+    ],
+)
+def test_bad_dummy_data_params_are_refused(build: Callable[..., Layer], param: str, message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        build(f'type: "DummyData" dummy_data_param {{ {param} }}', tops=2)
+
+
+MEMORY = 'type: "MemoryData" memory_data_param { batch_size: 2 channels: 1 height: 1 width: 3 }'
+
+
+def test_memory_data_goes_round_its_arrays(build: Callable[..., Layer]) -> None:
+    layer = build(MEMORY, tops=2)
+    assert isinstance(layer, MemoryData)
+    assert layer.top_shapes == [(2, 1, 1, 3), (2,)]
+    with pytest.raises(SpecError, match="has no data yet"):
+        layer.run()
+    layer.set_input_arrays(np.arange(12).reshape(4, 1, 1, 3), np.array([5, 6, 7, 8]))
+    labels = [layer.run()[1].tolist() for _ in range(3)]
+    assert labels == [[5, 6], [7, 8], [5, 6]]
+    layer.restart()
+    images, label = layer.run()
+    assert images.ravel().tolist() == [0, 1, 2, 3, 4, 5]
+    assert label.tolist() == [5, 6]
+
+
+@pytest.mark.parametrize(
+    ("images", "labels"), [((3, 1, 1, 3), 3), ((2, 1, 3, 1), 2), ((2, 1, 1, 3), 4), ((0, 1, 1, 3), 0)]
+)
+def test_memory_data_refuses_what_does_not_fit(build: Callable[..., Layer], images: tuple, labels: int) -> None:
+    layer = build(MEMORY, tops=2)
+    assert isinstance(layer, MemoryData)
+    with pytest.raises(SpecError, match="n a multiple of batch_size 2"):
+        layer.set_input_arrays(np.zeros(images), np.zeros(labels))
+
+
+def test_memory_data_needs_its_sizes(build: Callable[..., Layer]) -> None:
+    with pytest.raises(SpecError, match="must all be given and above 0"):
+        build('type: "MemoryData" memory_data_param { batch_size: 2 }', tops=2)

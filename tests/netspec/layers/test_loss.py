@@ -1,0 +1,505 @@
+"""The losses and Accuracy: against plain loops in numpy, and what Caffe does at the corners."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.data.blobs import from_array
+from netspec.errors import SpecError
+
+FLT_MIN = np.finfo(np.float32).tiny
+FULL, VALID, BATCH_SIZE, NONE = "FULL", "VALID", "BATCH_SIZE", "NONE"
+
+
+pytestmark = pytest.mark.usefixtures("small_or_large")
+
+
+def softmax(x: np.ndarray, axis: int = 1) -> np.ndarray:
+    e = np.exp(x - x.max(axis, keepdims=True))
+    return e / e.sum(axis, keepdims=True)
+
+
+def normalizer(mode: str, outer: int, inner: int, valid: int) -> int:
+    return max(1, {FULL: outer * inner, VALID: valid, BATCH_SIZE: outer, NONE: 1}[mode])
+
+
+def value_and_gradient(layer, *bottoms: torch.Tensor) -> tuple[float, np.ndarray]:
+    first = bottoms[0].clone().requires_grad_()
+    loss = layer.run(first, *bottoms[1:])[0]
+    assert loss.shape == ()
+    loss.backward()
+    assert first.grad is not None
+    return loss.item(), first.grad.numpy()
+
+
+# SoftmaxWithLoss
+
+
+def softmax_loss(x: np.ndarray, labels: np.ndarray, mode: str, ignore: int | None) -> tuple[float, np.ndarray]:
+    """Caffe's loops; x (outer, classes, inner), labels (outer, inner)."""
+    p = softmax(x)
+    total, valid, grad = 0.0, 0, p.copy()
+    for i, j in np.ndindex(*labels.shape):
+        label = int(labels[i, j])
+        if label == ignore:
+            grad[i, :, j] = 0
+            continue
+        total -= math.log(max(p[i, label, j], FLT_MIN))
+        grad[i, label, j] -= 1
+        valid += 1
+    scale = normalizer(mode, *labels.shape, valid)
+    return total / scale, grad / scale
+
+
+@pytest.mark.parametrize("ignore", [None, 2, 255])
+@pytest.mark.parametrize("mode", [FULL, VALID, BATCH_SIZE, NONE])
+def test_softmax_with_loss_in_every_normalisation(build, mode: str, ignore: int | None) -> None:
+    given = "" if ignore is None else f"ignore_label: {ignore}"
+    layer = build(f'type: "SoftmaxWithLoss" loss_param {{ normalization: {mode} {given} }}', (3, 4, 2, 5), (3, 2, 5))
+    x = torch.randn(3, 4, 2, 5)
+    labels = torch.randint(0, 4, (3, 2, 5)).float()
+    if ignore is not None:
+        labels[torch.rand(3, 2, 5) < 0.3] = ignore
+    loss, grad = value_and_gradient(layer, x, labels)
+    expected = softmax_loss(x.double().reshape(3, 4, 10).numpy(), labels.reshape(3, 10).numpy(), mode, ignore)
+    assert loss == pytest.approx(expected[0], rel=1e-6)
+    np.testing.assert_allclose(grad.reshape(3, 4, 10), expected[1], atol=1e-7)
+
+
+def test_softmax_with_loss_clamps_the_probability_at_flt_min_but_not_its_gradient(build) -> None:
+    layer = build('type: "SoftmaxWithLoss"', (1, 2), (1,))
+    loss, grad = value_and_gradient(layer, torch.tensor([[200.0, 0.0]]), torch.tensor([1.0]))
+    assert loss == pytest.approx(87.33655, abs=1e-5)
+    assert grad.tolist() == [[1, -1]]
+
+
+@pytest.mark.parametrize(
+    ("loss_param", "divisor"),
+    [
+        ("", 12),  # VALID
+        ("normalize: false", 4),  # BATCH_SIZE
+        ("normalize: true", 12),
+        ("normalize: false normalization: FULL", 12),  # normalization wins
+        ("normalize: true normalization: NONE", 1),
+    ],
+)
+def test_normalize_counts_only_without_normalization(build, loss_param: str, divisor: int) -> None:
+    layer = build(f'type: "SoftmaxWithLoss" loss_param {{ {loss_param} }}', (4, 2, 3), (4, 3))
+    loss = layer.run(torch.zeros(4, 2, 3), torch.zeros(4, 3))[0].item()
+    assert loss == pytest.approx(12 * math.log(2) / divisor)
+
+
+def test_everything_ignored_is_a_loss_of_zero(build) -> None:
+    layer = build('type: "SoftmaxWithLoss" loss_param { ignore_label: -1 }', (2, 3), (2,))
+    loss, grad = value_and_gradient(layer, torch.randn(2, 3), torch.tensor([-1.0, -1.0]))
+    assert (loss, np.abs(grad).max()) == (0, 0)
+
+
+def test_softmax_with_loss_along_another_axis(build) -> None:
+    layer = build('type: "SoftmaxWithLoss" softmax_param { axis: -1 }', (2, 3, 4), (2, 3, 1))
+    x, labels = torch.randn(2, 3, 4), torch.randint(0, 4, (2, 3, 1)).float()
+    expected, grad = softmax_loss(x.double().reshape(6, 4, 1).numpy(), labels.reshape(6, 1).numpy(), VALID, None)
+    found = value_and_gradient(layer, x, labels)
+    assert found[0] == pytest.approx(expected, rel=1e-6)
+    np.testing.assert_allclose(found[1], grad.reshape(2, 3, 4), atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["SoftmaxWithLoss", "InfogainLoss"])
+def test_second_top_is_the_softmax_and_brings_no_gradient(build, kind: str) -> None:
+    bottoms = [torch.randn(2, 3, 4), torch.zeros(2, 4), torch.eye(3)][: 2 + (kind == "InfogainLoss")]
+    layer = build(f'type: "{kind}"', *(tuple(b.shape) for b in bottoms), tops=2)
+    assert layer.top_shapes == [(), (2, 3, 4)]
+    bottoms[0].requires_grad_()
+    loss, p = layer.run(*bottoms)
+    assert loss.requires_grad
+    assert not p.requires_grad
+    torch.testing.assert_close(p, torch.softmax(bottoms[0].detach(), 1))
+
+
+def test_a_loss_without_top_is_made_one(build) -> None:
+    layer = build('type: "SoftmaxWithLoss"', (2, 3), (2,), tops=0)
+    assert layer.top_shapes == [()]
+    assert len(layer.run(torch.randn(2, 3), torch.zeros(2))) == 1
+
+
+# InfogainLoss
+
+
+def infogain_loss(x: np.ndarray, labels: np.ndarray, gain: np.ndarray, ignore: int | None) -> tuple[float, np.ndarray]:
+    """Caffe's loops; x (outer, classes, inner), labels (outer, inner); normalised by the valid ones."""
+    p = softmax(x)
+    total, valid, grad = 0.0, 0, np.zeros_like(p)
+    for i, j in np.ndindex(*labels.shape):
+        label = int(labels[i, j])
+        if label == ignore:
+            continue
+        total -= (gain[label] * np.log(np.maximum(p[i, :, j], 1e-20))).sum()
+        grad[i, :, j] = p[i, :, j] * gain[label].sum() - gain[label]
+        valid += 1
+    return total / max(1, valid), grad / max(1, valid)
+
+
+@pytest.mark.parametrize("ignore", [None, 1])
+def test_infogain_loss_with_a_matrix_from_a_bottom_or_a_file(build, tmp_path: Path, ignore: int | None) -> None:
+    gain = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
+    source = tmp_path / "h.binaryproto"
+    source.write_bytes(from_array(gain.reshape(1, 1, 3, 3)).SerializeToString())
+    loss_param = "" if ignore is None else f"loss_param {{ ignore_label: {ignore} }}"
+    x, labels = torch.randn(2, 4, 3), torch.randint(0, 3, (2, 4)).float()
+    expected = infogain_loss(
+        x.double().reshape(8, 3, 1).numpy(), labels.reshape(8, 1).numpy(), gain.astype(np.float64), ignore
+    )
+    for third, given in (((1, 1, 3, 3),), ""), ((), f'source: "{source}"'):
+        text = f'type: "InfogainLoss" {loss_param} infogain_loss_param {{ axis: 2 {given} }}'
+        layer = build(text, (2, 4, 3), (2, 4), *third)
+        matrix = [torch.from_numpy(gain).reshape(shape) for shape in third]
+        loss, grad = value_and_gradient(layer, x, labels, *matrix)
+        assert loss == pytest.approx(expected[0], rel=1e-5)
+        np.testing.assert_allclose(grad.reshape(8, 3, 1), expected[1], atol=1e-6)
+
+
+def test_infogain_loss_clamps_the_probability_at_1e_20_but_not_its_gradient(build) -> None:
+    layer = build('type: "InfogainLoss"', (1, 2), (1,), (2, 2))
+    gain = torch.tensor([[0.0, 0.0], [0.0, 2.0]])
+    loss, grad = value_and_gradient(layer, torch.tensor([[200.0, 0.0]]), torch.tensor([1.0]), gain)
+    assert loss == pytest.approx(2 * 20 * math.log(10), rel=1e-6)
+    assert grad.tolist() == [[2, -2]]
+
+
+# MultinomialLogisticLoss
+
+
+def test_multinomial_loss_clamps_the_probability_at_1e_20_for_the_gradient_too(build) -> None:
+    layer = build('type: "MultinomialLogisticLoss"', (2, 3, 1, 1), (2,))
+    p = torch.tensor([[0.2, 0.3, 0.5], [0.0, 1e-25, 1.0]]).reshape(2, 3, 1, 1)
+    loss, grad = value_and_gradient(layer, p, torch.tensor([2.0, 1.0]))
+    assert loss == pytest.approx((math.log(2) + 20 * math.log(10)) / 2, rel=1e-6)
+    np.testing.assert_allclose(grad.reshape(2, 3), [[0, 0, -1], [0, -5e19, 0]], rtol=1e-6)
+
+
+# HingeLoss
+
+
+@pytest.mark.parametrize("norm", ["L1", "L2"])
+def test_hinge_loss_is_one_against_all_over_n_without_a_half(build, norm: str) -> None:
+    layer = build(f'type: "HingeLoss" hinge_loss_param {{ norm: {norm} }}', (4, 3), (4,))
+    x, labels = torch.randn(4, 3), torch.tensor([0.0, 2.0, 1.0, 1.0])
+    total, expected = 0.0, np.zeros((4, 3))
+    for i, j in np.ndindex(4, 3):
+        sign = 1 if labels[i] == j else -1
+        margin = max(0.0, 1 - sign * x[i, j].item())
+        total += margin if norm == "L1" else margin**2
+        expected[i, j] = -sign * ((margin > 0) if norm == "L1" else 2 * margin) / 4
+    loss, grad = value_and_gradient(layer, x, labels)
+    assert loss == pytest.approx(total / 4, rel=1e-6)
+    np.testing.assert_allclose(grad, expected, atol=1e-6)
+
+
+def test_hinge_loss_has_no_gradient_where_the_margin_is_just_met(build) -> None:
+    layer = build('type: "HingeLoss"', (1, 2), (1,))
+    assert value_and_gradient(layer, torch.tensor([[1.0, -1.0]]), torch.tensor([0.0]))[1].tolist() == [[0, 0]]
+
+
+# SigmoidCrossEntropyLoss
+
+
+@pytest.mark.parametrize("ignore", [None, 1])
+@pytest.mark.parametrize("mode", [None, FULL, VALID, BATCH_SIZE, NONE])
+def test_sigmoid_cross_entropy_defaults_to_the_batch_size(build, mode: str | None, ignore: int | None) -> None:
+    given = ("" if mode is None else f"normalization: {mode} ") + ("" if ignore is None else f"ignore_label: {ignore}")
+    layer = build(f'type: "SigmoidCrossEntropyLoss" loss_param {{ {given} }}', (3, 4), (3, 4, 1))
+    x = torch.randn(3, 4) * 30
+    targets = torch.tensor([0.0, 0.3, 1.0, 1.9, 1.0, 0.0, 2.5, 0.5, 1.0, 0.0, 0.0, -0.7])
+    valid, total, expected = 0, 0.0, np.zeros(12)
+    for i, (v, t) in enumerate(zip(x.flatten().tolist(), targets.tolist(), strict=True)):
+        if int(t) == ignore:  # 1.9 is cast to 1
+            continue
+        total -= v * (t - (v >= 0)) - math.log1p(math.exp(v - 2 * v * (v >= 0)))
+        expected[i] = 1 / (1 + math.exp(-v)) - t
+        valid += 1
+    scale = normalizer(mode or BATCH_SIZE, 3, 4, valid)
+    loss, grad = value_and_gradient(layer, x, targets.reshape(3, 4, 1))
+    assert loss == pytest.approx(total / scale, rel=1e-6)
+    np.testing.assert_allclose(grad.flatten(), expected / scale, atol=1e-6)
+
+
+@pytest.mark.parametrize(("loss_param", "divisor"), [("normalize: true", 6), ("normalize: false", 2)])
+def test_sigmoid_cross_entropy_takes_the_old_normalize(build, loss_param: str, divisor: int) -> None:
+    layer = build(f'type: "SigmoidCrossEntropyLoss" loss_param {{ {loss_param} }}', (2, 3), (2, 3))
+    assert layer.run(torch.zeros(2, 3), torch.ones(2, 3))[0].item() == pytest.approx(6 * math.log(2) / divisor)
+
+
+# EuclideanLoss
+
+
+def test_euclidean_loss_is_over_2n_and_gives_both_bottoms_a_gradient(build) -> None:
+    layer = build('type: "EuclideanLoss"', (4, 3), (4, 3, 1, 1))
+    a, b = torch.randn(4, 3, requires_grad=True), torch.randn(4, 3, 1, 1, requires_grad=True)
+    loss = layer.run(a, b)[0]
+    difference = a.detach().numpy() - b.detach().numpy().reshape(4, 3)
+    assert loss.item() == pytest.approx((difference**2).sum() / 8, rel=1e-6)
+    loss.backward()
+    np.testing.assert_allclose(a.grad.numpy(), difference / 4, atol=1e-7)
+    np.testing.assert_allclose(b.grad.numpy().reshape(4, 3), -difference / 4, atol=1e-7)
+
+
+def test_euclidean_loss_compares_item_by_item_whatever_the_axes(build) -> None:
+    layer = build('type: "EuclideanLoss"', (3,), (3, 1))
+    # Broadcasting (3,) against (3, 1) would give 9 differences.
+    assert layer.run(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([[1.0], [2.0], [3.0]]))[0].item() == 0
+
+
+# ContrastiveLoss
+
+
+def contrastive_loss(
+    a: np.ndarray, b: np.ndarray, labels: np.ndarray, margin: float, legacy: bool
+) -> tuple[float, np.ndarray]:
+    """Caffe's loops, and the gradient of a (that of b is its negative)."""
+    total, grad = 0.0, np.zeros_like(a)
+    for i in range(len(a)):
+        d = a[i] - b[i]
+        squared = (d**2).sum()
+        if int(labels[i]):
+            total += squared
+            grad[i] = d
+        elif legacy:
+            total += max(margin - squared, 0)
+            grad[i] = -d if margin - squared > 0 else 0
+        else:
+            distance = math.sqrt(squared)
+            total += max(margin - distance, 0) ** 2
+            grad[i] = -(margin - distance) / (distance + 1e-4) * d if margin - distance > 0 else 0
+    return total / len(a) / 2, grad / len(a)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("shape", [(6, 5), (6, 5, 1, 1)])
+def test_contrastive_loss_and_its_gradients(build, shape: tuple, legacy: bool) -> None:
+    text = f'type: "ContrastiveLoss" contrastive_loss_param {{ margin: 3 legacy_version: {str(legacy).lower()} }}'
+    layer = build(text, shape, shape, (6,))
+    a, b = torch.randn(shape, requires_grad=True), torch.randn(shape, requires_grad=True)
+    with torch.no_grad():
+        b[3:] = a[3:] + 0.3 * b[3:]  # some within the margin
+    labels = torch.tensor([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    loss = layer.run(a, b, labels)[0]
+    loss.backward()
+    expected, grad = contrastive_loss(
+        a.detach().double().numpy().reshape(6, 5), b.detach().double().numpy().reshape(6, 5), labels.numpy(), 3, legacy
+    )
+    assert loss.item() == pytest.approx(expected, rel=1e-6)
+    np.testing.assert_allclose(a.grad.numpy().reshape(6, 5), grad, atol=1e-6)
+    np.testing.assert_allclose(b.grad.numpy().reshape(6, 5), -grad, atol=1e-6)
+
+
+def test_contrastive_loss_backward_divides_by_the_distance_plus_1e_4(build) -> None:
+    layer = build('type: "ContrastiveLoss"', (2, 1), (2, 1), (2,))
+    a = torch.tensor([[1e-4], [0.0]])
+    _, grad = value_and_gradient(layer, a, torch.zeros(2, 1), torch.zeros(2))
+    # The derivative would be -(1 - d) / 2 at the first, and nothing finite at the second.
+    np.testing.assert_allclose(grad, [[-(1 - 1e-4) / 2e-4 * 1e-4 / 2], [0]], rtol=1e-5)
+
+
+def test_contrastive_labels_are_cast_to_integers_and_any_but_zero_is_similar(build) -> None:
+    layer = build('type: "ContrastiveLoss"', (5, 1), (5, 1), (5,))
+    labels = torch.tensor([0.9, -0.9, 1.0, -1.0, 7.3])  # dissimilar twice (cast to 0), then similar
+    loss = layer.run(torch.full((5, 1), 0.5), torch.zeros(5, 1), labels)[0].item()
+    assert loss == pytest.approx(5 * 0.25 / 10)
+    loss = layer.run(torch.full((5, 1), 2.0), torch.zeros(5, 1), labels)[0].item()
+    assert loss == pytest.approx(3 * 4 / 10)
+
+
+# Accuracy
+
+
+def test_accuracy_counts_ties_against_the_label(build) -> None:
+    layer = build('type: "Accuracy"', (3, 3), (3,))
+    scores = torch.tensor([[1.0, 1.0, 0.0], [0.0, 2.0, 1.0], [5.0, 5.0, 5.0]])
+    assert layer.run(scores, torch.tensor([0.0, 1.0, 0.0]))[0].item() == pytest.approx(1 / 3)
+    top2 = build('type: "Accuracy" accuracy_param { top_k: 2 }', (3, 3), (3,))
+    assert top2.run(scores, torch.tensor([0.0, 1.0, 0.0]))[0].item() == pytest.approx(2 / 3)
+
+
+def test_accuracy_leaves_ignored_labels_out_and_is_zero_without_any_other(build) -> None:
+    layer = build('type: "Accuracy" accuracy_param { ignore_label: 255 }', (3, 2), (3,), tops=2)
+    scores = torch.tensor([[2.0, 1.0], [2.0, 1.0], [2.0, 1.0]])
+    accuracy, each = layer.run(scores, torch.tensor([0.0, 1.0, 255.0]))
+    assert (accuracy.item(), each.tolist()) == (0.5, [1, 0])
+    accuracy, each = layer.run(scores, torch.full((3,), 255.0))
+    assert (accuracy.item(), each.tolist()) == (0, [0, 0])
+
+
+def test_accuracy_of_each_class_along_another_axis(build) -> None:
+    layer = build('type: "Accuracy" accuracy_param { axis: -1 top_k: 2 }', (4, 5, 6), (4, 5), tops=2)
+    assert layer.top_shapes == [(), (6,)]
+    scores, labels = torch.randn(4, 5, 6), torch.randint(0, 5, (4, 5))  # class 5 does not occur
+    hits, seen = np.zeros(6), np.zeros(6)
+    for i, j in np.ndindex(4, 5):
+        label = labels[i, j]
+        hits[label] += (scores[i, j] >= scores[i, j, label]).sum().item() <= 2
+        seen[label] += 1
+    accuracy, each = layer.run(scores.requires_grad_(), labels.float())
+    assert accuracy.item() == pytest.approx(hits.sum() / 20)
+    np.testing.assert_allclose(each.numpy(), hits / np.maximum(seen, 1), rtol=1e-6)
+    assert not accuracy.requires_grad
+
+
+# All of them
+
+
+@pytest.mark.parametrize(
+    ("text", "bottoms"),
+    [
+        ('type: "SoftmaxWithLoss" loss_param { ignore_label: 1 }', [(3, 4, 2), (3, 2)]),
+        ('type: "InfogainLoss"', [(3, 4, 2), (3, 2), (4, 4)]),
+        ('type: "MultinomialLogisticLoss"', [(6, 4), (6,)]),
+        ('type: "HingeLoss"', [(6, 4), (6,)]),
+        ('type: "HingeLoss" hinge_loss_param { norm: L2 }', [(6, 4), (6,)]),
+        ('type: "SigmoidCrossEntropyLoss" loss_param { ignore_label: 1 }', [(3, 4), (3, 4)]),
+    ],
+)
+def test_gradient_of_the_scores_is_the_derivative(build, gradcheck, text: str, bottoms: list) -> None:
+    layer = build(text, *bottoms)
+    labels = torch.arange(math.prod(bottoms[1])).remainder(4).reshape(bottoms[1]).double()
+    rest = [torch.rand(shape).double() for shape in bottoms[2:]]
+    scores = torch.rand(bottoms[0]) + 0.1
+
+    class WithLabels(torch.nn.Module):
+        blobs, default_param_lr = (), 0.0
+
+        def run(self, scores: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return layer.run(scores, labels, *rest)
+
+    gradcheck(WithLabels(), scores)
+
+
+def test_euclidean_gradients_are_the_derivatives(build, gradcheck) -> None:
+    gradcheck(build('type: "EuclideanLoss"', (3, 4), (3, 4)), torch.randn(3, 4), torch.randn(3, 4))
+
+
+@pytest.mark.parametrize("legacy", ["true", "false"])
+def test_contrastive_gradients_are_nearly_the_derivatives(build, legacy: str) -> None:
+    layer = build(
+        f'type: "ContrastiveLoss" contrastive_loss_param {{ margin: 5 legacy_version: {legacy} }}', (4, 3), (4, 3), (4,)
+    )
+    a, b = torch.randn(4, 3).double().requires_grad_(), torch.randn(4, 3).double().requires_grad_()
+    labels = torch.tensor([0.0, 1.0, 0.0, 1.0])
+    # atol: what the 1e-4 beside the distance makes
+    torch.autograd.gradcheck(lambda a, b: layer.run(a, b, labels)[0], (a, b), atol=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "shapes"),
+    [
+        ("SoftmaxWithLoss", [(4, 3), (4,)]),
+        ("InfogainLoss", [(4, 3), (4,), (3, 3)]),
+        ("MultinomialLogisticLoss", [(4, 3), (4,)]),
+        ("HingeLoss", [(4, 3), (4,)]),
+        ("SigmoidCrossEntropyLoss", [(4, 3), (4, 3)]),
+        ("ContrastiveLoss", [(4, 3), (4, 3), (4,)]),
+        ("Accuracy", [(4, 3), (4,)]),
+    ],
+)
+def test_labels_never_get_a_gradient_and_batches_may_change(build, kind: str, shapes: list) -> None:
+    layer = build(f'type: "{kind}"', *shapes)
+    for n in (4, 2):
+        bottoms = [torch.rand(n if shape[0] == 4 else 3, *shape[1:], requires_grad=True) for shape in shapes]
+        top = layer.run(*bottoms)[0]
+        if top.requires_grad:
+            top.backward()
+        for i in layer.label_bottoms:
+            assert bottoms[i].grad is None
+
+
+@pytest.mark.parametrize(
+    ("text", "shapes", "message"),
+    [
+        (
+            'type: "SoftmaxWithLoss"',
+            [(4, 3, 2), (4,)],
+            "bottom.1: found 4 labels, shape (4,), for 8 predictions, shape (4, 3, 2); expected one label (0 to 2) a "
+            "prediction along axis 1",
+        ),
+        (
+            'type: "SoftmaxWithLoss"',
+            [(4, 3), (5,)],
+            "bottom: found bottoms of shapes (4, 3) and (5,), expected the same number of items",
+        ),
+        (
+            'type: "SoftmaxWithLoss" softmax_param { axis: 2 }',
+            [(4, 3), (4,)],
+            "softmax_param.axis: axis 2 is out of range for a blob of 2 axes, shape (4, 3)",
+        ),
+        ('type: "SoftmaxWithLoss"', [(4, 3)], "bottom: found 1 bottom blob(s), expected 2"),
+        (
+            'type: "InfogainLoss" loss_param { normalize: true }',
+            [(4, 3), (4,), (3, 3)],
+            "loss_param.normalize: InfogainLoss does not take the old field normalize; use normalization",
+        ),
+        (
+            'type: "InfogainLoss"',
+            [(4, 3), (4,)],
+            "infogain_loss_param: found neither a third bottom nor a source, expected the infogain matrix from one",
+        ),
+        (
+            'type: "InfogainLoss"',
+            [(4, 3), (4,), (1, 1, 4, 4)],
+            "bottom.2: found an infogain matrix of shape (1, 1, 4, 4), expected 3 x 3 numbers",
+        ),
+        (
+            'type: "SigmoidCrossEntropyLoss"',
+            [(4, 3), (4, 2)],
+            "bottom: found bottoms of shapes (4, 3) and (4, 2), expected the same count",
+        ),
+        (
+            'type: "EuclideanLoss"',
+            [(4, 3), (4, 2)],
+            "bottom: found bottoms of shapes (4, 3) and (4, 2), expected as many numbers an item",
+        ),
+        ('type: "HingeLoss"', [(4, 3), (4, 2)], "bottom.1: found 8 labels, shape (4, 2), for 4 predictions"),
+        (
+            'type: "ContrastiveLoss"',
+            [(4, 3, 2), (4, 3, 2), (4,)],
+            "bottom.0: found a bottom of shape (4, 3, 2), expected (N, C) or (N, C, 1, 1)",
+        ),
+        (
+            'type: "ContrastiveLoss"',
+            [(4, 3), (4, 2), (4,)],
+            "bottom.1: found bottoms of shapes (4, 3) and (4, 2), expected the same number of channels",
+        ),
+        (
+            'type: "ContrastiveLoss"',
+            [(4, 3), (4, 3), (4, 2)],
+            "bottom.2: found labels of shape (4, 2), expected one a pair: (4,)",
+        ),
+        (
+            'type: "Accuracy" accuracy_param { top_k: 4 }',
+            [(4, 3), (4,)],
+            "accuracy_param.top_k: found top_k 4, expected at most the 3 classes",
+        ),
+    ],
+)
+def test_bad_bottoms_are_refused(build, text: str, shapes: list, message: str) -> None:
+    with pytest.raises(SpecError) as fault:
+        build(text, *shapes)
+    assert str(fault.value).startswith(message)
+
+
+@pytest.mark.parametrize("kind", ["SoftmaxWithLoss", "MultinomialLogisticLoss", "HingeLoss", "Accuracy"])
+@pytest.mark.parametrize("label", [-1.0, 3.0])
+def test_a_label_that_is_no_class_is_named(build, kind: str, label: float) -> None:
+    layer = build(f'type: "{kind}"', (2, 3), (2,))
+    with pytest.raises(SpecError, match=rf"found label {label:g}, expected 0 to 2: the scores have 3 classes"):
+        layer.run(torch.rand(2, 3), torch.tensor([0.0, label]))
+
+
+def test_an_unreadable_infogain_matrix_is_named(build, tmp_path: Path) -> None:
+    for name, content in (("absent", None), ("broken", b"\xff\xff\xff")):
+        source = tmp_path / name
+        if content is not None:
+            source.write_bytes(content)
+        with pytest.raises(SpecError, match=rf'infogain_loss_param.source: cannot read the infogain matrix "{source}"'):
+            build(f'type: "InfogainLoss" infogain_loss_param {{ source: "{source}" }}', (4, 3), (4,))

@@ -1,0 +1,298 @@
+"""Pooling and SPP beside Caffe's loops written plainly, at random settings; the oddities by name; the refusals."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+from netspec.proto.schema import TRAIN
+
+LOWEST = np.finfo(np.float32).min  # -FLT_MAX
+
+
+def window_count(size: int, kernel: int, stride: int, pad: int, padded: bool, floor: bool) -> int:
+    room = (size + 2 * pad - kernel) / stride
+    count = (math.floor(room) if floor else math.ceil(room)) + 1
+    return count - 1 if padded and (count - 1) * stride >= size + pad else count
+
+
+def plain_pool(data: np.ndarray, kernel, stride, pad, floor: bool, average: bool, top_diff=None):
+    """Pool as Caffe's loops do: top, mask (of MAX), and for a ``top_diff`` of ones or given the bottom's gradient."""
+    size = data.shape[2:]
+    counts = [window_count(size[i], kernel[i], stride[i], pad[i], any(pad), floor) for i in range(2)]
+    top = np.full((*data.shape[:2], *counts), 0 if average else LOWEST, data.dtype)
+    mask = np.full(top.shape, -1)
+    diff = np.zeros_like(data)
+    for n, c, y, x in np.ndindex(*top.shape):
+        starts = [y * stride[0] - pad[0], x * stride[1] - pad[1]]
+        ends = [min(starts[i] + kernel[i], size[i] + pad[i]) for i in range(2)]
+        area = (ends[0] - starts[0]) * (ends[1] - starts[1])
+        rows, columns = (range(max(starts[i], 0), min(ends[i], size[i])) for i in range(2))
+        for h in rows:
+            for w in columns:
+                value = data[n, c, h, w]
+                if average:
+                    top[n, c, y, x] += value
+                    diff[n, c, h, w] += (1 if top_diff is None else top_diff[n, c, y, x]) / area
+                elif value > top[n, c, y, x]:
+                    top[n, c, y, x], mask[n, c, y, x] = value, h * size[1] + w
+        if average:
+            top[n, c, y, x] = np.float32(top[n, c, y, x]) / np.float32(area) if area else np.nan
+        elif mask[n, c, y, x] >= 0:
+            h, w = divmod(mask[n, c, y, x], size[1])
+            diff[n, c, h, w] += 1 if top_diff is None else top_diff[n, c, y, x]
+    return top, mask, diff
+
+
+def random_settings(random: np.random.Generator):
+    """Yield settings that Caffe takes: kernel, stride, pad, floor, size of the map."""
+    for _ in range(150):
+        kernel, stride = (tuple(map(int, random.integers(1, 6, 2))) for _ in range(2))
+        pad = tuple(int(random.integers(0, k)) for k in kernel) if random.random() < 0.5 else (0, 0)
+        size = tuple(map(int, random.integers(1, 12, 2)))
+        floor = bool(random.random() < 0.3)
+        counts = [window_count(size[i], kernel[i], stride[i], pad[i], any(pad), floor) for i in range(2)]
+        if min(counts) >= 1:
+            yield kernel, stride, pad, floor, size
+
+
+def pooling_text(method: str, kernel, stride, pad, floor: bool) -> str:
+    names = ("kernel_h", "kernel_w", "stride_h", "stride_w", "pad_h", "pad_w")
+    fields = " ".join(f"{name}: {value}" for name, value in zip(names, (*kernel, *stride, *pad), strict=True))
+    return f'type: "Pooling" pooling_param {{ pool: {method} {fields} {"round_mode: FLOOR" if floor else ""} }}'
+
+
+@pytest.mark.parametrize("method", ["MAX", "AVE"])
+def test_pooling_agrees_with_plain_loops_at_random_settings(build, method: str) -> None:
+    random = np.random.default_rng(7)
+    wide_pads = empty_windows = cases = 0
+    for kernel, stride, pad, floor, size in random_settings(random):
+        # few different values, so that maxima tie
+        data = random.integers(-3, 4, (2, 2, *size)).astype(np.float32)
+        layer = build(pooling_text(method, kernel, stride, pad, floor), data.shape, tops=1 + (method == "MAX"))
+        order = torch.channels_last if cases % 2 else torch.contiguous_format  # torch has a kernel for each
+        bottom = torch.from_numpy(data).to(memory_format=order).requires_grad_()
+        tops = layer.run(bottom)
+        top_diff = random.standard_normal(tops[0].shape).astype(np.float32)
+        expected, mask, diff = plain_pool(data, kernel, stride, pad, floor, method == "AVE", top_diff)
+        what = f"{kernel=} {stride=} {pad=} {floor=} {size=}"
+        assert layer.top_shapes[0] == expected.shape == tuple(tops[0].shape), what
+        np.testing.assert_allclose(tops[0].detach(), expected, rtol=1e-6, atol=1e-7, err_msg=what)
+        if method == "MAX":
+            np.testing.assert_array_equal(tops[1], mask, err_msg=what)
+        tops[0].backward(torch.from_numpy(top_diff))
+        np.testing.assert_allclose(bottom.grad, diff, atol=1e-5, err_msg=what)
+        cases += 1
+        wide_pads += any(2 * p > k for p, k in zip(pad, kernel, strict=True))
+        empty_windows += not any(pad) and any(
+            (n - 1) * s >= z for n, s, z in zip(expected.shape[2:], stride, size, strict=True)
+        )
+    assert cases > 80
+    assert wide_pads > 10
+    assert empty_windows > 10
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf, np.inf])
+def test_nan_and_minus_infinity_never_win_a_maximum(build, value: float) -> None:
+    random = np.random.default_rng(3)
+    for kernel, stride, pad, floor, size in random_settings(random):
+        data = random.standard_normal((2, 2, *size)).astype(np.float32)
+        data[random.random(data.shape) < 0.4] = value
+        layer = build(pooling_text("MAX", kernel, stride, pad, floor), data.shape, tops=2)
+        bottom = torch.from_numpy(data).requires_grad_()
+        top, mask = layer.run(bottom)
+        expected, expected_mask, diff = plain_pool(data, kernel, stride, pad, floor, average=False)
+        np.testing.assert_array_equal(top.detach(), expected)
+        np.testing.assert_array_equal(mask, expected_mask)
+        top.backward(torch.ones_like(top))
+        np.testing.assert_array_equal(bottom.grad, diff)
+
+
+def test_a_window_of_nothing_but_nan_is_minus_flt_max_without_gradient(build) -> None:
+    data = torch.full((1, 1, 2, 4), math.nan)
+    data[..., 2:] = torch.tensor([[1.0, 2.0], [2.0, 1.0]])
+    bottom = data.requires_grad_()
+    top, mask = build('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }', (1, 1, 2, 4), tops=2).run(bottom)
+    assert top.flatten().tolist() == [LOWEST, 2]
+    assert mask.flatten().tolist() == [-1, 3]
+    top.sum().backward()
+    assert bottom.grad is not None
+    assert bottom.grad.flatten().tolist() == [0, 0, 0, 1, 0, 0, 0, 0]
+
+
+def test_the_first_of_equal_maxima_gets_the_gradient(build) -> None:
+    bottom = torch.zeros(1, 1, 4, 4, requires_grad=True)
+    build('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }', bottom.shape).run(bottom)[0].sum().backward()
+    assert bottom.grad is not None
+    assert bottom.grad.nonzero()[:, 2:].tolist() == [[0, 0], [0, 2], [2, 0], [2, 2]]
+
+
+def test_windows_are_counted_upwards_and_the_last_is_dropped_only_where_padded(build) -> None:
+    def tops(settings: str, height: int) -> int:
+        return build(f'type: "Pooling" pooling_param {{ {settings} }}', (1, 1, height, height)).top_shapes[0][2]
+
+    assert tops("kernel_size: 3 stride: 2", 6) == 3  # 1.5 + 1, rounded up
+    assert tops("kernel_size: 3 stride: 2 round_mode: FLOOR", 6) == 2
+    assert tops("kernel_size: 2 stride: 2 pad: 1", 5) == 3  # 2.5 + 1 rounded up is 4, but window 4 begins at the end
+    assert tops("kernel_size: 1 stride: 3", 5) == 3  # window 3 begins past the map: unpadded, it stays
+    assert tops("kernel_size: 3 stride: 2", 2) == 1  # a kernel longer than the map
+
+
+def test_an_empty_last_window_is_minus_flt_max_or_zero_over_what_is_left_of_its_area(build) -> None:
+    text = 'type: "Pooling" pooling_param { pool: %s kernel_h: 1 stride_h: %d kernel_w: 1 stride_w: 1 }'
+    top, mask = build(text % ("MAX", 3), (1, 1, 2, 1), tops=2).run(torch.ones(1, 1, 2, 1))
+    assert top.flatten().tolist() == [1, LOWEST]
+    assert mask.flatten().tolist() == [0, -1]
+    ends_there = build(text % ("AVE", 2), (1, 1, 2, 1)).run(torch.ones(1, 1, 2, 1))[0].flatten()
+    assert ends_there[0] == 1
+    assert ends_there[1].isnan()  # 0 / 0: the window begins where the map ends
+    begins_past_it = build(text % ("AVE", 3), (1, 1, 2, 1)).run(torch.ones(1, 1, 2, 1))[0].flatten()
+    assert begins_past_it.tolist() == [1, 0]  # 0 / -1
+
+
+@pytest.mark.parametrize("method", ["MAX", "AVE"])
+def test_global_pooling_follows_the_map(build, method: str) -> None:
+    layer = build(f'type: "Pooling" pooling_param {{ pool: {method} global_pooling: true }}', (2, 3, 5, 7))
+    for shape in ((2, 3, 5, 7), (4, 3, 2, 9)):
+        data = torch.randn(shape)
+        (top,) = layer.run(data)
+        assert layer.top_shapes == [(*shape[:2], 1, 1)]
+        torch.testing.assert_close(top[..., 0, 0], data.amax((2, 3)) if method == "MAX" else data.mean((2, 3)))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        "pool: MAX kernel_size: 3 stride: 2",
+        "pool: MAX kernel_size: 3 stride: 2 pad: 2",
+        "pool: MAX kernel_size: 2 stride: 4",
+        "pool: AVE kernel_size: 3 stride: 2 pad: 1",
+        "pool: AVE kernel_size: 3 stride: 2 pad: 2",
+        "pool: STOCHASTIC kernel_size: 3 stride: 2",
+    ],
+)
+def test_gradients(build, gradcheck, settings: str) -> None:
+    layer = build(f'type: "Pooling" pooling_param {{ {settings} }}', (2, 2, 6, 5))
+    gradcheck(layer, torch.rand(2, 2, 6, 5) + 0.1)
+
+
+def test_an_empty_batch_pools_to_an_empty_batch(build) -> None:
+    layer = build('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }', (2, 3, 4, 4))
+    assert layer.run(torch.empty(0, 3, 4, 4))[0].shape == (0, 3, 2, 2)
+
+
+def test_stochastic_pooling_draws_pixels_in_proportion_to_their_value(build) -> None:
+    layer = build(
+        'type: "Pooling" pooling_param { pool: STOCHASTIC kernel_size: 2 stride: 2 }', (10000, 4, 2, 2), phase=TRAIN
+    )
+    bottom = torch.tensor([1.0, 0.0, 3.0, 6.0]).reshape(1, 1, 2, 2).repeat(10000, 4, 1, 1).requires_grad_()
+    (top,) = layer.run(bottom)
+    for value in (1.0, 3.0, 6.0):
+        share = float((top == value).float().mean())
+        assert share == pytest.approx(value / 10, abs=6 * 0.5 / math.sqrt(40000))
+    assert not (top == 0).any()
+    top.sum().backward()
+    assert bottom.grad is not None
+    assert torch.equal((bottom.grad * bottom.detach()).sum((2, 3)), top.detach()[..., 0, 0])  # 1 for the pixel drawn
+    assert torch.equal(bottom.grad.sum((2, 3)), torch.ones(10000, 4))
+
+
+def test_stochastic_pooling_of_a_clipped_window_draws_inside_the_map(build) -> None:
+    text = 'type: "Pooling" pooling_param { pool: STOCHASTIC kernel_size: 3 stride: 2 }'
+    data = torch.rand(50, 3, 6, 6) + 1
+    layer = build(text, data.shape, phase=TRAIN, seed=5)
+    (top,) = layer.run(data)
+    assert layer.top_shapes == [(50, 3, 3, 3)] == [tuple(top.shape)]
+    corner = data[:, :, 4:, 4:].flatten(2)
+    assert (top[:, :, 2, 2].unsqueeze(2) == corner).any(2).all()
+    assert not torch.equal(top, layer.run(data)[0])
+    assert torch.equal(top, build(text, data.shape, phase=TRAIN, seed=5).run(data)[0])
+    assert build(text, data.shape, phase=TRAIN).run(torch.zeros(data.shape))[0].count_nonzero() == 0
+
+
+def test_stochastic_pooling_in_the_test_phase_weights_each_pixel_by_itself(build) -> None:
+    layer = build('type: "Pooling" pooling_param { pool: STOCHASTIC kernel_size: 3 stride: 2 }', (1, 1, 4, 4))
+    data = torch.rand(1, 1, 4, 4)
+    (top,) = layer.run(data)
+    for y, x in np.ndindex(2, 2):
+        window = data[0, 0, 2 * y : 2 * y + 3, 2 * x : 2 * x + 3]
+        assert float(top[0, 0, y, x]) == pytest.approx(float(window.square().sum() / window.sum()))
+    assert layer.run(torch.zeros(1, 1, 4, 4))[0].count_nonzero() == 0  # 0 / FLT_MIN
+
+
+@pytest.mark.parametrize(
+    ("settings", "shape", "tops", "words"),
+    [
+        (
+            "stride: 2",
+            (1, 1, 4, 4),
+            1,
+            "pooling_param: kernel_size (or kernel_h and kernel_w, or global_pooling) is",
+        ),
+        ("kernel_size: 0", (1, 1, 4, 4), 1, "pooling_param.kernel_size: kernel_size must be at least 1, found 0 x 0"),
+        ("kernel_h: 2", (1, 1, 4, 4), 1, "pooling_param.kernel_h: found kernel_h only"),
+        ("kernel_size: 2 kernel_h: 2 kernel_w: 2", (1, 1, 4, 4), 1, "found both kernel_size and kernel_h"),
+        ("kernel_size: 2 stride: 0", (1, 1, 4, 4), 1, "pooling_param.stride: stride must be at least 1"),
+        ("kernel_size: 2 stride_h: 2 stride_w: 0", (1, 1, 4, 4), 1, "stride must be at least 1, found 2 x 0"),
+        ("kernel_size: 2 pad: 1 pad_h: 1 pad_w: 1", (1, 1, 4, 4), 1, "found both pad and pad_h"),
+        ("kernel_size: 2 pad: 2", (1, 1, 4, 4), 1, "pad (2, 2) must be less than the kernel (2, 2)"),
+        ("pool: STOCHASTIC kernel_size: 2 pad: 1", (1, 1, 4, 4), 1, "STOCHASTIC pooling knows no padding"),
+        (
+            "global_pooling: true kernel_size: 2",
+            (1, 1, 4, 4),
+            1,
+            "pooling_param.kernel_size: global_pooling takes the",
+        ),
+        ("global_pooling: true stride: 2", (1, 1, 4, 4), 1, "global_pooling goes with pad 0 and stride 1 only"),
+        ("global_pooling: true pad: 1", (1, 1, 4, 4), 1, "global_pooling goes with pad 0 and stride 1 only"),
+        ("pool: AVE kernel_size: 2", (1, 1, 4, 4), 2, "top.1: only MAX pooling has a second top"),
+        ("kernel_size: 2", (1, 4, 4), 1, "bottom: pooling needs a bottom of 4 axes"),
+        ("kernel_size: 5", (1, 1, 4, 4), 1, "no window of (5, 5) at stride (1, 1), pad (0, 0), fits a map of (4, 4)"),
+    ],
+)
+def test_wrong_pooling_is_refused(build, settings: str, shape: tuple, tops: int, words: str) -> None:
+    with pytest.raises(SpecError) as error:
+        build(f'type: "Pooling" pooling_param {{ {settings} }}', shape, tops=tops)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("method", ["MAX", "AVE"])
+def test_spp_puts_the_levels_side_by_side(build, gradcheck, method: str) -> None:
+    layer = build(f'type: "SPP" spp_param {{ pyramid_height: 3 pool: {method} }}', (2, 3, 9, 12))
+    for size in ((9, 12), (11, 6), (12, 15)):
+        data = torch.rand(2, 3, *size)
+        (top,) = layer.run(data)
+        assert layer.top_shapes == [(2, 3 * 21)]
+        expected = []
+        for bins in (1, 2, 4):
+            kernel = [math.ceil(n / bins) for n in size]
+            pad = [math.ceil((k * bins - n) / 2) for k, n in zip(kernel, size, strict=True)]
+            level, _, _ = plain_pool(data.numpy(), kernel, kernel, pad, floor=False, average=method == "AVE")
+            assert level.shape[2:] == (bins, bins)
+            expected.append(level.reshape(2, -1))
+        np.testing.assert_allclose(top, np.concatenate(expected, axis=1), rtol=1e-6)
+    gradcheck(layer, torch.rand(2, 3, 9, 12))
+
+
+def test_spp_of_one_level_keeps_four_axes(build) -> None:
+    layer = build('type: "SPP" spp_param { pyramid_height: 1 }', (2, 3, 5, 7))
+    data = torch.randn(2, 3, 5, 7)
+    assert layer.top_shapes == [(2, 3, 1, 1)]
+    assert torch.equal(layer.run(data)[0], data.amax((2, 3), keepdim=True))
+
+
+@pytest.mark.parametrize(
+    ("settings", "shape", "words"),
+    [
+        ("", (2, 3, 9, 9), "spp_param.pyramid_height: pyramid_height must be at least 1"),
+        ("pyramid_height: 3", (2, 3, 5, 9), "spp_param: pad (2, 2) must be less than the kernel (2, 3)"),
+        ("pyramid_height: 2 pool: STOCHASTIC", (2, 3, 5, 9), "STOCHASTIC pooling knows no padding"),
+        ("pyramid_height: 2", (2, 3, 5), "SPP needs a bottom of 4 axes"),
+    ],
+)
+def test_wrong_spp_is_refused(build, settings: str, shape: tuple, words: str) -> None:
+    with pytest.raises(SpecError) as error:
+        build(f'type: "SPP" spp_param {{ {settings} }}', shape)
+    assert words in str(error.value)

@@ -1,0 +1,345 @@
+"""The Python layer: code as people wrote it for pycaffe runs, if it is allowed to."""
+
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import netspec
+from netspec.errors import SpecError, Where
+from netspec.layers import Context, Layer, layer_class
+from netspec.proto.schema import TRAIN, LayerParameter
+
+CODE = '''
+import numpy as np
+import caffe
+
+class TimesTen(caffe.Layer):
+    """Caffe's own first example."""
+
+    def setup(self, bottom, top):
+        pass
+
+    def reshape(self, bottom, top):
+        top[0].reshape(*bottom[0].data.shape)
+
+    def forward(self, bottom, top):
+        top[0].data[...] = 10 * bottom[0].data
+
+    def backward(self, top, propagate_down, bottom):
+        bottom[0].diff[...] = 10 * top[0].diff
+
+
+class Euclidean(caffe.Layer):
+    """Caffe's second: a loss of two bottoms, with a buffer of its own."""
+
+    def setup(self, bottom, top):
+        if len(bottom) != 2:
+            raise Exception("Need two inputs to compute distance.")
+
+    def reshape(self, bottom, top):
+        if bottom[0].count != bottom[1].count:
+            raise Exception("Inputs must have the same dimension.")
+        self.diff = np.zeros_like(bottom[0].data, dtype=np.float32)
+        top[0].reshape(1)
+
+    def forward(self, bottom, top):
+        self.diff[...] = bottom[0].data - bottom[1].data
+        top[0].data[...] = np.sum(self.diff**2) / bottom[0].num / 2.
+
+    def backward(self, top, propagate_down, bottom):
+        self.asked = list(propagate_down)
+        for i in range(2):
+            if not propagate_down[i]:
+                continue
+            if i == 0:
+                sign = 1
+            else:
+                sign = -1
+            bottom[i].diff[...] = sign * self.diff / bottom[i].num
+
+
+class Count(caffe.Layer):
+    """A data layer: no bottoms, a state, parameters in param_str."""
+
+    def setup(self, bottom, top):
+        self.size = eval(self.param_str)["size"]
+        assert self.param_str_ == self.param_str
+        self.next = 0
+        top[0].reshape(self.size)
+
+    def reshape(self, bottom, top):
+        pass
+
+    def forward(self, bottom, top):
+        top[0].data[...] = np.arange(self.next, self.next + self.size)
+        self.next += self.size
+
+    def backward(self, top, propagate_down, bottom):
+        pass
+
+
+class Learned(caffe.Layer):
+    """Blobs of its own."""
+
+    def setup(self, bottom, top):
+        self.blobs.add_blob(2, 3)
+        self.blobs.add_blob(1)
+        self.blobs[0].data[...] = 0.5
+
+    def reshape(self, bottom, top):
+        top[0].reshape(bottom[0].num, 2)
+
+    def forward(self, bottom, top):
+        top[0].data[...] = bottom[0].data.dot(self.blobs[0].data.T) + self.blobs[1].data
+
+    def backward(self, top, propagate_down, bottom):
+        self.blobs[0].diff[...] += top[0].diff.T.dot(bottom[0].data)
+        self.blobs[1].diff[...] += top[0].diff.sum()
+        bottom[0].diff[...] = top[0].diff.dot(self.blobs[0].data)
+
+
+class Half(caffe.Layer):
+    """A top whose shape shows in forward only; a lazy import; the phase."""
+
+    def forward(self, bottom, top):
+        import caffe
+        n = bottom[0].num // 2 if self.phase == caffe.TRAIN else bottom[0].num
+        top[0].reshape(n, bottom[0].channels, bottom[0].height, bottom[0].width)
+        top[0].data[...] = bottom[0].data[:n].reshape(top[0].shape)
+
+
+class Look(caffe.Layer):
+    """Does nothing to the blob that it works on in place."""
+
+    def forward(self, bottom, top):
+        self.seen = bottom[0].data.copy()
+
+    def backward(self, top, propagate_down, bottom):
+        self.seen_diff = top[0].diff.copy()
+
+
+class Doubler(Look):
+    """Works on the one blob that is its bottom and its top."""
+
+    def forward(self, bottom, top):
+        bottom[0].data[...] *= 2
+
+    def backward(self, top, propagate_down, bottom):
+        bottom[0].diff[...] *= 2
+
+
+class NoLayer(object):
+    def __init__(self, param):
+        pass
+'''
+
+
+@pytest.fixture
+def python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Layer]:
+    """``python(class_name, *bottom_shapes, ...)``: a Python layer of CODE, which lies in the current directory."""
+    (tmp_path / "layers_of_mine.py").write_text(CODE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "layers_of_mine", raising=False)
+
+    def build(
+        name: str,
+        *shapes: tuple[int, ...],
+        module: str = "layers_of_mine",
+        param_str: str = "",
+        bottoms: tuple[str, ...] = ("a", "b", "c"),
+        tops: tuple[str, ...] = ("top",),
+        allow_python: bool = True,
+        **context,
+    ) -> Layer:
+        param = LayerParameter(name="mine", type="Python", bottom=bottoms[: len(shapes)], top=tops)
+        param.python_param.module, param.python_param.layer, param.python_param.param_str = module, name, param_str
+        at = lambda *path: Where("net.prototxt", 7, 3, "mine", "Python")  # noqa: E731
+        return layer_class("Python")(param, shapes, Context(allow_python=allow_python, at=at, **context))
+
+    yield build
+    sys.modules.pop("layers_of_mine", None)
+
+
+def test_code_of_a_prototxt_runs_only_where_it_is_allowed_to(python) -> None:
+    with pytest.raises(SpecError) as fault:
+        python("TimesTen", (2, 3), allow_python=False)
+    assert str(fault.value) == (
+        'net.prototxt:7:3: layer "mine" (Python): a Python layer runs code that the prototxt names; pass '
+        "--allow-python-layers where you trust it"
+    )
+    assert "layers_of_mine" not in sys.modules
+
+
+def test_checking_a_net_takes_given_shapes_and_runs_no_code(python) -> None:
+    given = {"image": (1, 3, 8, 8), "label": (1,)}
+    layer = python("Count", tops=("image", "label"), allow_python=False, open_data=False, given_shapes=given)
+    assert layer.top_shapes == [(1, 3, 8, 8), (1,)]
+    assert "layers_of_mine" not in sys.modules
+    with pytest.raises(SpecError, match="--allow-python-layers"):
+        python("Count", tops=("image", "other"), allow_python=False, open_data=False, given_shapes=given)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_first_example_of_caffe(python, dtype: torch.dtype) -> None:
+    layer = python("TimesTen", (2, 3))
+    assert layer.top_shapes == [(2, 3)]
+    for shape in ((2, 3), (4, 5, 1)):
+        bottom = torch.randn(shape, dtype=dtype, requires_grad=True)
+        top = layer.run(bottom)[0]
+        assert top.dtype == dtype
+        assert torch.equal(top, 10 * bottom)
+        diff = torch.randn(shape, dtype=dtype)
+        top.backward(diff)
+        assert torch.equal(bottom.grad, 10 * diff)
+    assert layer.top_shapes == [(4, 5, 1)]
+
+
+def test_first_example_as_a_net(python, tmp_path: Path) -> None:
+    layers = [
+        f"layer {{ type: 'Python' name: '{name}' bottom: '{bottom}' top: '{name}' "
+        "python_param { module: 'layers_of_mine' layer: 'TimesTen' } }"
+        for name, bottom in (("one", "data"), ("two", "one"), ("three", "two"))
+    ]
+    path = tmp_path / "net.prototxt"
+    path.write_text("input: 'data' input_shape { dim: 10 dim: 9 dim: 8 } force_backward: true\n" + "\n".join(layers))
+    with pytest.raises(SpecError, match=r"net.prototxt:2:9: layer \"one\" \(Python\): a Python layer runs code"):
+        netspec.load_net(path)
+    net = netspec.load_net(path, allow_python=True)
+    data = torch.full((10, 9, 8), 8.0, requires_grad=True)
+    top = net(data=data)["three"]
+    assert (top == 8000).all()
+    top.backward(torch.full((10, 9, 8), 7.0))
+    assert (data.grad == 7000).all()
+    assert net(data=np.ones((4, 4, 4, 4), np.float32))["three"].shape == (4, 4, 4, 4)
+
+
+def test_second_example_of_caffe_is_told_which_bottoms_want_a_gradient(python) -> None:
+    layer = python("Euclidean", (4, 3), (4, 3))
+    a, b = torch.randn(4, 3, requires_grad=True), torch.randn(4, 3, requires_grad=True)
+    loss = layer.run(a, b)[0]
+    assert loss.shape == (1,)
+    assert loss.item() == pytest.approx(((a - b) ** 2).sum().item() / 8, rel=1e-6)
+    loss.sum().backward()
+    torch.testing.assert_close(a.grad, (a - b).detach() / 4)
+    torch.testing.assert_close(b.grad, -a.grad)
+    layer.run(a, b.detach())[0].sum().backward()
+    assert layer.code.asked == [True, False]
+
+
+def test_a_data_layer_has_a_state_and_a_param_str(python) -> None:
+    layer = python("Count", param_str="{'size': 3}")
+    assert layer.top_shapes == [(3,)]
+    batches = [layer.run()[0] for _ in range(3)]
+    assert [batch.tolist() for batch in batches] == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
+
+
+def test_blobs_that_the_code_adds_are_learned(python, gradcheck) -> None:
+    layer = python("Learned", (4, 3))
+    assert layer.blob_shapes == [(2, 3), (1,)]
+    assert layer.blobs[0].tolist() == [[0.5] * 3] * 2
+    with torch.no_grad():
+        layer.blobs[0].copy_(torch.randn(2, 3))  # as a solver or a .caffemodel does
+        layer.blobs[1].fill_(2)
+    bottom = torch.randn(4, 3)
+    expected = torch.nn.functional.linear(bottom, layer.blobs[0]) + 2
+    torch.testing.assert_close(layer.run(bottom)[0], expected)
+    gradcheck(layer, bottom)
+
+
+def test_forward_may_give_the_top_another_shape(python) -> None:
+    layer = python("Half", (4, 3), phase=TRAIN)
+    top = layer.run(torch.arange(12.0).reshape(4, 3))[0]
+    assert top.shape == (2, 3, 1, 1)
+    assert top.flatten().tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_in_place_bottom_and_top_are_one_blob(python) -> None:
+    for name, factor in (("Look", 1), ("Doubler", 2)):
+        layer = python(name, (3,), bottoms=("x",), tops=("x",))
+        bottom = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
+        top = layer.run(bottom)[0]
+        assert top.tolist() == [factor, 2 * factor, 3 * factor]
+        assert bottom.tolist() == [1, 2, 3]  # other layers' gradients may need it
+        top.backward(torch.tensor([5.0, 6.0, 7.0]))
+        assert bottom.grad.tolist() == [5 * factor, 6 * factor, 7 * factor]
+
+
+def test_a_layer_without_tops_only_looks(python) -> None:
+    layer = python("Look", (2, 3), tops=())
+    assert layer.run(torch.ones(2, 3)) == ()
+    assert layer.code.seen.tolist() == [[1] * 3] * 2
+
+
+def test_caffe_can_be_imported_by_that_code_only(python) -> None:
+    python("TimesTen", (2, 3)).run(torch.ones(2, 3))
+    assert "caffe" not in sys.modules
+    assert str(Path.cwd()) not in sys.path[:1]
+
+
+def test_a_caffe_that_is_there_is_left_alone(python, monkeypatch: pytest.MonkeyPatch) -> None:
+    from netspec.layers.utility import pycaffe_shim
+
+    real = types.ModuleType("caffe")
+    real.Layer = type("Layer", (pycaffe_shim.Layer,), {})
+    monkeypatch.setitem(sys.modules, "caffe", real)
+    layer = python("TimesTen", (2, 3))
+    assert isinstance(layer.code, real.Layer)
+    assert sys.modules["caffe"] is real
+
+
+def test_a_folder_of_caffes_sources_is_no_caffe(python, tmp_path: Path) -> None:
+    (tmp_path / "caffe").mkdir()
+    assert python("TimesTen", (2, 3)).run(torch.ones(2, 3))[0].sum() == 60
+
+
+def test_what_the_stand_in_lacks_is_named(python, tmp_path: Path) -> None:
+    (tmp_path / "wants_more.py").write_text("import caffe\nnet = caffe.Net('a', 'b', caffe.TEST)\n")
+    with pytest.raises(SpecError, match=r"netspec's stand-in for pycaffe has no Net; it offers Layer, TRAIN and TEST"):
+        python("Mine", (2,), module="wants_more")
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        (
+            "TimesTen",
+            {"module": "nowhere"},
+            'cannot import module "nowhere" (looked for in the current directory and PYTHONPATH): ModuleNotFoundError: '
+            "No module named 'nowhere'",
+        ),
+        ("TimesTwn", {}, 'layers_of_mine.py) has no class "TimesTwn"; did you mean "TimesTen"?'),
+        ("NoLayer", {}, "layers_of_mine.NoLayer is no caffe.Layer"),
+        ("Euclidean", {}, "layers_of_mine.Euclidean.setup: Exception: Need two inputs to compute distance. ("),
+        ("Count", {"param_str": "{}"}, "layers_of_mine.Count.setup: KeyError: 'size' ("),
+    ],
+)
+def test_faults_of_the_code_are_one_line(python, name: str, options: dict, message: str) -> None:
+    with pytest.raises(SpecError) as fault:
+        python(name, (2, 3), **options)
+    text = str(fault.value)
+    assert text.startswith('net.prototxt:7:3: layer "mine" (Python): ')
+    assert message in text
+    assert "\n" not in text
+
+
+def test_faults_of_old_python_name_file_and_line(python, tmp_path: Path) -> None:
+    (tmp_path / "of_2014.py").write_text('import caffe\nprint "hello"\n')
+    with pytest.raises(SpecError, match=r"SyntaxError: .*of_2014.py, line 2"):
+        python("Mine", (2,), module="of_2014")
+
+
+def test_faults_of_forward_and_of_a_missing_backward_name_them(python) -> None:
+    layer = python("Euclidean", (2, 3), (2, 3))
+    with pytest.raises(SpecError, match=r"layers_of_mine.Euclidean.reshape: Exception: Inputs must have the same dim"):
+        layer.run(torch.ones(2, 3), torch.ones(2, 4))
+    bottom = torch.ones(2, 3, requires_grad=True)
+    top = python("Half", (2, 3)).run(bottom)[0]
+    with pytest.raises(
+        SpecError, match=r"layers_of_mine.Half.backward: AttributeError: 'Half' object has no attribute"
+    ):
+        top.sum().backward()

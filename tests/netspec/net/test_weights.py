@@ -1,0 +1,276 @@
+import logging
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from netspec.errors import SpecError
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.net.weights import load_weights, net_to_proto, save_weights
+from netspec.proto.schema import BlobProto, NetParameter, V1LayerParameter
+from netspec.proto.text import parse_net_text
+from paths import GOLDEN
+
+CASES = sorted(path.name for path in (GOLDEN / "train").iterdir())
+
+TOWERS = """
+name: "towers" state { phase: TRAIN }
+layer { name: "in" type: "Input" top: "a" top: "b" input_param { shape { dim: 2 dim: 3 } } }
+layer { name: "ip" type: "InnerProduct" bottom: "a" top: "x" inner_product_param { num_output: 4 }
+  param { name: "w" } param { name: "v" } }
+layer { name: "ip/p" type: "InnerProduct" bottom: "b" top: "y" inner_product_param { num_output: 4 }
+  param { name: "w" } param { name: "v" } }
+layer { name: "sum" type: "Eltwise" bottom: "x" bottom: "y" top: "z" }
+layer { name: "twice" type: "Eltwise" bottom: "x" bottom: "z" top: "out" }
+"""
+
+
+def net_of(text: str, seed: int = 1) -> Net:
+    return build_net(*parse_net_text(text, "net.prototxt"), BuildOptions(seed=seed))
+
+
+def blobs_of(net: Net) -> dict[str, list[np.ndarray]]:
+    return {name: [blob.detach().numpy().copy() for blob in blobs] for name, blobs in net.params.items()}
+
+
+def fill(net: Net) -> None:
+    with torch.no_grad():
+        for k, item in enumerate(net.learnable):
+            item.parameter.copy_(torch.arange(item.parameter.numel()).view(item.parameter.shape) + 100.0 * k)
+            item.parameter.grad = torch.full_like(item.parameter, 0.5)
+
+
+@pytest.fixture
+def golden_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Return a function that builds the TRAIN net of one of Caffe's trainings."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pairs").symlink_to(GOLDEN / "pairs")
+
+    def build(folder: str) -> Net:
+        text = (GOLDEN / folder / "train_val.prototxt").read_text()
+        net, source = parse_net_text(text, "train_val.prototxt")
+        net.state.phase = 0
+        return build_net(net, source)
+
+    return build
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_weights_of_caffes_are_written_again_byte_for_byte(case: str, golden_net, tmp_path: Path):
+    """Layer list, splits, phases, parameters, shapes, and shared blobs repeated by each sharer are Caffe's."""
+    net = golden_net(f"train/{case}")
+    load_weights(net, GOLDEN / "train" / case / "init.caffemodel")
+    save_weights(net, tmp_path / "again.caffemodel")
+    net.close()
+    assert (tmp_path / "again.caffemodel").read_bytes() == (GOLDEN / "train" / case / "init.caffemodel").read_bytes()
+
+
+def test_the_hdf5_form_has_caffes_structure(golden_net, tmp_path: Path):
+    theirs = GOLDEN / "snapshot/h5_iter_10.caffemodel.h5"
+    net = golden_net("snapshot")
+    load_weights(net, theirs)
+    save_weights(net, tmp_path / "again.caffemodel.h5")
+    net.close()
+    with h5py.File(tmp_path / "again.caffemodel.h5") as mine, h5py.File(theirs) as expected:
+        names: list[list[str]] = [[], []]
+        mine.visit(names[0].append)
+        expected.visit(names[1].append)
+        assert names[0] == names[1]
+        for name in names[0]:
+            if isinstance(expected[name], h5py.Dataset):
+                assert mine[name].dtype == expected[name].dtype
+                assert mine[name].chunks is None
+                np.testing.assert_array_equal(mine[name][()], expected[name][()])
+
+
+@pytest.mark.parametrize("name", ["w.caffemodel", "w.caffemodel.h5"])
+def test_what_is_written_is_read(name: str, tmp_path: Path):
+    net = net_of(TOWERS)
+    fill(net)
+    save_weights(net, tmp_path / name)
+    other = net_of(TOWERS, seed=2)
+    load_weights(other, tmp_path / name)
+    for layer, blobs in blobs_of(net).items():
+        for mine, theirs in zip(blobs, blobs_of(other)[layer], strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+    assert other.params["ip"][0] is other.params["ip/p"][0]
+
+
+def test_the_file_lists_the_layers_as_they_run():
+    proto = net_to_proto(net_of(TOWERS))
+    assert proto.name == "towers"
+    assert [layer.name for layer in proto.layer] == ["in", "ip", "x_ip_0_split", "ip/p", "sum", "twice"]
+    assert all(layer.phase == 0 and layer.HasField("phase") for layer in proto.layer)
+    assert [len(layer.blobs) for layer in proto.layer] == [0, 2, 0, 2, 0, 0]
+    assert list(proto.layer[3].blobs[0].shape.dim) == [4, 3]
+    assert not any(len(blob.diff) for layer in proto.layer for blob in layer.blobs)
+
+
+def test_gradients_are_written_where_asked_for(tmp_path: Path):
+    net = net_of(TOWERS)
+    fill(net)
+    assert list(net_to_proto(net, diff=True).layer[3].blobs[1].diff) == [0.5] * 4
+    save_weights(net, tmp_path / "w.h5", diff=True)
+    with h5py.File(tmp_path / "w.h5") as file:
+        assert sorted(file["data/ip"]) == ["0", "1", "p"]
+        assert sorted(file["data/ip/p"]) == []  # a sharer's data are its owner's; its diffs are written
+        assert sorted(file["diff/ip/p"]) == ["0", "1"]
+        assert file["diff/ip/0"][()].tolist() == [[0.5] * 3] * 4
+
+
+def test_a_sharer_of_another_shape_is_written_in_its_own(tmp_path: Path):
+    net = net_of(
+        """
+        layer { name: "in" type: "Input" top: "a" top: "b"
+          input_param { shape { dim: 2 dim: 3 } shape { dim: 2 dim: 4 } } }
+        layer { name: "p" type: "InnerProduct" bottom: "a" top: "x" param { name: "w" share_mode: PERMISSIVE }
+          inner_product_param { num_output: 4 bias_term: false } }
+        layer { name: "q" type: "InnerProduct" bottom: "b" top: "y" param { name: "w" share_mode: PERMISSIVE }
+          inner_product_param { num_output: 3 bias_term: false } }
+        """
+    )
+    fill(net)
+    save_weights(net, tmp_path / "w.caffemodel")
+    proto = NetParameter.FromString((tmp_path / "w.caffemodel").read_bytes())
+    assert [list(layer.blobs[0].shape.dim) for layer in proto.layer[1:]] == [[4, 3], [3, 4]]
+    assert list(proto.layer[2].blobs[0].data) == list(range(12))
+    before = blobs_of(net)["p"][0]
+    load_weights(net, tmp_path / "w.caffemodel")
+    np.testing.assert_array_equal(blobs_of(net)["p"][0], before)
+
+
+def written(tmp_path: Path, proto: NetParameter) -> Path:
+    path = tmp_path / "w.caffemodel"
+    path.write_bytes(proto.SerializeToString())
+    return path
+
+
+def test_layers_that_only_the_file_has_are_ignored_and_named(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    proto = net_to_proto(net_of(TOWERS))
+    proto.layer[1].name = "other"
+    with caplog.at_level(logging.INFO, "netspec"):
+        load_weights(net_of(TOWERS), written(tmp_path, proto))
+    assert "Ignoring source layer other" in caplog.text
+    assert "Ignoring source layer ip" not in caplog.text
+
+
+def test_layers_that_only_the_net_has_stay(tmp_path: Path):
+    proto = net_to_proto(net_of(TOWERS))
+    del proto.layer[1:]
+    net = net_of(TOWERS)
+    fill(net)
+    load_weights(net, written(tmp_path, proto))
+    assert blobs_of(net)["ip"][0][0].tolist() == [0, 1, 2]
+
+
+def test_old_four_axis_shapes_fit(tmp_path: Path):
+    proto = NetParameter()
+    layer = proto.layer.add(name="ip")
+    layer.blobs.add(num=1, channels=1, height=4, width=3).data.extend(range(12))
+    layer.blobs.add(num=1, channels=1, height=1, width=4).data.extend([5, 6, 7, 8])
+    net = net_of(TOWERS)
+    load_weights(net, written(tmp_path, proto))
+    assert blobs_of(net)["ip"][0].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]]
+    assert blobs_of(net)["ip"][1].tolist() == [5, 6, 7, 8]
+
+
+def test_double_data_is_read(tmp_path: Path):
+    proto = net_to_proto(net_of(TOWERS))
+    for layer in proto.layer:
+        for blob in layer.blobs:
+            blob.double_data.extend([0.5] * len(blob.data))
+            blob.ClearField("data")
+    net = net_of(TOWERS)
+    load_weights(net, written(tmp_path, proto))
+    assert set(blobs_of(net)["ip"][0].flat) == {0.5}
+
+
+def test_weights_of_v1_nets_are_upgraded(tmp_path: Path):
+    proto = NetParameter(name="old")
+    layer = V1LayerParameter(name="ip", type="INNER_PRODUCT")
+    layer.blobs.append(BlobProto(num=1, channels=1, height=4, width=3, data=range(12)))
+    layer.blobs.append(BlobProto(num=1, channels=1, height=1, width=4, data=range(4)))
+    proto.layers.append(layer)
+    net = net_of(TOWERS)
+    load_weights(net, written(tmp_path, proto))
+    assert blobs_of(net)["ip"][0][3].tolist() == [9, 10, 11]
+
+
+def test_another_shape_is_refused_and_nothing_changes(tmp_path: Path):
+    proto = net_to_proto(net_of(TOWERS))
+    proto.layer[3].blobs[1].shape.dim[:] = [2, 2]
+    net = net_of(TOWERS)
+    fill(net)
+    before = blobs_of(net)["ip"][0]
+    message = (
+        r"w\.caffemodel: cannot copy param 1 weights from layer 'ip/p'; shape mismatch\. "
+        r"Source param shape is 2 2 \(4\); target param shape is 4 \(4\)\. "
+        r"To learn this layer's parameters from scratch rather than copying from a saved net, rename the layer\.$"
+    )
+    with pytest.raises(SpecError, match=message):
+        load_weights(net, written(tmp_path, proto))
+    np.testing.assert_array_equal(blobs_of(net)["ip"][0], before)
+
+
+def test_another_number_of_blobs_is_refused(tmp_path: Path):
+    proto = net_to_proto(net_of(TOWERS))
+    del proto.layer[1].blobs[1:]
+    with pytest.raises(SpecError, match="incompatible number of blobs for layer 'ip': 1 in the file, 2 in the net"):
+        load_weights(net_of(TOWERS), written(tmp_path, proto))
+
+
+def test_in_hdf5_only_the_blobs_of_an_owner_may_not_lack(tmp_path: Path):
+    path = tmp_path / "w.caffemodel.h5"
+    net = net_of(TOWERS)
+    save_weights(net, path)
+    with h5py.File(path, "r+") as file:
+        del file["data/ip/1"]
+    with pytest.raises(SpecError, match="incompatible number of blobs for layer 'ip': 1 in the file, 2 in the net"):
+        load_weights(net, path)
+    save_weights(net, path)
+    with h5py.File(path, "r+") as file:
+        file["data/ip"].create_dataset("2", data=[1.0])
+    with pytest.raises(SpecError, match="incompatible number of blobs for layer 'ip': 3 in the file, 2 in the net"):
+        load_weights(net, path)
+    save_weights(net, path)
+    with h5py.File(path, "r+") as file:
+        del file["data/ip/1"]
+        file["data/ip"].create_dataset("1", data=np.zeros((1, 4), np.float32))
+    with pytest.raises(SpecError, match=r"Source param shape is 1 4 \(4\); target param shape is 4 \(4\)"):
+        load_weights(net, path)
+
+
+def test_the_form_is_known_by_the_content_not_by_the_name(tmp_path: Path):
+    net = net_of(TOWERS)
+    save_weights(net, tmp_path / "w.h5")
+    shutil.move(tmp_path / "w.h5", tmp_path / "w.caffemodel")
+    load_weights(net, tmp_path / "w.caffemodel")
+
+
+def test_files_that_are_no_weights(tmp_path: Path):
+    net = net_of(TOWERS)
+    with pytest.raises(SpecError, match=r"nowhere\.caffemodel: cannot be read: No such file"):
+        load_weights(net, tmp_path / "nowhere.caffemodel")
+    (tmp_path / "text.caffemodel").write_text("layer { }\n" * 20)
+    with pytest.raises(SpecError, match=r"text\.caffemodel: expected a binary NetParameter, found text"):
+        load_weights(net, tmp_path / "text.caffemodel")
+    with h5py.File(tmp_path / "state.h5", "w") as file:
+        file.create_group("history")
+    with pytest.raises(SpecError, match=r"state\.h5: .*no group /data"):
+        load_weights(net, tmp_path / "state.h5")
+    torn = net_to_proto(net)
+    torn.layer[1].blobs[1].data.append(1)
+    with pytest.raises(SpecError, match=r'layer "ip", blob 1: found 5 numbers in data, expected 4 for shape \(4,\)'):
+        load_weights(net, written(tmp_path, torn))
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path):
+    with pytest.raises(SpecError, match=r"gone/w\.caffemodel: cannot be written: No such file or directory"):
+        save_weights(net_of(TOWERS), tmp_path / "gone" / "w.caffemodel")
+    with pytest.raises(SpecError, match=r"gone/w\.h5: cannot be written: No such file or directory$"):
+        save_weights(net_of(TOWERS), tmp_path / "gone" / "w.h5")

@@ -1,0 +1,209 @@
+"""A fork's fields and messages are known while its dialect is active, and only then."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+
+from netspec.errors import SpecError
+from netspec.proto import schema
+from netspec.proto.dialect import registry as dialect
+from netspec.proto.dialect.declarations import read_declarations
+from netspec.proto.dialect.registry import Dialect
+from netspec.proto.schema import LayerParameter, NetParameter
+from netspec.proto.text import parse_net_text, write_text
+
+PROTO = Path(schema.__file__).parent
+
+SOURCE = """
+// A made-up fork.
+message WarpParameter {
+  enum Border { ZERO = 0; EDGE = -1; }  /* two
+                                           lines */
+  message Corner { required double x = 1; optional uint64 id = 2 [default = 0x10]; }
+  optional Border border = 1 [default = EDGE];
+  repeated float scale = 2 [packed = true];
+  optional FillerParameter filler = 3;
+  repeated Corner corner = 4;
+  optional string note = 5 [default = "a b"];
+  optional float tiny = 6 [default = -1.5e-3];
+  optional bool on = 7 [default = true];
+}
+enum Sort { UP = 1; DOWN = 2; }
+extend LayerParameter {
+  optional WarpParameter warp_param = 900;
+  repeated int32 ages = 901;
+}
+extend caffe.PoolingParameter { optional Sort sort = 20; }
+extend V1LayerParameter { optional WarpParameter warp_param2 = 2000; }
+"""
+NET = """layer {
+  name: "w"
+  pooling_param {
+    sort: DOWN
+  }
+  warp_param {
+    border: ZERO
+    scale: 0.5
+    scale: 2
+    filler {
+      type: "xavier"
+    }
+    corner {
+      x: 3
+    }
+  }
+  ages: 4
+  ages: 5
+}
+"""
+
+
+@pytest.fixture
+def fork() -> Iterator[Dialect]:
+    made_up = Dialect("madeup", SOURCE, ("Warp", "Bend"), "add --plugin madeup")
+    dialect.activate(made_up)
+    yield made_up
+    if "madeup" in dialect.active():
+        dialect.deactivate("madeup")
+
+
+@pytest.mark.usefixtures("fork")
+def test_fields_of_an_active_dialect_are_read_and_written() -> None:
+    net, source = parse_net_text(NET, "f")
+    layer = net.layer[0]
+    warp = schema.value(layer, "warp_param")
+    assert list(warp.scale) == [0.5, 2]
+    assert warp.filler.type == "xavier"
+    assert (warp.border, warp.corner[0].id, warp.note, warp.on) == (0, 16, "a b", True)
+    assert warp.tiny == pytest.approx(-1.5e-3)
+    assert list(schema.value(layer, "ages")) == [4, 5]
+    assert schema.value(layer.pooling_param, "sort") == 2
+    assert schema.has(layer, "warp_param")
+    assert not schema.has(LayerParameter(), "warp_param")
+    assert not schema.has(LayerParameter(), "ages")
+    assert schema.value(LayerParameter(), "warp_param").border == -1
+    assert str(source.at(0, "warp_param", "scale", 1)) == "f:9:5"
+    assert write_text(net) == NET
+    assert write_text(NetParameter.FromString(net.SerializeToString())) == NET
+
+
+@pytest.mark.usefixtures("fork")
+def test_faults_in_a_dialects_fields_have_places() -> None:
+    with pytest.raises(SpecError, match=r'^f:1:22: WarpParameter has no field "scal"; did you mean "scale"\?$'):
+        parse_net_text("layer { warp_param { scal: 3 } }", "f")
+    with pytest.raises(SpecError, match=r'^f:1:22: Corner lacks "x", which it requires$'):
+        parse_net_text("layer { warp_param { corner {} } }", "f")
+
+
+@pytest.mark.usefixtures("fork")
+def test_upgrades_carry_a_dialects_fields() -> None:
+    net, source = parse_net_text("layer { name: 'a' }\ninput: 'x' input_dim: [1, 1, 1, 1] layer {\n ages: 3 }", "f")
+    assert list(schema.value(net.layer[2], "ages")) == [3]
+    assert str(source.at(2, "ages")) == "f:3:2"
+
+
+def test_classes_and_schema_are_caffes_without_a_dialect(fork: Dialect) -> None:
+    before = LayerParameter, schema.message("LayerParameter")
+    dialect.deactivate(fork.name)
+    assert (LayerParameter, schema.message("LayerParameter")) == before
+    assert dialect.active() == []
+    with pytest.raises(SpecError) as caught:
+        parse_net_text("layer {\n warp_param {} }", "f")
+    assert str(caught.value) == (
+        'f:2:2: LayerParameter has no field "warp_param"; dialect "madeup" has "warp_param"; add --plugin madeup'
+    )
+    dialect.activate(fork)
+    assert dialect.active() == ["madeup"]
+    parse_net_text("layer { warp_param {} }", "f")
+
+
+def test_an_unknown_type_or_field_tells_which_known_dialects_have_it() -> None:
+    dialect.announce(
+        Dialect("one", "extend LayerParameter { optional int32 lens = 700; }", ("Lens",), "add --plugin one")
+    )
+    dialect.announce(Dialect("two", "extend LayerParameter { optional int32 lens = 800; }", ("Lens",)))
+    assert dialect.advice_for_type("Lens") == 'dialects "one" and "two" have "Lens"; add --plugin one'
+    assert dialect.advice_for_field("caffe.LayerParameter", "lens").startswith('dialects "one" and "two" have "lens"')
+    assert dialect.advice_for_field("caffe.PoolingParameter", "lens") == ""
+    assert dialect.advice_for_type("ReLU") == ""
+
+
+REFUSED = {
+    "a field that Caffe has": (
+        "extend LayerParameter { optional int32 name = 990; }",
+        'bad.proto: caffe.LayerParameter has a field "name" already',
+    ),
+    "a number that Caffe has": ("extend LayerParameter { optional int32 x = 100; }", "do not fit Caffe's schema"),
+    "an unknown type": ("extend LayerParameter { optional Thing x = 991; }", "do not fit Caffe's schema"),
+    "an unknown message": (
+        "extend LayersParameter { optional int32 x = 991; }",
+        'bad.proto: Caffe has no message "caffe.LayersParameter" to extend',
+    ),
+    "no label": (
+        "message A {\n int32 x = 1; }",
+        'bad.proto:2:2: expected optional, repeated or required, found "int32"',
+    ),
+    "no number": ("message A { optional int32 x = y; }", 'bad.proto:1:32: expected an integer, found "y"'),
+    "another language": ("class A: pass", 'bad.proto:1:8: unexpected character ":"'),
+    "another statement": ("service A {}", 'bad.proto:1:1: expected message, enum or extend, found "service"'),
+    "another syntax": ('syntax = "proto3";', "bad.proto:1:10: expected proto2"),
+    "another option": ("message A { optional int32 x = 1 [lazy = true]; }", 'bad.proto:1:35: unknown option "lazy"'),
+    "an end too early": ("message A {", "bad.proto:1:12: the declarations end too early"),
+}
+
+
+@pytest.mark.parametrize(("source", "message"), REFUSED.values(), ids=REFUSED.keys())
+def test_bad_declarations_are_refused(source: str, message: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        dialect.activate(Dialect("bad", source))
+    assert message in str(caught.value)
+    assert "bad" not in dialect.active()
+
+
+def test_two_dialects_with_one_field_are_not_active_together(fork: Dialect) -> None:
+    rival = Dialect("rival", "extend LayerParameter { optional int32 warp_param = 950; }")
+    with pytest.raises(SpecError, match=r'^rival\.proto: caffe\.LayerParameter has a field "warp_param" already$'):
+        dialect.activate(rival)
+    dialect.deactivate(fork.name)
+    dialect.activate(rival)
+    assert schema.value(LayerParameter(), "warp_param") == 0
+    dialect.deactivate("rival")
+
+
+def test_declarations_mean_what_protoc_makes_of_them(tmp_path: Path) -> None:
+    protoc = pytest.importorskip("grpc_tools.protoc")
+    (tmp_path / "fork.proto").write_text(
+        f'syntax = "proto2"; package caffe.fork; import "caffe.proto";{SOURCE}', "utf-8"
+    )
+    # protoc wants the ranges that netspec opens by itself when it loads the schema.
+    ranges = FileDescriptorProto()
+    schema.pool.FindFileByName("caffe.proto").CopyToProto(ranges)
+    opened = tmp_path / "caffe.desc"
+    opened.write_bytes(FileDescriptorSet(file=[ranges]).SerializeToString())
+    out = tmp_path / "fork.desc"
+    arguments = [
+        f"-I{tmp_path}",
+        f"--descriptor_set_in={opened}",
+        f"--descriptor_set_out={out}",
+        str(tmp_path / "fork.proto"),
+    ]
+    assert protoc.main(["protoc", *arguments]) == 0
+    theirs = FileDescriptorSet()
+    theirs.ParseFromString(out.read_bytes())
+    ours = read_declarations((tmp_path / "fork.proto").read_text("utf-8"), "fork.proto", "elsewhere")
+    resolved = []
+    for file in (ours, theirs.file[0]):
+        pool = DescriptorPool()
+        pool.Add(ranges)
+        pool.Add(file)
+        message = DescriptorProto()
+        pool.FindMessageTypeByName("caffe.fork.WarpParameter").CopyToProto(message)
+        for field in [*message.field, *message.nested_type[0].field]:
+            field.ClearField("json_name")
+        extensions: list[Any] = [pool.FindExtensionByName(f"caffe.fork.{e.name}") for e in file.extension]
+        resolved.append((message, [(e.containing_type.full_name, e.number, e.type) for e in extensions]))
+    assert resolved[0] == resolved[1]

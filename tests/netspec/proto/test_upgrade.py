@@ -1,0 +1,607 @@
+"""Older formats become the current one, and every part keeps the place it came from."""
+
+import logging
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf import text_format
+
+from netspec.errors import SpecError
+from netspec.proto.schema import NetParameter, SolverParameter, V1LayerParameter
+from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.text import parse_net_text, parse_solver, parse_solver_text, read_solver, write_text
+from netspec.proto.upgrade import current as upgrade
+from netspec.proto.upgrade.v0 import merge_padding, upgrade_v0
+from paths import GOLDEN
+
+V0 = """\
+name: "old"
+input: "data"
+input_dim: 1 input_dim: 3 input_dim: 8 input_dim: 8
+state { level: 2 }
+layers {
+  layer { name: "pad1" type: "padding"
+    pad: 2 }
+  bottom: "data" top: "padded"
+}
+layers {
+  layer { name: "conv1" type: "conv"
+    num_output: 4 kernelsize: 5 group: 2 stride: 1 biasterm: false
+    weight_filler { type: "gaussian" std: 0.01 }
+    blobs_lr: 1. blobs_lr: 2.
+    weight_decay: 1. weight_decay: 0.
+  }
+  bottom: "padded"
+  top: "conv1"
+}
+layers {
+  layer { name: "pool1" type: "pool" pool: AVE kernelsize: 3
+    stride: 2 pad: 1 }
+  bottom: "conv1" top: "pool1"
+}
+"""
+
+V0_UPGRADED = """\
+name: "old"
+state { level: 2 }
+layer {
+  name: "input" type: "Input" top: "data"
+  input_param { shape { dim: [1, 3, 8, 8] } }
+}
+layer {
+  name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
+  param { lr_mult: 1 decay_mult: 1 }
+  param { lr_mult: 2 decay_mult: 0 }
+  convolution_param {
+    num_output: 4 kernel_size: 5 group: 2 stride: 1 bias_term: false pad: 2
+    weight_filler { type: "gaussian" std: 0.01 }
+  }
+}
+layer {
+  name: "pool1" type: "Pooling" bottom: "conv1" top: "pool1"
+  pooling_param { pool: AVE kernel_size: 3 stride: 2 pad: 1 }
+}
+"""
+
+V1 = """\
+layers {
+  name: "data" type: DATA top: "data" top: "label"
+  data_param { source: "db"
+    scale: 0.5 mirror: true }
+  include: { phase: TRAIN }
+}
+layers {
+  name: "ip" type: INNER_PRODUCT bottom: "data" top: "ip"
+  param: "w"
+  param: "b"
+  blob_share_mode: PERMISSIVE
+  blobs_lr: 1
+  blobs_lr: 2
+  blobs_lr: 3
+  weight_decay: 0
+  inner_product_param { num_output: 3 }
+  loss_weight: 0.5
+  exclude { stage: "x" }
+}
+"""
+
+V1_UPGRADED = """\
+layer {
+  name: "data" type: "Data" top: "data" top: "label"
+  data_param { source: "db" }
+  transform_param { scale: 0.5 mirror: true }
+  include: { phase: TRAIN }
+}
+layer {
+  name: "ip" type: "InnerProduct" bottom: "data" top: "ip"
+  param { name: "w" share_mode: PERMISSIVE lr_mult: 1 decay_mult: 0 }
+  param { name: "b" lr_mult: 2 }
+  param { lr_mult: 3 }
+  inner_product_param { num_output: 3 }
+  loss_weight: 0.5
+  exclude { stage: "x" }
+}
+"""
+
+SHAPES = 'input: "a"\ninput: "b"\ninput_shape { dim: 1 }\ninput_shape {\n  dim: 2 dim: 3\n}\nlayer { name: "l" }\n'
+SHAPES_UPGRADED = """\
+layer {
+  name: "input" type: "Input" top: "a" top: "b"
+  input_param { shape { dim: 1 } shape { dim: [2, 3] } }
+}
+layer { name: "l" }
+"""
+
+BATCH_NORM = """\
+layer { name: "bn" type: "BatchNorm" param { name: "m" lr_mult: 1 } param { name: "v" } param { decay_mult: 0 } }
+layer { name: "two" type: "BatchNorm" param { lr_mult: 0 } param { lr_mult: 0 } }
+"""
+BATCH_NORM_UPGRADED = """\
+layer { name: "bn" type: "BatchNorm"
+  param { name: "m" lr_mult: 0 decay_mult: 0 }
+  param { name: "v" lr_mult: 0 decay_mult: 0 }
+  param { lr_mult: 0 decay_mult: 0 }
+}
+layer { name: "two" type: "BatchNorm" param { lr_mult: 0 } param { lr_mult: 0 } }
+"""
+
+NETS = {
+    "V0": (V0, V0_UPGRADED),
+    "V1": (V1, V1_UPGRADED),
+    "input shapes": (SHAPES, SHAPES_UPGRADED),
+    "batch norm": (BATCH_NORM, BATCH_NORM_UPGRADED),
+}
+PASSES: list[Callable[[NetParameter, SourceMap], tuple[NetParameter, SourceMap]]] = [
+    upgrade_v0,
+    upgrade.upgrade_data,
+    upgrade.upgrade_v1,
+    upgrade.upgrade_input,
+    upgrade.upgrade_batch_norm,
+]
+
+
+def net_of(text: str) -> NetParameter:
+    return text_format.Parse(text, NetParameter())
+
+
+def leaves(node: Place) -> list[Place]:
+    """Return the places of all parts, whole messages included."""
+    return [node, *(leaf for nodes in node.fields.values() for inner in nodes for leaf in leaves(inner))]
+
+
+@pytest.mark.parametrize(("old", "new"), NETS.values(), ids=NETS.keys())
+def test_net_is_upgraded(old: str, new: str) -> None:
+    net, source = parse_net_text(old, "f")
+    assert write_text(net) == write_text(net_of(new))
+    assert len(source.layers) == len(net.layer)
+    assert not upgrade.net_needs_upgrade(net)
+
+
+@pytest.mark.parametrize(("old", "new"), NETS.values(), ids=NETS.keys())
+def test_passes_change_nothing_they_are_given_and_nothing_twice(old: str, new: str) -> None:
+    net, source = parse_net_text(old, "f", upgrade=False)
+    assert upgrade.net_needs_upgrade(net)
+    for step in PASSES:
+        before = net.SerializeToString(deterministic=True), source
+        after, after_source = step(net, source)
+        assert (net.SerializeToString(deterministic=True), source) == before
+        again, again_source = step(after, after_source)
+        assert again is after
+        assert again_source is after_source
+        net, source = after, after_source
+    assert net == net_of(new)
+
+
+@pytest.mark.parametrize(("old", "new"), NETS.values(), ids=NETS.keys())
+def test_every_part_has_a_place_with_its_own_value_in_that_line(old: str, new: str) -> None:
+    net, source = parse_net_text(old, "f")
+    lines = old.splitlines()
+    for layer, place in zip(net.layer, source.layers, strict=True):
+        for name in ("name", "bottom", "top"):
+            for node, value in zip(place.fields.get(name, ()), _values(layer, name), strict=False):
+                assert f'"{value}"' in lines[node.where.line - 1]
+        for node in leaves(place):
+            assert 0 < node.where.line <= len(lines)
+
+
+def _values(layer: Any, name: str) -> list[str]:
+    return [layer.name] if name == "name" else list(getattr(layer, name))
+
+
+def test_places_of_a_v0_net() -> None:
+    _, source = parse_net_text(V0, "f")
+    assert str(source.at(0)) == "f:2:1"
+    assert str(source.at(0, "input_param", "shape", 0, "dim", 3)) == "f:3:40"
+    assert str(source.at(1)) == "f:10:1"
+    assert str(source.at(1, "bottom")) == "f:8:3"
+    assert str(source.at(1, "convolution_param", "pad")) == "f:7:5"
+    assert str(source.at(1, "convolution_param", "kernel_size")) == "f:12:19"
+    assert str(source.at(1, "convolution_param", "weight_filler", "std")) == "f:13:38"
+    assert str(source.at(1, "param", 1, "lr_mult")) == "f:14:18"
+    assert str(source.at(1, "param", 1, "decay_mult")) == "f:15:22"
+    assert str(source.at(2, "pooling_param", "stride")) == "f:22:5"
+
+
+def test_places_of_a_v1_net() -> None:
+    _, source = parse_net_text(V1, "f")
+    assert str(source.at(0, "type")) == "f:2:16"
+    assert str(source.at(0, "transform_param")) == "f:3:3"
+    assert str(source.at(0, "transform_param", "mirror")) == "f:4:16"
+    assert str(source.at(0, "data_param", "source")) == "f:3:16"
+    assert str(source.at(0, "include", 0, "phase")) == "f:5:14"
+    assert str(source.at(1, "param", 0)) == "f:9:3"
+    assert str(source.at(1, "param", 0, "share_mode")) == "f:11:3"
+    assert str(source.at(1, "param", 1, "name")) == "f:10:3"
+    assert str(source.at(1, "param", 2, "lr_mult")) == "f:14:3"
+
+
+def test_weights_are_upgraded_without_places() -> None:
+    v1 = net_of('input: "data" layers { name: "c" type: CONVOLUTION blobs { num: 1 data: [1, 2] } blobs_lr: 2 }')
+    net, source = upgrade.upgrade_net(v1, SourceMap.unknown("w.caffemodel", 1))
+    expected = net_of(
+        'layer { name: "c" type: "Convolution" blobs { num: 1 data: [1, 2] } param { lr_mult: 2 } }',
+    )
+    assert net == expected
+    assert str(source.at(0, "param", 0)) == "w.caffemodel"
+    v0 = net_of('layers { layer { name: "c" type: "innerproduct" num_output: 2 blobs { data: 3 } } }')
+    net, _ = upgrade.upgrade_net(v0, SourceMap.unknown("w.caffemodel", 1))
+    assert net == net_of(
+        'layer { name: "c" type: "InnerProduct" blobs { data: 3 } inner_product_param { num_output: 2 } }'
+    )
+
+
+# ---- V0 ----
+
+# The fields of a V0 layer, and of the layer that it becomes, type first.
+V0_LAYERS = [
+    (
+        'type: "data" source: "s" batchsize: 2 rand_skip: 3 scale: 0.5 meanfile: "m" cropsize: 4 mirror: true',
+        'type: "Data" data_param { source: "s" batch_size: 2 rand_skip: 3 } transform_param { scale: 0.5 '
+        'mean_file: "m" crop_size: 4 mirror: true }',
+    ),
+    (
+        'type: "images" source: "s" batchsize: 2 rand_skip: 3 shuffle_images: true new_height: 5 new_width: 6',
+        'type: "ImageData" image_data_param { source: "s" batch_size: 2 rand_skip: 3 shuffle: true '
+        "new_height: 5 new_width: 6 }",
+    ),
+    (
+        'type: "window_data" source: "s" batchsize: 2 det_fg_threshold: 0.6 det_bg_threshold: 0.4 '
+        'det_fg_fraction: 0.3 det_context_pad: 7 det_crop_mode: "square"',
+        'type: "WindowData" window_data_param { source: "s" batch_size: 2 fg_threshold: 0.6 '
+        'bg_threshold: 0.4 fg_fraction: 0.3 context_pad: 7 crop_mode: "square" }',
+    ),
+    (
+        'type: "hdf5_data" source: "s" batchsize: 2',
+        'type: "HDF5Data" hdf5_data_param { source: "s" batch_size: 2 }',
+    ),
+    (
+        'type: "hdf5_output" hdf5_output_param { file_name: "o" }',
+        'type: "HDF5Output" hdf5_output_param { file_name: "o" }',
+    ),
+    (
+        'type: "infogain_loss" source: "s"',
+        'type: "InfogainLoss" infogain_loss_param { source: "s" }',
+    ),
+    (
+        'type: "innerproduct" num_output: 2 biasterm: false weight_filler { std: 2 } bias_filler { value: 3 }',
+        'type: "InnerProduct" inner_product_param { num_output: 2 bias_term: false weight_filler { std: '
+        "2 } bias_filler { value: 3 } }",
+    ),
+    (
+        'type: "conv" pad: 1 bias_filler { value: 3 }',
+        'type: "Convolution" convolution_param { pad: 1 bias_filler { value: 3 } }',
+    ),
+    (
+        'type: "pool" pool: STOCHASTIC',
+        'type: "Pooling" pooling_param { pool: STOCHASTIC }',
+    ),
+    (
+        'type: "dropout" dropout_ratio: 0.2',
+        'type: "Dropout" dropout_param { dropout_ratio: 0.2 }',
+    ),
+    (
+        'type: "lrn" local_size: 3 alpha: 2 beta: 0.5 k: 4',
+        'type: "LRN" lrn_param { local_size: 3 alpha: 2 beta: 0.5 k: 4 }',
+    ),
+    (
+        'type: "concat" concat_dim: 0',
+        'type: "Concat" concat_param { concat_dim: 0 }',
+    ),
+    (
+        'type: "accuracy"',
+        'type: "Accuracy"',
+    ),
+    (
+        'type: "bnll"',
+        'type: "BNLL"',
+    ),
+    (
+        'type: "euclidean_loss"',
+        'type: "EuclideanLoss"',
+    ),
+    (
+        'type: "flatten"',
+        'type: "Flatten"',
+    ),
+    (
+        'type: "im2col"',
+        'type: "Im2col"',
+    ),
+    (
+        'type: "multinomial_logistic_loss"',
+        'type: "MultinomialLogisticLoss"',
+    ),
+    (
+        'type: "relu"',
+        'type: "ReLU"',
+    ),
+    (
+        'type: "sigmoid"',
+        'type: "Sigmoid"',
+    ),
+    (
+        'type: "softmax"',
+        'type: "Softmax"',
+    ),
+    (
+        'type: "softmax_loss"',
+        'type: "SoftmaxWithLoss"',
+    ),
+    (
+        'type: "split"',
+        'type: "Split"',
+    ),
+    (
+        'type: "tanh"',
+        'type: "TanH"',
+    ),
+]
+
+
+@pytest.mark.parametrize(("old", "new"), V0_LAYERS, ids=lambda text: text.split('"')[1])
+def test_v0_layer(old: str, new: str, caplog: pytest.LogCaptureFixture) -> None:
+    net, _ = parse_net_text(f'layers {{ layer {{ name: "l" {old} }} top: "t" }}', "f")
+    assert net == net_of(f'layer {{ name: "l" top: "t" {new} }}')
+    assert "Unknown parameter" not in caplog.text
+
+
+def test_v0_parameter_of_another_type_is_dropped_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    net, _ = parse_net_text('layers { layer { name: "l" type: "relu"\n num_output: 3 new_num: 2 } }', "f")
+    assert net == net_of('layer { name: "l" type: "ReLU" }')
+    assert "f:2:2: Unknown parameter num_output for layer type relu" in caplog.messages
+    assert "f:2:16: Unknown parameter new_num for layer type relu" in caplog.messages
+
+
+def test_v1_layer_among_v0_layers_is_kept() -> None:
+    net, _ = parse_net_text('layers { name: "a" type: RELU } layers { layer { name: "b" type: "tanh" } }', "f")
+    assert net == net_of('layer { name: "a" type: "ReLU" } layer { name: "b" type: "TanH" }')
+
+
+def test_padding_is_merged_where_its_blob_is_used_last_made() -> None:
+    """A padding layer's output may have the name of its input; each consumer sees the last maker of a name."""
+    text = """
+      input: "x"
+      layers { layer { name: "p" type: "padding" pad: 1 } bottom: "x" top: "x" }
+      layers { layer { name: "c1" type: "conv" } bottom: "x" top: "x" }
+      layers { layer { name: "c2" type: "conv" } bottom: "x" top: "y" }
+    """
+    net, _ = merge_padding(*parse_net_text(text, "f", upgrade=False))
+    assert [(layer.layer.name, layer.layer.HasField("pad")) for layer in net.layers] == [("c1", True), ("c2", False)]
+
+
+PADDING_FAULTS = {
+    "feeds no convolution": (
+        'layers { layer { name: "r" type: "relu" }\n bottom: "p" }',
+        'f:3:2: layer "r" (relu): padding layer "p" feeds it; only a conv or pool layer with one bottom can pad',
+    ),
+    "feeds one of two bottoms": (
+        'layers { layer { name: "c" type: "conv" }\n bottom: "data" bottom: "p" }',
+        'f:3:2: layer "c" (conv): padding layer "p" feeds it; only a conv or pool layer with one bottom can pad',
+    ),
+    "two bottoms": (
+        'layers { layer { name: "q" type: "padding" }\n bottom: "p" bottom: "p" top: "q" }',
+        'f:3:2: layer "q" (padding): a padding layer has one bottom, found 2',
+    ),
+    "no top": (
+        'layers { layer { name: "q" type: "padding" } bottom: "p" }',
+        'f:2:1: layer "q" (padding): a padding layer has one top, found 0',
+    ),
+    "unknown bottom": (
+        'layers { layer { name: "c" type: "conv" }\n bottom: "daat" }',
+        'f:3:2: layer "c" (conv): unknown bottom blob "daat"; did you mean "data"?',
+    ),
+    "unknown type": (
+        'layers { layer { name: "c"\n type: "inner_product" } }',
+        'f:3:2: layer "c": unknown V0 layer type "inner_product"; did you mean "innerproduct"?',
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), PADDING_FAULTS.values(), ids=PADDING_FAULTS.keys())
+def test_v0_fault(text: str, message: str) -> None:
+    start = 'input: "data" layers { layer { name: "p" type: "padding" } bottom: "data" top: "p" }\n'
+    with pytest.raises(SpecError) as caught:
+        parse_net_text(start + text, "f")
+    assert str(caught.value) == message
+
+
+# ---- V1 ----
+
+
+def test_every_v1_type_has_a_name() -> None:
+    types = [value.name for value in V1LayerParameter.DESCRIPTOR.enum_types_by_name["LayerType"].values]
+    net, _ = parse_net_text("".join(f"layers {{ type: {name} }}\n" for name in types), "f")
+    names = [layer.type for layer in net.layer]
+    special = {"NONE": "", "SOFTMAX_LOSS": "SoftmaxWithLoss"}
+    plain = [special.get(name, name.replace("_", "")).lower() for name in types]
+    assert [name.lower() for name in names] == [name.lower() for name in plain]
+    assert len(set(names)) == len(types) == 40
+
+
+def test_every_parameter_of_a_v1_layer_is_carried_over() -> None:
+    fields = [f.name for f in V1LayerParameter.DESCRIPTOR.fields if f.name.endswith("_param")]
+    assert len(fields) > 25
+    for name in fields:
+        net, source = parse_net_text(f"layers {{\n {name} {{}} }}", "f")
+        assert net == net_of(f"layer {{ {name} {{}} }}")
+        assert str(source.at(0, name)) == "f:2:2"
+
+
+@pytest.mark.parametrize(
+    "old", ["type: DATA data_param", "type: IMAGE_DATA image_data_param", "type: WINDOW_DATA window_data_param"]
+)
+def test_transform_of_v1_data_layers(old: str) -> None:
+    fields = 'scale: 2 mean_file: "m" crop_size: 3 mirror: true'
+    net, _ = parse_net_text(
+        f"layers {{ {old} {{ {fields} batch_size: 4 }} transform_param {{ force_gray: true }} }}", "f"
+    )
+    assert (
+        net.layer[0].transform_param
+        == net_of(f"layer {{ transform_param {{ {fields} force_gray: true }} }}").layer[0].transform_param
+    )
+    assert f"{old.split()[-1]} {{ batch_size: 4 }}" in " ".join(write_text(net).split())
+
+
+def test_mixture_of_layer_and_layers_is_refused() -> None:
+    with pytest.raises(SpecError, match=r'^f:2:1: "layers" is the older format, and the net has "layer" of line 3 too'):
+        parse_net_text('name: "n"\nlayers { type: RELU }\nlayer { type: "ReLU" }', "f")
+    both = net_of("layers {} layer {}")
+    with pytest.raises(SpecError, match=r'^w: "layers" is the older format, and the net has "layer" too'):
+        upgrade.upgrade_net(both, SourceMap.unknown("w", 2))
+
+
+# ---- Inputs ----
+
+
+def test_input_layer_is_put_first() -> None:
+    net, source = parse_net_text('layer { name: "a" }\ninput: "d"\ninput_dim: [1, 2, 3, 4]', "f")
+    assert [layer.name for layer in net.layer] == ["input", "a"]
+    assert [str(source.at(i)) for i in range(2)] == ["f:2:1", "f:1:1"]
+    assert not source.net.fields.keys() & {"input", "input_dim"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            'input: "a"\ninput: "b"\ninput_dim: [1, 2, 3, 4, 5]',
+            "f:2:1: found 5 input_dim for 2 inputs, expected four each",
+        ),
+        ('input: "a"\ninput: "b"\ninput_shape {}', "f:2:1: found 1 input_shape for 2 inputs, expected one each"),
+    ],
+)
+def test_input_without_a_shape_among_others_is_refused(text: str, message: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        parse_net_text(text, "f")
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('\ninput: "a"', "f:2:1: input without input_shape or input_dim is not used"),
+        ('input: "a"\ninput_dim: [1, 2, 3, 4,\n5]', "f:3:1: input_dim beyond four each of 1 inputs is not used"),
+        ('input: "a" input_shape {}\ninput_shape {}', "f:2:1: input_shape beyond the 1 inputs is not used"),
+        ('input: "a" input_shape {}\ninput_dim: 1', "f:2:1: input_dim beside input_shape is not used"),
+    ],
+)
+def test_input_fields_that_are_not_used_are_named(text: str, message: str, caplog: pytest.LogCaptureFixture) -> None:
+    net, _ = parse_net_text(text, "f")
+    assert message in caplog.messages
+    assert not len(net.input) + len(net.input_shape) + len(net.input_dim)
+
+
+# ---- What is logged ----
+
+
+def test_says_what_caffe_says(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        parse_net_text(V1, "old.prototxt")
+    said = [(record.levelname, getattr(record, "site", ""), record.message) for record in caplog.records]
+    assert said == [
+        (
+            "INFO",
+            "upgrade_proto.cpp:44",
+            "Attempting to upgrade input file specified using deprecated transformation parameters: old.prototxt",
+        ),
+        (
+            "INFO",
+            "upgrade_proto.cpp:47",
+            "Successfully upgraded file specified using deprecated data transformation parameters.",
+        ),
+        (
+            "WARNING",
+            "upgrade_proto.cpp:49",
+            "Note that future Caffe releases will only support transform_param messages for transformation fields.",
+        ),
+        (
+            "INFO",
+            "upgrade_proto.cpp:53",
+            "Attempting to upgrade input file specified using deprecated V1LayerParameter: old.prototxt",
+        ),
+        ("INFO", "upgrade_proto.cpp:61", "Successfully upgraded file specified using deprecated V1LayerParameter"),
+    ]
+
+
+def test_current_net_is_returned_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
+    net, source = parse_net_text('layer { name: "a" }', "f", upgrade=False)
+    assert upgrade.upgrade_net(net, source) == (net, source)
+    assert not caplog.messages
+
+
+# ---- Solvers ----
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("SGD", "SGD"),
+        ("NESTEROV", "Nesterov"),
+        ("ADAGRAD", "AdaGrad"),
+        ("RMSPROP", "RMSProp"),
+        ("4", "AdaDelta"),
+        ("ADAM", "Adam"),
+    ],
+)
+def test_solver_type(old: str, new: str) -> None:
+    solver, node = parse_solver_text(f"base_lr: 1\n solver_type: {old}", "s.prototxt")
+    assert solver.type == new
+    assert not solver.HasField("solver_type")
+    assert str(node.find("type")) == "s.prototxt:2:2"
+
+
+def test_both_solver_types_are_refused() -> None:
+    with pytest.raises(SpecError, match=r'^s:2:1: both "type" and the older "solver_type" are given; keep "type"$'):
+        parse_solver_text('type: "SGD"\nsolver_type: ADAM', "s")
+
+
+def test_nets_in_a_solver_are_upgraded_in_place() -> None:
+    text = (
+        "net_param {\n  layers { type: RELU }\n}\n"
+        'test_net_param { layer { name: "a" } }\n'
+        'test_net_param {\n  input: "d" input_dim: [1, 1, 1,\n 1] }\n'
+    )
+    solver, node = parse_solver_text(text, "s")
+    assert solver.net_param == net_of('layer { type: "ReLU" }')
+    assert [[layer.name for layer in net.layer] for net in solver.test_net_param] == [["a"], ["input"]]
+    source = SourceMap.of(node.fields["net_param"][0])
+    assert str(source.at(0, "type")) == "s:2:12"
+    source = SourceMap.of(node.fields["test_net_param"][1])
+    assert str(source.at(0, "input_param", "shape", 0, "dim", 3)) == "s:7:2"
+    raw, _ = parse_solver_text(text, "s", upgrade=False)
+    assert upgrade.upgrade_solver(raw, Place(node.where))[0].net_param == solver.net_param
+
+
+def test_upgrading_a_solver_is_pure_and_idempotent() -> None:
+    solver, node = parse_solver_text("solver_type: ADAM net_param { layers {} }", "s", upgrade=False)
+    before = solver.SerializeToString(deterministic=True)
+    once = upgrade.upgrade_solver(solver, node)
+    assert solver.SerializeToString(deterministic=True) == before
+    assert upgrade.upgrade_solver(*once) == once
+
+
+def test_snapshot_prefix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("snapshots").mkdir()
+    Path("nets.v2").mkdir()
+    for text, prefix in {
+        "": "nets.v2/quick_solver",
+        'snapshot_prefix: "snapshots"': "snapshots/quick_solver",
+        'snapshot_prefix: "snapshots/"': "snapshots/quick_solver",
+        'snapshot_prefix: "snapshots/run"': "snapshots/run",
+        'snapshot_prefix: ""': "",
+    }.items():
+        Path("nets.v2/quick_solver.prototxt").write_text(text, encoding="utf-8")
+        assert read_solver("nets.v2/quick_solver.prototxt").snapshot_prefix == prefix
+    solver = SolverParameter()
+    assert upgrade.upgrade_snapshot_prefix(solver, "./a/solver").snapshot_prefix == "./a/solver"
+    assert not solver.HasField("snapshot_prefix")
+
+
+def test_place_of_a_solver_is_its_file() -> None:
+    _, node = parse_solver(GOLDEN / "snapshot" / "solver.prototxt")
+    assert re.search(r"solver\.prototxt$", str(node.where))
+    assert str(node.find("net_param")) == str(node.where)
