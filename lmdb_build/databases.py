@@ -25,11 +25,13 @@ import cv2
 import numpy as np
 
 from lmdb_build.pairs.list_file import read_pair_list
+from loopclosure.errors import InputError
 from loopclosure.progress import Progress, silent
 from netspec import log
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum, decode_image, encoded_datum, times
 from netspec.data.images import read_image, read_image_list
+from netspec.data.random_words import permutation
 from netspec.errors import SpecError, Where
 
 S = TypeVar("S")
@@ -60,15 +62,22 @@ class Options:
 
 
 def read_pairs(path: str) -> list[Entry]:
-    """Return the entries of a list of pairs; see lmdb_build/pairs/list_file.py. Raises InputError for a faulty line."""
-    return [
-        Entry((pair.first, pair.second), pair.label, Where(path, pair.line, 1)) for pair in read_pair_list(Path(path))
-    ]
+    """Return the entries of a list of pairs; see lmdb_build/pairs/list_file.py. Raises SpecError for a faulty line."""
+    try:
+        pairs = read_pair_list(Path(path))
+    except InputError as fault:  # all else here raises SpecError
+        raise SpecError(fault.message, Where(fault.file, fault.line, fault.column)) from None
+    return [Entry((pair.first, pair.second), pair.label, Where(path, pair.line, 1)) for pair in pairs]
 
 
 def read_single_list(path: str) -> list[Entry]:
-    """Read lines of ``name label``, split at the last blank."""
+    """Read lines of ``name label``, split at the last blank. Raises SpecError for a faulty line."""
     return [Entry((image.name,), image.label, image.where) for image in read_image_list(path)]
+
+
+def shuffled(entries: Sequence[Entry], seed: int) -> list[Entry]:
+    """Return the entries in a random order that follows from the seed alone."""
+    return [entries[i] for i in permutation(seed, "convert/shuffle", len(entries))]
 
 
 def pair_key(number: int, entry: Entry) -> str:

@@ -176,7 +176,7 @@ def write_views(
             if not cv2.imwrite(str(folder.parent / name), view, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
                 raise InputError("cannot be written", folder.parent / name)
         listed.append((*names, int(same[number])))
-    out = folder.with_suffix(".txt")
+    out = folder.with_name(f"{folder.name}.txt")
     settings = {
         "source": f"{len(runs.names)} images of {len(np.unique(runs.tracks))} runs",
         "batches": f"{batches.count} of {batches.size} places, up to {batches.per_track} of one run, "

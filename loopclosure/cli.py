@@ -56,7 +56,10 @@ SETTINGS = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage."""
+    """Run one command; return 0 when done, 1 for a fault of the user's files, 130 for Ctrl-C.
+
+    Raises SystemExit 2 for wrong usage.
+    """
     words = list(sys.argv[1:] if argv is None else argv)
     arguments = _parser().parse_args(words)
     arguments.command_line = shlex.join(["loopclosure", *words])
@@ -68,6 +71,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+    except OSError as fault:
+        print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
 
 
 def evaluate_loops(argv: Sequence[str] | None = None) -> int:

@@ -1,7 +1,4 @@
-"""The command line: one module for each command or family of commands; it computes nothing.
-
-Options may be written as gflags let Caffe's users write them: ``-solver s``, ``--solver=s``, ``-gpu 0``.
-"""
+"""The command line: one module for each command or family of commands; it computes nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +7,8 @@ import sys
 from collections.abc import Sequence
 
 from netspec.cli import caffe_tools, check, extract, measure, train
-from netspec.cli.run import Commands, run
+from netspec.cli.run import Commands
+from netspec.command_line import run
 
 _FAMILIES = (train, measure, check, extract, caffe_tools)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from netspec import log
 from netspec.cli.arguments import add_device, add_python, add_state, bar, device, load_weights, positive, shape, stages
-from netspec.cli.run import Commands, WrongUsage
+from netspec.cli.run import Commands
+from netspec.command_line import WrongUsage
 from netspec.errors import SpecError
 from netspec.proto.schema import PHASES
 

@@ -8,7 +8,8 @@ import sys
 
 from netspec import log
 from netspec.cli.arguments import add_device, add_python, add_state, devices
-from netspec.cli.run import Commands, WrongUsage, signals
+from netspec.cli.run import Commands, signals
+from netspec.command_line import WrongUsage
 
 EFFECTS = ("stop", "snapshot", "none")
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import logging
 import os
 import subprocess
 import sys
@@ -11,13 +10,30 @@ import lmdb
 import numpy as np
 import pytest
 
-from lmdb_build.convert import compute_image_mean, convert_imageset, convert_pairs_lmdb
-from lmdb_build.databases import read_pairs
+from lmdb_build.cli import main
+from lmdb_build.databases import read_pairs, read_single_list
 from netspec.data.datum import datum_to_array, parse_datum
+from netspec.errors import SpecError
 from paths import ROOT
 
 GOLDEN = ROOT / "tests" / "golden" / "images"
 PNG = f"{GOLDEN}/png/"
+
+
+def convert_pairs_lmdb(words: list[str]) -> int:
+    return main(["convert", *words])
+
+
+def convert_imageset(words: list[str]) -> int:
+    return main(["imageset", *words])
+
+
+def compute_image_mean(words: list[str]) -> int:
+    return main(["mean", *words])
+
+
+def log_of(err: str) -> list[str]:
+    return [line.partition("] ")[2] for line in err.splitlines()]
 
 
 def records(path: Path) -> list[tuple[bytes, bytes]]:
@@ -60,24 +76,23 @@ def test_single_images_become_caffes_records_byte_for_byte(
     assert records(tmp_path / "db") == records(GOLDEN / database)
 
 
-def test_the_log_is_caffes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    convert_imageset(["-shuffle", "-seed", "5", PNG, str(GOLDEN / "list.txt"), f"{tmp_path}/db"])
-    assert caplog.messages == [
+def test_the_log_is_caffes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    convert_imageset(["-shuffle", "-seed", "5", "-encode_type=png", PNG, str(GOLDEN / "list.txt"), f"{tmp_path}/db"])
+    assert log_of(capsys.readouterr().err) == [
         "Shuffling data",
         "Shuffled with seed 5 (-seed)",
         "A total of 6 images.",
+        "encode_type specified, assuming encoded=true.",
         f"Opened lmdb {tmp_path}/db",
         "Processed 6 files.",
     ]
 
 
-def test_every_thousand_records_are_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
+def test_every_thousand_records_are_logged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "list.txt").write_text("0.png 1\n" * 2500)
     flags = ["-resize_width=2", "-resize_height=2", "-workers=1"]
     assert convert_imageset([*flags, PNG, f"{tmp_path}/list.txt", f"{tmp_path}/db"]) == 0
-    assert [line for line in caplog.messages if line.startswith("Processed")] == [
+    assert [line for line in log_of(capsys.readouterr().err) if line.startswith("Processed")] == [
         "Processed 1000 files.",
         "Processed 2000 files.",
         "Processed 2500 files.",
@@ -117,7 +132,7 @@ def test_a_pair_is_stacked_along_the_channels(tmp_path: Path, pair_list: str) ->
 
 def test_grey_pairs_have_two_channels_and_any_size(tmp_path: Path, pair_list: str) -> None:
     flags = ["--gray=true", "--resize_width", "10", "--resize_height=12", "-nocheck_size", "-backend", "lmdb"]
-    assert convert_pairs_lmdb([*flags, PNG, pair_list, f"{tmp_path}/db"]) == 0
+    assert convert_pairs_lmdb([PNG, *flags, pair_list, f"{tmp_path}/db"]) == 0
     expected = [cv2.resize(image(f"{n}.png", cv2.IMREAD_GRAYSCALE), (10, 12)) for n in (0, 1)]
     assert (pairs_in(tmp_path / "db")[0][1] == np.stack(expected)).all()
 
@@ -236,9 +251,20 @@ def test_an_existing_database_is_kept(tmp_path: Path, capsys: pytest.CaptureFixt
     "flags", [["-resize_width=4"], ["-gray=maybe"], ["-colour"], ["-backend=sqlite"], ["-resize_width=x"]]
 )
 def test_wrong_usage_is_status_2(tmp_path: Path, pair_list: str, flags: list[str]) -> None:
-    with pytest.raises(SystemExit) as end:
-        convert_pairs_lmdb([*flags, PNG, pair_list, f"{tmp_path}/db"])
-    assert end.value.code == 2
+    assert convert_pairs_lmdb([*flags, PNG, pair_list, f"{tmp_path}/db"]) == 2
+    assert sorted(os.listdir(tmp_path)) == ["pairs.txt"]
+
+
+@pytest.mark.parametrize(("read", "text"), [(read_pairs, "a.png b.png 2"), (read_single_list, "a.png cat")])
+def test_both_kinds_of_lists_raise_one_kind_of_error(tmp_path: Path, read: object, text: str) -> None:
+    assert callable(read)
+    (tmp_path / "l").write_text(f"# a comment\n{text}\n")
+    with pytest.raises(SpecError, match=f"^{tmp_path}/l:2:") as fault:
+        read(f"{tmp_path}/l")
+    assert fault.value.where
+    assert (fault.value.where.file, fault.value.where.line) == (f"{tmp_path}/l", 2)
+    with pytest.raises(SpecError, match="cannot be read"):
+        read(f"{tmp_path}/nowhere")
 
 
 # compute_image_mean, and the doors

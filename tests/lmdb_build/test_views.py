@@ -1,5 +1,6 @@
 """Two views of each place: what stands in a batch together, what a view shows, and the command that writes them."""
 
+import shlex
 from pathlib import Path
 
 import cv2
@@ -100,7 +101,12 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
     command = ["views", "--batches", "3", "--size", "4", "--per-track", "2", "--view-size", "32x24"]
     by_index = [*command, "--index", str(index), "--track", "run", "--time", "second"]
     assert main([*by_index, "--out", str(tmp_path / "one")]) == 0
-    assert "3 batches of 4 pairs" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "3 batches of 4 pairs" in said
+    program, *hint = shlex.split(said.splitlines()[-1])
+    assert program == "lmdb-build"
+    assert main(hint) == 0
+    assert (tmp_path / "one_lmdb" / "data.mdb").is_file()
     listed = read_pair_list(tmp_path / "one.txt")
     assert [pair.label for pair in listed] == [1] * 12
     views = [cv2.imread(str(tmp_path / name)) for pair in listed for name in (pair.first, pair.second)]
@@ -114,6 +120,10 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
     assert main([*command, *folders, "--out", str(tmp_path / "two")]) == 0
     assert len(read_pair_list(tmp_path / "two.txt")) == 12
 
+    assert main([*command, *folders, "--negatives", "0.5", "--out", str(tmp_path / "v1.2")]) == 0
+    assert sorted(pair.label for pair in read_pair_list(tmp_path / "v1.2.txt")) == [0] * 6 + [1] * 6
+
+    capsys.readouterr()
     assert main([*command, *folders, "--size", "9", "--out", str(tmp_path / "three")]) == 1
     assert "cannot be made" in capsys.readouterr().err
     assert not (tmp_path / "three").exists()
@@ -124,6 +134,4 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.parametrize("more", [[], ["folder", "--index", "x.csv"], ["--index", "x.csv"]])
 def test_the_source_is_named_once_and_whole(more: list[str]) -> None:
-    with pytest.raises(SystemExit) as exit:
-        main(["views", "--out", "out", *more])
-    assert exit.value.code == 2
+    assert main(["views", "--out", "out", *more]) == 2

@@ -195,3 +195,21 @@ def test_wrong_usage_is_status_2(words, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(words)
     assert stopped.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("end", "status", "said"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (PermissionError(13, "Permission denied", "out/report.html"), 1, "out/report.html: Permission denied\n"),
+    ],
+)
+def test_other_ends_have_the_statuses_of_all_commands(
+    end, status, said, two_laps_features, tmp_path, capsys, monkeypatch
+):
+    def fail(*arguments, **options):
+        raise end
+
+    monkeypatch.setattr("loopclosure.cli.write_similarity", fail)
+    assert main(["similarity", str(two_laps_features), "--out", str(tmp_path / "s.npy")]) == status
+    assert capsys.readouterr().err == said

@@ -1,0 +1,34 @@
+"""The command ``lmdb-build``: one module for each command or family of commands; it computes nothing."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+import cv2
+
+from lmdb_build.cli import convert, lists, pairs, views, walk
+from loopclosure.errors import InputError
+from netspec.command_line import Commands, run
+
+_FAMILIES = (walk, pairs, views, lists, convert)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage, 130 for Ctrl-C."""
+    cv2.setNumThreads(1)  # the pictures are small
+    return run(parser(), list(sys.argv[1:] if argv is None else argv), (InputError,))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    made = argparse.ArgumentParser(
+        prog="lmdb-build",
+        description="From image sequences to labeled pairs, to databases that Caffe reads, to a table of nets.",
+        allow_abbrev=False,
+    )
+    commands = Commands(made)
+    for family in _FAMILIES:
+        family.add_to(commands)
+    return made

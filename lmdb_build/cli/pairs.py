@@ -1,0 +1,184 @@
+"""``lmdb-build pairs``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from lmdb_build.cli.arguments import next_command
+from lmdb_build.cli.bar import bar
+from lmdb_build.pairs.build import Plan, build_lists
+from lmdb_build.pairs.by_list import (
+    CAMERAS,
+    MaskSource,
+    folders_source,
+    index_source,
+    singles_source,
+    table_source,
+)
+from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
+from lmdb_build.pairs.choose import SPLITS, PairSource
+from loopclosure.descriptors.feature_file import read_features
+from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
+from netspec.command_line import Commands, WrongUsage
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add("pairs", _pairs, "choose labeled pairs and write their lists")
+    add = parser.add_argument
+    add("sequences", type=Path, nargs="*", metavar="SEQUENCE", help="folders in TUM RGB-D layout: pairs by pose")
+    add("--out", type=Path, required=True, help="folder for train.txt, val.txt and test.txt")
+    add("--root", type=Path, help="folder that the lists' names are relative to (the sources' common parent)")
+
+    source = parser.add_argument_group("other sources, instead of sequences")
+    source.add_argument(
+        "--mask", type=Path, metavar="FILE", help="a mask of loops (.mat, .npy, .txt, image) of --images"
+    )
+    source.add_argument("--images", type=Path, metavar="FOLDER", help="the images of --mask, in natural order")
+    source.add_argument(
+        "--camera", choices=CAMERAS, default="all", help="FAB-MAP's sets alternate left and right (all)"
+    )
+    source.add_argument("--folders", type=Path, nargs=2, metavar="FOLDER", help="equal names are the same place")
+    source.add_argument("--table", type=Path, metavar="CSV", help="positives: two columns of image names")
+    source.add_argument("--index", type=Path, metavar="CSV", help="a table of frames; with --table, of their groups")
+    source.add_argument(
+        "--group", metavar="COLUMN", help="different values are other places: negatives come from there"
+    )
+    source.add_argument("--track", metavar="COLUMN", help="of --index: frames of one clip")
+    source.add_argument("--time", metavar="COLUMN", help="of --index: where in the clip; neighbours are positives")
+    source.add_argument("--max-gap", type=float, default=1.0, help="how far apart such neighbours may be (1)")
+    source.add_argument(
+        "--singles", type=Path, metavar="FOLDER", help="each image is a place of its own: all is warped"
+    )
+
+    rule = parser.add_argument_group("what is the same place")
+    rule.add_argument("--max-distance", type=float, default=MAX_DISTANCE_M, help="metres; nearer is a positive (2)")
+    rule.add_argument("--max-angle", type=float, default=MAX_ANGLE_DEG, help="degrees; less turned is a positive (15)")
+    rule.add_argument("--min-gap", type=float, help="pairs nearer in time are left out: seconds, of a mask images (0)")
+    rule.add_argument("--negatives", choices=NEGATIVES, default="both", help="where negatives come from (both)")
+    rule.add_argument("--clear-distance", type=float, metavar="M", help="negatives by pose only from so far apart")
+    rule.add_argument("--clear-view-angle", type=float, metavar="DEG", help="or from viewing axes so far turned")
+    sets = {"type": _names, "action": "append", "default": [], "metavar": "A,B"}
+    rule.add_argument("--same-scene", **sets, help="sequences of one room: no pair is made across them")
+    rule.add_argument("--same-frame", **sets, help="sequences whose poses share a frame: judged by pose across them")
+    rule.add_argument("--different-scenes", action="store_true", help="all sequences else show different rooms")
+    rule.add_argument("--max-difference", type=float, default=MAX_DIFFERENCE_S, help="image to pose, seconds (0.03)")
+
+    choice = parser.add_argument_group("the choice")
+    for split, number in zip(SPLITS, (30000, 6000, 6000), strict=True):
+        choice.add_argument(
+            f"--{split}", type=int, default=number, metavar="N", help=f"pairs, half positive ({number})"
+        )
+    choice.add_argument("--at-most", action="store_true", help="fewer pairs where there are not enough")
+    choice.add_argument("--split", choices=("time", "sequence"), help="whole sequences (places, groups) or stretches")
+    choice.add_argument("--shares", type=_shares, default=(0.6, 0.2, 0.2), help="of the images (0.6,0.2,0.2)")
+    choice.add_argument("--split-gap", type=float, default=0.0, help="seconds left out between two splits (0)")
+    for split in SPLITS:
+        choice.add_argument(f"--{split}-sequences", type=_names, metavar="A,B", help=f"sequences (groups) of {split}")
+    choice.add_argument("--hard-negatives", type=Path, metavar="NPZ", help="nearest negatives by a net's features")
+    choice.add_argument("--hard-share", type=float, default=0.5, help="of the negatives (0.5)")
+    choice.add_argument("--warp-share", type=float, default=0.0, help="of the pairs: one image is a warped copy (0)")
+    choice.add_argument("--seed", type=int, default=1, help="another seed, other pairs (1)")
+
+
+def _pairs(arguments: argparse.Namespace) -> None:
+    named = {split: names for split in SPLITS if (names := getattr(arguments, f"{split}_sequences"))}
+    source, root = _source(arguments)
+    by_pose = bool(arguments.sequences or arguments.mask)
+    by = arguments.split or ("sequence" if named or not by_pose else "time")
+    if named and by == "time":
+        raise WrongUsage("--train-sequences, --val-sequences and --test-sequences need --split sequence")
+    plan = Plan(
+        counts={split: getattr(arguments, split) for split in SPLITS},
+        seed=arguments.seed,
+        by="time" if by == "time" else "group",
+        shares=dict(zip(SPLITS, arguments.shares, strict=True)),
+        split_gap=arguments.split_gap,
+        named=named,
+        at_most=arguments.at_most,
+        features=read_features(arguments.hard_negatives) if arguments.hard_negatives else None,
+        hard_share=arguments.hard_share,
+        warp_share=1.0 if arguments.singles else arguments.warp_share,
+    )
+    lists = build_lists(source, plan, root, arguments.out, print, _warn, bar)
+    for split, path in lists.items():
+        print(next_command("convert", f"{root}/", path, f"{arguments.out / split}_lmdb"))
+
+
+def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
+    """Open the one source that is named; return it and the root folder."""
+    kinds = ("sequences", "mask", "folders", "table", "singles")
+    given = [kind for kind in kinds if getattr(arguments, kind)]
+    if arguments.index and "table" not in given:
+        given.append("index")
+    if len(given) != 1:
+        raise WrongUsage("name sequences or one of --mask, --folders, --table, --index, --singles")
+    kind = given[0]
+    if kind == "mask" and not arguments.images:
+        raise WrongUsage("--mask needs --images")
+    if kind == "index" and not (arguments.group and arguments.track and arguments.time):
+        raise WrongUsage("--index without --table needs --group, --track and --time")
+    places = {
+        "sequences": [folder.resolve().parent for folder in arguments.sequences],
+        "mask": [arguments.images],
+        "folders": arguments.folders,
+        "table": [arguments.table.parent] if arguments.table else [],
+        "index": [arguments.index.parent] if arguments.index else [],
+        "singles": [arguments.singles],
+    }[kind]
+    warped = [arguments.out] if arguments.warp_share or arguments.singles else []
+    root = arguments.root or Path(os.path.relpath(os.path.commonpath([str(p.resolve()) for p in [*places, *warped]])))
+    if kind == "sequences":
+        return _pose_source(arguments, root), root
+    min_gap = None if arguments.min_gap is None else int(arguments.min_gap)
+    if kind == "mask":
+        return MaskSource(arguments.mask, arguments.images, root, min_gap, arguments.camera), root
+    if kind == "folders":
+        return folders_source(arguments.folders[0], arguments.folders[1], root, min_gap or 0), root
+    if kind == "table":
+        return table_source(arguments.table, root, arguments.group, arguments.index), root
+    if kind == "index":
+        return index_source(
+            arguments.index, root, arguments.group, arguments.track, arguments.time, arguments.max_gap
+        ), root
+    return singles_source(arguments.singles, root), root
+
+
+def _pose_source(arguments: argparse.Namespace, root: Path) -> PoseSource:
+    sequences = [read_tum_sequence(folder, arguments.max_difference) for folder in arguments.sequences]
+    for folder, sequence in zip(arguments.sequences, sequences, strict=True):
+        print(f"{folder}: {len(sequence)} images with a pose, {sequence.dropped} without one left out")
+    rule = PoseRule(
+        max_distance_m=arguments.max_distance,
+        max_angle_deg=arguments.max_angle,
+        min_gap_s=arguments.min_gap or 0.0,
+        negatives=arguments.negatives,
+        clear_distance_m=arguments.clear_distance,
+        clear_view_angle_deg=arguments.clear_view_angle,
+    )
+    scenes = Scenes(tuple(arguments.same_scene), tuple(arguments.same_frame), arguments.different_scenes)
+    folders = [Path(os.path.relpath(folder.resolve(), root.resolve())).as_posix() for folder in arguments.sequences]
+    return PoseSource(sequences, folders, rule, scenes)
+
+
+def _warn(doubt: str) -> None:
+    print(f"warning: {doubt}", file=sys.stderr)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name for name in text.split(",") if name)
+
+
+def _shares(text: str) -> tuple[float, ...]:
+    parts = text.split(",")
+    try:
+        shares = tuple(float(part) for part in parts)
+    except ValueError:
+        shares = ()
+    if len(shares) != len(SPLITS):
+        raise argparse.ArgumentTypeError(f'expected three numbers for {", ".join(SPLITS)}, found "{text}"')
+    return shares

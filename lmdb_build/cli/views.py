@@ -1,0 +1,57 @@
+"""``lmdb-build views``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from lmdb_build.cli.arguments import next_command, size
+from lmdb_build.cli.bar import bar
+from lmdb_build.pairs.runs import folder_runs, index_runs
+from lmdb_build.views import Batches, write_views
+from netspec.command_line import Commands, WrongUsage
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    add = commands.add("views", _views, "make two views of each place, in batches of different places").add_argument
+    add("folders", type=Path, nargs="*", metavar="FOLDER", help="runs of images, or give --index")
+    add("--out", type=Path, required=True, help="folder for the views; the list is OUT.txt")
+    add("--index", type=Path, metavar="CSV", help="a table of frames, with --track and --time")
+    add("--track", metavar="COLUMN", help="of --index: frames of one run")
+    add("--time", metavar="COLUMN", help="of --index: where in the run")
+    add("--batches", type=int, default=400, help="how many batches (400)")
+    add("--size", type=int, default=48, help="pairs per batch, each of another place (48)")
+    add("--per-track", type=int, default=8, help="of them at most so many of one run (8)")
+    add("--apart", type=float, default=4.0, help="places of one run are further apart: seconds, or images (4)")
+    add("--max-gap", type=float, default=1.0, help="two views may be of two images so far apart (1)")
+    add("--other", type=float, default=0.4, help="in this share of the pairs they are (0.4)")
+    add("--negatives", type=float, default=0.0, help="share of pairs of two places, for ContrastiveLoss (0)")
+    add("--view-size", type=size, default=(128, 96), help="of a view (128x96)")
+    add("--seed", type=int, default=1, help="another seed, other views (1)")
+
+
+def _views(arguments: argparse.Namespace) -> None:
+    if bool(arguments.folders) == bool(arguments.index):
+        raise WrongUsage("name folders, or --index")
+    if arguments.index:
+        if not (arguments.track and arguments.time):
+            raise WrongUsage("--index needs --track and --time")
+        root = arguments.index.parent
+        runs = index_runs(arguments.index, root, arguments.track, arguments.time)
+    else:
+        root = Path(os.path.commonpath([folder.resolve() for folder in arguments.folders]))
+        runs = folder_runs(arguments.folders, root)
+    batches = Batches(
+        arguments.batches,
+        arguments.size,
+        arguments.per_track,
+        arguments.apart,
+        arguments.max_gap,
+        arguments.other,
+        arguments.negatives,
+    )
+    path = write_views(runs, batches, arguments.view_size, root, arguments.out, arguments.seed, bar)
+    print(f"{path}: {arguments.batches} batches of {arguments.size} pairs")
+    print(next_command("convert", f"{path.parent}/", path, f"{arguments.out}_lmdb"))

@@ -1,0 +1,44 @@
+"""``lmdb-build walk``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from lmdb_build.cli.arguments import size
+from lmdb_build.cli.bar import bar
+from lmdb_build.walk.sequence import Walk, write_walk
+from netspec.command_line import Commands, WrongUsage
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add("walk", _walk, "render a synthetic walk through textured rooms, as TUM RGB-D sequences")
+    p.add_argument("out", type=Path, metavar="OUT", help="folder for the sequences walk_1, walk_2, ...")
+    p.add_argument("--sequences", type=int, default=1, help="how many, each in a house of its own (1)")
+    p.add_argument("--frames", type=int, default=400, help="images per sequence (400)")
+    p.add_argument("--size", type=size, default=(320, 240), help="of an image (320x240)")
+    p.add_argument("--laps", type=int, default=3, help="rounds of the house (3)")
+    p.add_argument("--rooms", type=int, default=4, help="of a house; an even number (4)")
+    p.add_argument("--seed", type=int, default=1, help="another seed, other houses (1)")
+
+
+def _walk(arguments: argparse.Namespace) -> None:
+    if arguments.seed < 0:
+        raise WrongUsage("--seed must be 0 or more")
+    if not 1 <= arguments.sequences <= 999:
+        raise WrongUsage("--sequences must be 1 to 999")
+    for number in range(1, arguments.sequences + 1):
+        walk = Walk(
+            frames=arguments.frames,
+            width=arguments.size[0],
+            height=arguments.size[1],
+            laps=arguments.laps,
+            rooms=arguments.rooms,
+            seed=1000 * arguments.seed + number,
+            start_s=10_000.0 * number,
+        )
+        folder = arguments.out / f"walk_{number}"
+        for _ in bar(write_walk(folder, walk), folder.name, walk.frames):
+            pass
+        print(f"{folder}: {walk.frames} images, {walk.laps} laps of {walk.rooms} rooms")

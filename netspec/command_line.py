@@ -1,0 +1,184 @@
+"""How the commands of netspec and of lmdb_build read their words, log, and end.
+
+Words are read as gflags reads them: one dash or two, ``-flag value`` or ``-flag=value``; a Boolean flag is ``-flag``,
+``-noflag``, ``-flag=true`` or ``-flag=false``, and never takes the next word. The log goes to stderr in glog's form;
+glog's own flags ``-minloglevel``, ``-logtostderr`` and ``-alsologtostderr`` are known. Every fault is one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from netspec import log
+from netspec.errors import SpecError
+
+DONE, FAULT, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130  # exit statuses
+SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
+VARIABLE = "GLOG_minloglevel"
+TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
+
+
+class WrongUsage(Exception):
+    """Arguments that do not go together."""
+
+
+class Commands:
+    """The commands of a parser, each with what all of them have."""
+
+    def __init__(self, parser: argparse.ArgumentParser) -> None:
+        self._parsers = parser.add_subparsers(
+            dest="command", required=True, metavar="COMMAND", parser_class=_GflagsParser
+        )
+
+    def add(
+        self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str
+    ) -> argparse.ArgumentParser:
+        """Return the parser of a new command that runs ``function``, to add its own arguments to.
+
+        An argument with ``action="store_true"`` is a Boolean flag in all of gflags' spellings.
+        """
+        added = self._parsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        added.set_defaults(run=function, log_level=logging.INFO, log_form=log.GlogFormatter())
+        added.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
+        for name in ("--logtostderr", "--alsologtostderr"):  # it always does
+            added.add_argument(name, action="store_true", help=argparse.SUPPRESS)
+        return added
+
+
+def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[type[Exception], ...] = ()) -> int:
+    """Parse a command line, run the command, and return its exit status.
+
+    A SpecError, one of ``faults`` and an OSError become one line on stderr and status 1, wrong usage status 2, Ctrl-C
+    status 130.
+    """
+    try:
+        arguments = parser.parse_args(words)
+    except SystemExit as end:  # argparse has said what is wrong, or printed its help
+        return int(end.code or DONE)
+    try:
+        with _logging(_level(arguments), arguments.log_form):
+            return arguments.run(arguments) or DONE
+    except (SpecError, *faults) as fault:
+        print(fault, file=sys.stderr)
+        return FAULT
+    except WrongUsage as fault:
+        print(f"{parser.prog} {arguments.command}: error: {fault}", file=sys.stderr)
+        return WRONG_USAGE
+    except BrokenPipeError:
+        sys.stderr.close()  # or Python complains once more, at its end
+        return FAULT
+    except OSError as fault:
+        print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
+        return FAULT
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+class _GflagsParser(argparse.ArgumentParser):
+    """A parser to which gflags' spellings are translated."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.register("action", "store_true", _Switch)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        return super().parse_known_args([self._translated(word) for word in args or ()], namespace)
+
+    def _translated(self, word: str) -> str:
+        """Return ``-flag`` as ``--flag``, and a Boolean flag as ``--flag`` or ``--noflag``."""
+        if not re.match(r"--?[A-Za-z_]\w", word):  # argparse knows options of one letter; -1 is a number
+            return word
+        word = word.lstrip("-")
+        name, equals, value = word.partition("=")
+        switches = {action.name: action for action in self._actions if isinstance(action, _Switch)}
+        if name in switches:
+            truth = value.lower() if equals else "true"
+            if truth not in TRUE + FALSE:
+                self.error(f"argument --{name}: found {value!r}, expected true or false")
+            return switches[name].on if truth in TRUE else switches[name].off
+        if name.startswith("no-") and name[3:] in switches and not equals:
+            return switches[name[3:]].off
+        return "--" + word
+
+
+class _Switch(argparse.Action):
+    """A Boolean flag: ``--flag`` and ``--noflag``."""
+
+    def __init__(
+        self, option_strings: Sequence[str], dest: str, default: bool = False, help: str | None = None
+    ) -> None:
+        (self.on,) = option_strings
+        self.name = self.on[2:]
+        self.off = f"--no{self.name}"
+        super().__init__([self.on, self.off], dest, nargs=0, default=default, help=help)
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        setattr(namespace, self.dest, option_string == self.on)
+
+
+def _level(arguments: argparse.Namespace) -> int:
+    """Return the level of the log: the command's own, or a higher one that glog's flag or variable asks for."""
+    wished = arguments.minloglevel
+    if wished is None:
+        variable = os.environ.get(VARIABLE, "")
+        wished = int(variable) if variable.isdigit() else 0
+    return max(arguments.log_level, SEVERITIES[min(wished, len(SEVERITIES) - 1)])
+
+
+@contextmanager
+def _logging(level: int, form: logging.Formatter) -> Iterator[None]:
+    """Show Caffe's log on stderr, around the progress bar where there is one.
+
+    A warning is shown once, though a solver's nets may each have it.
+    """
+    handler = logging.StreamHandler(_BarAware())
+    handler.setFormatter(form)
+    handler.addFilter(_WarnOnce())
+    before = log.logger.level, log.logger.propagate
+    log.logger.addHandler(handler)
+    log.logger.setLevel(level)
+    log.logger.propagate = False
+    try:
+        yield
+    finally:
+        log.logger.removeHandler(handler)
+        level, log.logger.propagate = before
+        log.logger.setLevel(level)
+
+
+class _WarnOnce(logging.Filter):
+    """Lets each warning pass the first time only."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        message = record.getMessage()
+        if record.levelno != logging.WARNING:
+            return True
+        new = message not in self.seen
+        self.seen.add(message)
+        return new
+
+
+class _BarAware:
+    """A stream that writes to stderr above a tqdm bar, if one is shown."""
+
+    def write(self, text: str) -> None:
+        tqdm = sys.modules.get("tqdm")
+        if tqdm is None or not sys.stderr.isatty():
+            sys.stderr.write(text)
+        elif text.rstrip("\n"):
+            tqdm.tqdm.write(text.rstrip("\n"), file=sys.stderr)
+
+    def flush(self) -> None:
+        sys.stderr.flush()

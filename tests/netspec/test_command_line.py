@@ -1,0 +1,179 @@
+"""How every command reads its words, logs and ends: gflags' spellings, glog's form, one line for a fault."""
+
+import argparse
+import logging
+from collections.abc import Callable
+
+import pytest
+
+from netspec import cli, log
+from netspec.command_line import Commands, WrongUsage, run
+from netspec.errors import SpecError, Where
+
+
+def command(function: Callable[[argparse.Namespace], int | None]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("program", allow_abbrev=False)
+    added = Commands(parser).add("convert", function, "a command")
+    added.add_argument("--gray", action="store_true", help="read images as gray")
+    added.add_argument("--train", action="store_true", default=True)
+    added.add_argument("--check_size", action="store_true")
+    group = added.add_argument_group("more")
+    group.add_argument("--at-most", action="store_true")
+    added.add_argument("--resize_width", type=int, default=0)
+    added.add_argument("--shift", type=float, default=0.0)
+    added.add_argument("names", nargs="*")
+    return parser
+
+
+def read(*words: str) -> argparse.Namespace:
+    found: list[argparse.Namespace] = []
+    assert run(command(lambda arguments: found.append(arguments)), ["convert", *words]) == 0
+    return found[0]
+
+
+@pytest.mark.parametrize(
+    "words", ["-gray", "--gray", "-gray=true", "--gray=1", "--gray=T", "-nogray -gray", "-gray=Yes"]
+)
+def test_a_boolean_flag_is_set_in_each_of_gflags_spellings(words: str) -> None:
+    assert read(*words.split(), "a", "b").gray is True
+
+
+@pytest.mark.parametrize("words", ["", "-nogray", "--nogray", "-gray=false", "--gray=no", "--no-gray", "-gray -gray=0"])
+def test_a_boolean_flag_is_cleared_in_each_of_gflags_spellings(words: str) -> None:
+    assert read(*words.split(), "a", "b").gray is False
+
+
+def test_a_boolean_flag_never_takes_the_next_word() -> None:
+    arguments = read("--check_size", "-gray", "false", "true")
+    assert (arguments.gray, arguments.check_size, arguments.names) == (True, True, ["false", "true"])
+
+
+def test_flags_of_groups_and_flags_with_dashes_are_no_different() -> None:
+    assert read("-at-most").at_most
+    assert not read("-at-most", "--noat-most").at_most
+    assert [read(*words).train for words in ([], ["--no-train"], ["-notrain"], ["--train=f"])] == [True, *[False] * 3]
+
+
+@pytest.mark.parametrize("words", ["-resize_width 64", "-resize_width=64", "--resize_width 64", "--resize_width=64"])
+def test_other_flags_take_a_value(words: str) -> None:
+    assert read(*words.split(), "a", "b").resize_width == 64
+
+
+def test_numbers_may_be_negative() -> None:
+    assert read("-shift", "-1.5").shift == -1.5
+    assert read("--shift=-2").shift == -2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["-gray=maybe"], "argument --gray: found 'maybe', expected true or false"),
+        (["-no-gray=true"], "unrecognized arguments: --no-gray=true"),
+        (["-resize", "64"], "unrecognized arguments: --resize"),
+        (["-resize_width=x"], "argument --resize_width: invalid int value: 'x'"),
+        (["-color"], "unrecognized arguments: --color"),
+    ],
+)
+def test_what_no_flag_is_written_like_ends_with_status_2(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(command(lambda arguments: None), ["convert", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["train", "test", "time", "check", "extract"])
+@pytest.mark.parametrize(
+    ("words", "value"),
+    [
+        (["-allow-python-layers"], True),
+        (["--allow-python-layers=true"], True),
+        (["-noallow-python-layers"], False),
+        (["--allow-python-layers=false"], False),
+    ],
+)
+def test_the_commands_of_netspec_read_boolean_flags_so(name: str, words: list[str], value: bool) -> None:
+    needed = {
+        "test": ["-model", "m", "-weights=w"],
+        "time": ["--model", "m"],
+        "check": ["f"],
+        "extract": ["--model=m", "-blob", "b", "-out", "o"],
+    }
+    assert cli.parser().parse_args([name, *words, *needed.get(name, [])]).allow_python_layers is value
+
+
+# The log
+
+
+@pytest.mark.parametrize(
+    ("words", "variable", "shown"),
+    [
+        ([], None, "IWE"),
+        (["-logtostderr", "--alsologtostderr=1"], None, "IWE"),
+        (["-minloglevel=1"], None, "WE"),
+        ([], "2", "E"),
+        (["--minloglevel", "0"], "2", "IWE"),
+        ([], "9", ""),
+    ],
+)
+def test_glogs_own_flags_and_variable(
+    words: list[str],
+    variable: str | None,
+    shown: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def speak(arguments: argparse.Namespace) -> None:
+        for say in (log.info, log.warning, log.error):
+            say("caffe.cpp:1", "hello")
+
+    monkeypatch.delenv("GLOG_minloglevel", raising=False)
+    if variable is not None:
+        monkeypatch.setenv("GLOG_minloglevel", variable)
+    assert run(command(speak), ["convert", *words]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert "".join(line[0] for line in lines) == shown
+    assert all(line.endswith(" caffe.cpp:1] hello") for line in lines)
+
+
+def test_the_logger_is_left_as_it_was() -> None:
+    before = log.logger.level, log.logger.propagate, list(log.logger.handlers)
+    read()
+    assert (log.logger.level, log.logger.propagate, log.logger.handlers) == before
+
+
+# How a command ends
+
+
+class Fault(ValueError):
+    """Another wing's error."""
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (SpecError("wrong", Where("net.prototxt", 3, 4)), 1, "net.prototxt:3:4: wrong\n"),
+        (Fault("list.txt:1:1: wrong"), 1, "list.txt:1:1: wrong\n"),
+        (PermissionError(13, "Permission denied", "out/db"), 1, "out/db: Permission denied\n"),
+        (OSError("no space"), 1, "no space\n"),
+        (WrongUsage("a and b do not go together"), 2, "program convert: error: a and b do not go together\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_each_end_has_its_status_and_one_line(
+    error: BaseException, status: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(arguments: argparse.Namespace) -> None:
+        raise error
+
+    assert run(command(fail), ["convert"], (Fault,)) == status
+    assert capsys.readouterr().err == said
+    assert not log.logger.handlers or all(type(h) is not logging.StreamHandler for h in log.logger.handlers)
+
+
+def test_a_fault_of_the_program_is_not_hidden() -> None:
+    def fail(arguments: argparse.Namespace) -> None:
+        raise AssertionError("a mistake in the program")
+
+    with pytest.raises(AssertionError):
+        run(command(fail), ["convert"], (Fault,))
