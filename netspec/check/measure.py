@@ -10,8 +10,8 @@ from netspec.log import info, number
 from netspec.net.net import Net
 
 
-def test_net(net: Net, iterations: int) -> dict[str, float | list[float]]:
-    """Run ``iterations`` batches; log each batch's outputs and their means, and return the means by output blob."""
+def test_net(net: Net, iterations: int) -> dict[str, list[float]]:
+    """Run ``iterations`` batches; log each batch's outputs, and the means of their elements; return the means."""
     info("caffe.cpp:281", f"Running for {iterations} iterations.")
     totals: dict[str, list[float]] = {}
     total_loss = 0.0
@@ -26,14 +26,13 @@ def test_net(net: Net, iterations: int) -> dict[str, float | list[float]]:
                     sums[k] += score
                     info("caffe.cpp:304", f"Batch {batch}, {name} = {number(score)}")
     info("caffe.cpp:309", f"Loss: {number(total_loss / iterations)}")
-    means: dict[str, float | list[float]] = {}
+    means: dict[str, list[float]] = {}
     for name, sums in totals.items():
         weight = net.output_loss_weights[name]
-        row = [value / iterations for value in sums]
-        for mean in row:
+        means[name] = [value / iterations for value in sums]
+        for mean in means[name]:
             ending = f" (* {number(weight)} = {number(weight * mean)} loss)" if weight else ""
             info("caffe.cpp:321", f"{name} = {number(mean)}{ending}")
-        means[name] = row[0] if len(row) == 1 else row
     return means
 
 

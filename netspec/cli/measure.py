@@ -6,6 +6,7 @@ import argparse
 
 from netspec.cli.arguments import add_device, add_python, add_state, load, load_weights, positive
 from netspec.cli.run import Commands
+from netspec.scores import Score, Scores
 
 
 def add_to(commands: Commands) -> None:
@@ -14,6 +15,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--model", required=True, help="the net's prototxt")
     p.add_argument("--weights", required=True, help="the trained weights")
     p.add_argument("--iterations", type=positive, default=50, help="batches to run (default: 50)")
+    p.add_argument("--scores", metavar="F.json", help="write the means to this file too")
     add_device(p)
     add_state(p, phase=None)
     add_python(p)
@@ -31,8 +33,10 @@ def _test(arguments: argparse.Namespace) -> None:
 
     net = load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
     load_weights(net, arguments.weights)
-    test_net(net, arguments.iterations)
+    means = test_net(net, arguments.iterations)
     net.close()
+    if arguments.scores:
+        Scores([Score(None, 0, means)]).write(arguments.scores)
 
 
 def _time(arguments: argparse.Namespace) -> None:

@@ -5,11 +5,17 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from netspec import log
 from netspec.cli.arguments import add_device, add_python, add_state, devices
 from netspec.cli.run import Commands, signals
 from netspec.command_line import WrongUsage
+from netspec.scores import Score, Scores, Snapshot, read_scores
+
+if TYPE_CHECKING:
+    from netspec.solver.solver import Solver
 
 EFFECTS = ("stop", "snapshot", "none")
 
@@ -21,6 +27,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--solver", help="the solver's prototxt")
     p.add_argument("--snapshot", help="a .solverstate to resume from")
     p.add_argument("--weights", help="weights to start from, several separated by commas")
+    p.add_argument("--scores", metavar="F.json", help="keep what its tests find and which snapshots it takes here")
     add_device(p)
     add_state(p, phase=None)
     p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
@@ -50,6 +57,8 @@ def _train(arguments: argparse.Namespace) -> None:
             allow_python=arguments.allow_python_layers,
             action=action,
         )
+        if arguments.scores:
+            _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
         log.info("caffe.cpp:239", "Starting Optimization")
         total, first, hidden = solver.param.max_iter, solver.iteration, not sys.stderr.isatty()
         with tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False) as bar:
@@ -57,3 +66,19 @@ def _train(arguments: argparse.Namespace) -> None:
             solver.solve()
         solver.close()
     log.info("caffe.cpp:250", "Optimization Done.")
+
+
+def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:
+    """Have the solver write its scores; a training that goes on keeps those that it found before."""
+    scores = read_scores(path).before(solver.iteration) if resumed and Path(path).exists() else Scores()
+    scores.write(path)
+
+    def tested(net: int) -> None:
+        scores.tests.append(Score(solver.iteration, net, solver.scores[net]))
+        scores.write(path)
+
+    def saved(model: str) -> None:
+        scores.snapshots.append(Snapshot(solver.iteration, model))
+        scores.write(path)
+
+    solver.on_test, solver.on_snapshot = tested, saved

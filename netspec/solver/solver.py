@@ -103,7 +103,8 @@ class Solver:
 
     ``iteration`` counts the updates done; ``net`` is the training net, ``test_nets`` the others; ``scores`` has, for
     each test net, the mean of every output element of its last test. ``on_iteration()`` is called after each update,
-    ``on_test(i)`` after test net i was run.
+    ``on_test(i)`` after test net i was run, ``on_snapshot(model)`` after weights and state were written, with the path
+    of the weights.
     """
 
     def __init__(
@@ -134,6 +135,7 @@ class Solver:
         self.clock = clock
         self.on_iteration: Callable[[], object] = lambda: None
         self.on_test: Callable[[int], object] = lambda i: None
+        self.on_snapshot: Callable[[str], object] = lambda model: None
         self.iteration = 0
         self.current_step = 0
         self.scores: list[Scores] = []
@@ -350,6 +352,7 @@ class Solver:
         log.info(site, f"Snapshotting solver state to {form} file {state}")
         history = [values.cpu().numpy() for values in self.history]
         write_state(state, State(self.iteration, model, self.current_step, history))
+        self.on_snapshot(model)
         return model, state
 
     def restore(self, path: str | Path) -> None:

@@ -1,0 +1,70 @@
+"""What a training's tests found and which snapshots it took, in a file for programs (JSON).
+
+    {"tests": [{"iteration": 0, "net": 0, "outputs": {"loss": [0.14]}}],
+     "snapshots": [{"iteration": 100, "path": "x_iter_100.caffemodel"}]}
+
+The log tells the same to people. Values that are infinite or no number are written as Python's json module writes
+them: Infinity, NaN.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from netspec.errors import SpecError, Where
+from netspec.whole_file import whole_file
+
+
+@dataclass(frozen=True)
+class Score:
+    """One run of test net ``net``: the mean of each element of each output blob.
+
+    ``iteration`` is that of the training; None for weights tested outside of one.
+    """
+
+    iteration: int | None
+    net: int
+    outputs: dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Weights as they were after ``iteration`` updates; ``path`` is as the solver wrote it."""
+
+    iteration: int
+    path: str
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The tests and the snapshots of a training, in the order in which they came."""
+
+    tests: list[Score] = field(default_factory=list)
+    snapshots: list[Snapshot] = field(default_factory=list)
+
+    def before(self, iteration: int) -> Scores:
+        """Return what stays true for a training that goes on from the snapshot at ``iteration``."""
+        return Scores(
+            [test for test in self.tests if (test.iteration or 0) < iteration],
+            [snapshot for snapshot in self.snapshots if snapshot.iteration <= iteration],
+        )
+
+    def write(self, path: str | Path) -> None:
+        """Write the file, whole or not at all. Raises SpecError where it cannot be written."""
+        with whole_file(path) as unfinished:
+            unfinished.write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+
+def read_scores(path: str | Path) -> Scores:
+    """Read a file that ``Scores.write`` wrote. Raises SpecError for another one."""
+    where = Where(str(path))
+    try:
+        entries = json.loads(Path(path).read_text())
+        tests = [Score(test["iteration"], test["net"], test["outputs"]) for test in entries["tests"]]
+        return Scores(tests, [Snapshot(entry["iteration"], entry["path"]) for entry in entries["snapshots"]])
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror}", where) from None
+    except (ValueError, KeyError, TypeError) as fault:
+        raise SpecError(f"this is no file of scores (netspec train --scores): {fault}", where) from None
