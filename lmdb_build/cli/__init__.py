@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import cv2
 
-from lmdb_build.cli import convert, lists, pairs, views, walk
+from lmdb_build.cli import compare, convert, lists, pairs, views, walk
 from loopclosure.errors import InputError
 from netspec.command_line import Commands, run
 
-_FAMILIES = (walk, pairs, views, lists, convert)
+_FAMILIES = (walk, pairs, views, lists, convert, compare)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,33 @@
+"""``lmdb-build compare``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from netspec.command_line import Commands
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add("compare", _compare, "train nets on the same pairs and print the table that compares them")
+    p.add_argument("solvers", nargs="+", metavar="SOLVER", help="solver prototxt files of Siamese nets")
+    p.add_argument(
+        "--train", action="store_true", default=True, help="with --no-train the snapshots that there are are judged"
+    )
+    p.add_argument("--out", type=Path, default=Path("out/compare"), help="folder for all files (default: out/compare)")
+    p.add_argument("--gpu", default="", help="the GPU to run on")
+
+
+def _compare(arguments: argparse.Namespace) -> None:
+    from lmdb_build.compare import compare  # which loads what draws pictures
+
+    table, files = compare(arguments.solvers, arguments.out, arguments.train, arguments.gpu, _say)
+    print(table)
+    for path in files:
+        _say(f"wrote {path}")
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

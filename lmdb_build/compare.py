@@ -1,0 +1,217 @@
+"""Nets trained on the same pairs, compared as in the paper's Table I: a chain of netspec's commands through files.
+
+For each net, in the output folder:
+
+    NAME.log, NAME.scores.json            its training (netspec train --scores)
+    NAME.ITERATION.scores.json            a snapshot that the training did not test (netspec test --scores)
+    NAME.train.npz, NAME.validation.npz   the descriptors of both databases' pairs (netspec extract)
+
+and then runs.json, from which the table and the pictures are made.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from loopclosure.report.table_one import read_runs, text_table, write_report
+from netspec.errors import SpecError, Where
+from netspec.graph.filter import filter_net, with_state
+from netspec.proto.text import parse_net, read_solver
+from netspec.scores import Score, read_scores
+
+PHASES = {"train": 0, "validation": 1}
+PROGRESS = ("Iteration ", "    Test net output", "Snapshotting to", "Optimization Done")  # lines of the log to show
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the table needs to know of one solver's net.
+
+    bottoms  of its ContrastiveLoss: two descriptors and the label
+    loss     that layer's top
+    tests    batches of a test
+    sources  train, validation -> data layer -> database
+    """
+
+    solver: str
+    net: str
+    name: str
+    prefix: str
+    tests: int
+    bottoms: tuple[str, ...]
+    loss: str
+    sources: dict[str, dict[str, str]]
+
+    @property
+    def stem(self) -> str:
+        """The name as part of a file's name."""
+        return re.sub(r"[^\w.-]", "_", self.name)
+
+
+def read_entry(path: str) -> Entry:
+    """Read what is needed of a solver and its net. Raises SpecError where it is no Siamese net."""
+    solver = read_solver(path)
+    if not solver.net:
+        raise SpecError("no net: expected one net for both phases", Where(path))
+    net, source = parse_net(solver.net)
+    losses = [layer for layer in net.layer if layer.type == "ContrastiveLoss"]
+    if not losses:
+        raise SpecError("no ContrastiveLoss layer: expected a Siamese net", Where(solver.net))
+    if not losses[0].top:
+        raise SpecError(
+            f'its ContrastiveLoss "{losses[0].name}" has no top; name one, so that tests show the loss',
+            Where(solver.net),
+        )
+    sources = {}
+    for kind, phase in PHASES.items():
+        filtered, _ = filter_net(with_state(net, phase), source)
+        sources[kind] = {
+            layer.name: layer.data_param.source for layer in filtered.layer if layer.HasField("data_param")
+        }
+    if len(sources["train"]) != len(sources["validation"]):
+        found = " and ".join(f"{len(layers)} in {kind}" for kind, layers in sources.items())
+        raise SpecError(f"found data layers: {found}; expected as many in both phases", Where(solver.net))
+    return Entry(
+        solver=path,
+        net=solver.net,
+        name=net.name or Path(path).parent.name,
+        prefix=solver.snapshot_prefix,
+        tests=solver.test_iter[0] if solver.test_iter else 1,
+        bottoms=tuple(losses[0].bottom),
+        loss=losses[0].top[0],
+        sources=sources,
+    )
+
+
+def compare(solvers: Sequence[str], out: Path, train: bool, gpu: str, say: Say) -> tuple[str, list[Path]]:
+    """Train the nets of the solvers, judge each one's best snapshot; return the table and the files of the report.
+
+    Without ``train`` the snapshots of earlier trainings are judged. ``gpu`` is netspec's ``--gpu``. ``say`` is told how
+    far it is. Raises SpecError or InputError for a fault of the files.
+    """
+    entries = [read_entry(path) for path in solvers]
+    for i, entry in enumerate(entries):
+        if entry.stem in [other.stem for other in entries[:i]]:
+            raise SpecError(f'found a second net named "{entry.name}"; give each a name of its own', Where(entry.net))
+    out.mkdir(parents=True, exist_ok=True)
+    runs = []
+    for entry in entries:
+        if train:
+            say(f"Training {entry.name} ({entry.solver})")
+            words = ["train", "--solver", entry.solver, "--scores", str(out / f"{entry.stem}.scores.json")]
+            _netspec([*words, *_on(gpu)], out / f"{entry.stem}.log", say)
+        runs.append(_judged(entry, out, gpu.replace("all", "0").partition(",")[0], say))
+    file = out / "runs.json"
+    file.write_text(json.dumps(runs, indent=1))
+    judged = read_runs(file)
+    return text_table(judged), write_report(judged, out)
+
+
+def _judged(entry: Entry, out: Path, gpu: str, say: Say) -> dict[str, Any]:
+    """Return the net's entry of the run file, its descriptors extracted."""
+    saved, losses = _snapshots(entry, out)
+    for iteration, path in saved.items():
+        if iteration not in losses:
+            scores = out / f"{entry.stem}.{iteration}.scores.json"
+            words = ["test", "--model", entry.net, "--weights", str(path), "--iterations", str(entry.tests)]
+            _netspec([*words, "--scores", str(scores), *_on(gpu)], out / f"{entry.stem}.test.log", say)
+            losses[iteration] = _loss(entry, read_scores(scores).tests[0], scores)
+    best = best_snapshot(list(saved), losses)
+    run: dict[str, Any] = {
+        "name": entry.name,
+        "iteration": best,
+        "losses": sorted(losses.items()),
+        "descriptors": entry.bottoms[:2],
+        "label": entry.bottoms[2],
+    }
+    for kind in PHASES:
+        say(f"Distances of the {kind} pairs: {entry.name}, iteration {best}")
+        features = out / f"{entry.stem}.{kind}.npz"
+        words = ["extract", "--model", entry.net, "--weights", str(saved[best]), "--phase", "TEST"]
+        words += ["--blob", *entry.bottoms, "--out", str(features)]
+        for layer, database in zip(entry.sources["validation"], entry.sources[kind].values(), strict=True):
+            words += ["--source", f"{layer}={database}"]
+        _netspec([*words, *_on(gpu)], out / f"{entry.stem}.extract.log", say)
+        run[kind] = str(features)
+    return run
+
+
+def best_snapshot(saved: Sequence[int], losses: dict[int, float]) -> int:
+    """Return the saved iteration of the smallest loss; of equal ones the first. A loss that is NaN is the largest."""
+    return min(saved, key=lambda k: (math.inf if math.isnan(losses[k]) else losses[k], k))
+
+
+def _snapshots(entry: Entry, out: Path) -> tuple[dict[int, Path], dict[int, float]]:
+    """Return the snapshots by iteration, and the validation losses that are known.
+
+    They are those of the training whose scores are in the output folder, and of no other one that wrote to the same
+    prefix; without such a training, all that are there.
+    """
+    file = out / f"{entry.stem}.scores.json"
+    if file.is_file():
+        scores = read_scores(file)
+        saved = {s.iteration: Path(s.path) for s in scores.snapshots if Path(s.path).is_file()}
+        if not saved:
+            raise SpecError(f"its training left no snapshot that is still there (see {file})", Where(entry.solver))
+        tested = [(score.iteration, score) for score in scores.tests if score.net == 0]
+        return saved, {k: _loss(entry, score, file) for k, score in tested if k is not None}
+    prefix = Path(entry.prefix)
+    pattern = re.compile(re.escape(prefix.name) + r"_iter_(\d+)\.caffemodel(\.h5)?$")
+    found = {int(m[1]): path for path in prefix.parent.glob("*") if (m := pattern.match(path.name))}
+    if not found:
+        raise SpecError("no snapshot of this net; train it first (without --no-train)", Where(entry.prefix))
+    return dict(sorted(found.items())), {}
+
+
+def _loss(entry: Entry, score: Score, file: Path) -> float:
+    if entry.loss not in score.outputs:
+        names = ", ".join(score.outputs)
+        raise SpecError(f'no output "{entry.loss}", the ContrastiveLoss; the test net has: {names}', Where(str(file)))
+    return score.outputs[entry.loss][0]
+
+
+def _on(gpu: str) -> list[str]:
+    return ["--gpu", gpu] if gpu else []
+
+
+def _netspec(words: list[str], log: Path, say: Say) -> None:
+    """Run a command of netspec; keep its log in a file, and show what tells progress.
+
+    Raises SpecError, which says what the command said last, where it fails.
+    """
+    beside = str(Path(__file__).parents[1])  # netspec is found where this package is
+    path = os.pathsep.join(filter(None, (beside, os.environ.get("PYTHONPATH"))))
+    command = [sys.executable, "-m", "netspec", *words]
+    environment = {**os.environ, "PYTHONPATH": path}
+    with (
+        log.open("w") as file,
+        subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process,
+    ):
+        assert process.stderr is not None
+        try:
+            last = _relay(process.stderr, file, say)
+        except KeyboardInterrupt:  # the command was interrupted too: a training ends with a snapshot
+            _relay(process.stderr, file, say)
+            raise
+    if process.returncode:
+        raise SpecError(last if process.returncode == 1 else f"netspec {words[0]} failed: {last or process.returncode}")
+
+
+def _relay(stream: IO[str], file: IO[str], say: Say) -> str:
+    """Copy the lines of a log to a file and show those that tell progress; return the last one."""
+    line = ""
+    for line in stream:
+        file.write(line)
+        if line.partition("] ")[2].startswith(PROGRESS):
+            say(line.rstrip("\n"))
+    return line.rstrip("\n")

@@ -1,0 +1,174 @@
+"""The chain that compares nets: train, choose a snapshot, take the distances of the pairs, print the table."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lmdb_build.cli import main, parser
+from lmdb_build.compare import best_snapshot, read_entry
+from netspec.errors import SpecError
+from netspec.scores import read_scores
+from paths import GOLDEN, ROOT
+
+SOLVER = "sgd_step/solver.prototxt"
+OLDER = (GOLDEN / "snapshot" / "straight_iter_60.caffemodel").read_bytes()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pairs").symlink_to(GOLDEN / "pairs")
+    (tmp_path / "sgd_step").mkdir()
+    for name in ("solver.prototxt", "train_val.prototxt", "init.caffemodel"):
+        (tmp_path / "sgd_step" / name).write_bytes((GOLDEN / "snapshot" / name).read_bytes())
+    return tmp_path
+
+
+@pytest.fixture
+def edited(folder: Path) -> Callable[..., None]:
+    """``edited(old, new, ...)``: replaces texts in the solver."""
+
+    def edit(*changes: str) -> None:
+        text = Path(SOLVER).read_text()
+        for old, new in zip(changes[::2], changes[1::2], strict=True):
+            assert old in text
+            text = text.replace(old, new)
+        Path(SOLVER).write_text(text)
+
+    edit("max_iter: 60", 'max_iter: 10 weights: "sgd_step/init.caffemodel"', "snapshot: 40", "snapshot: 5")
+    edit("test_interval: 25", "test_interval: 5")
+    return edit
+
+
+def row(out: str) -> dict[str, str]:
+    with (Path(out) / "table.csv").open() as file:
+        (found,) = csv.DictReader(file)
+    return found
+
+
+def test_it_trains_chooses_the_snapshot_that_validates_best_and_judges_it(
+    edited: Callable[..., None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    # better snapshots, but another training's; a path that begins with ./ is spelled in two ways
+    edited('"sgd_step/ref"', '"./sgd_step/ref"')
+    for iteration in (5, 60):
+        Path(f"sgd_step/ref_iter_{iteration}.caffemodel").write_bytes(OLDER)
+    assert main(["compare", SOLVER, "--out", "out"]) == 0
+    said = capfd.readouterr()
+    scores = {score.iteration: score.outputs["loss"][0] for score in read_scores("out/sgd_step.scores.json").tests}
+    assert sorted(scores) == [0, 5, 10]
+    assert row("out")["net"] == "sgd_step"
+    assert int(row("out")["iteration"]) == min((5, 10), key=scores.__getitem__)
+    assert float(row("out")["ROC AUC"]) > 0.8  # Caffe's own weights tell the synthetic places apart
+    # conv1 6x1x5x5 + 6, conv2 8x6x5x5 + 8, ip1 32x128 + 32, feat 8x32 + 8
+    assert int(row("out")["parameters"]) == 156 + 1208 + 4128 + 264
+    assert "sgd_step" in said.out
+    assert "The paper's Table I" in said.out
+    assert "Iteration 5, Testing net (#0)" in said.err
+    assert "Creating Layer" not in said.err
+    assert "Creating Layer" in Path("out/sgd_step.log").read_text()
+    assert Path("out/losses.png").stat().st_size > 1000
+    assert Path("out/distances.png").stat().st_size > 1000
+
+    before = row("out")
+    assert main(["compare", SOLVER, "--out", "out", "--no-train"]) == 0
+    assert row("out")["iteration"] == before["iteration"]
+    for path in Path("sgd_step").glob("ref_iter_*"):
+        path.unlink()
+    assert main(["compare", SOLVER, "--out", "out", "--no-train"]) == 1
+
+
+def test_a_snapshot_that_no_test_met_is_tested_once_more(edited: Callable[..., None]) -> None:
+    edited("snapshot: 5", "snapshot: 4", "max_iter: 10", "max_iter: 5")
+    assert main(["compare", SOLVER, "--out", "out"]) == 0
+    (run,) = json.loads(Path("out/runs.json").read_text())
+    assert [iteration for iteration, _ in run["losses"]] == [0, 4, 5]
+    (score,) = read_scores("out/sgd_step.4.scores.json").tests
+    assert run["losses"][1] == [4, score.outputs["loss"][0]]
+    assert run["iteration"] in (4, 5)
+
+
+def test_without_training_it_scores_the_snapshots_that_there_are(folder: Path) -> None:
+    for iteration, name in ((40, "ref_iter_40"), (60, "straight_iter_60")):
+        model = (GOLDEN / "snapshot" / f"{name}.caffemodel").read_bytes()
+        (folder / "sgd_step" / f"ref_iter_{iteration}.caffemodel").write_bytes(model)
+    assert main(["compare", SOLVER, "--no-train"]) == 0
+    assert row("out/compare")["iteration"] in ("40", "60")
+
+
+def test_not_to_train_is_spelled_as_every_flag() -> None:
+    words = (["--no-train"], ["-notrain"], ["--train=false"], [], ["-train"])
+    found = [parser().parse_args(["compare", "s", *more]).train for more in words]
+    assert found == [False, False, False, True, True]
+
+
+def test_the_best_snapshot() -> None:
+    assert best_snapshot([5, 10, 15], {0: 0.1, 5: 0.3, 10: 0.2, 15: 0.2}) == 10
+    assert best_snapshot([5, 10], {5: float("nan"), 10: 3.0}) == 10
+    assert best_snapshot([5, 10], {5: float("nan"), 10: float("nan")}) == 5
+
+
+def fault(capfd: pytest.CaptureFixture[str], *words: str) -> str:
+    assert main(["compare", SOLVER, *words]) == 1
+    err = capfd.readouterr().err
+    assert "Traceback" not in err
+    return err.splitlines()[-1]
+
+
+def test_what_is_wrong_is_one_line(
+    folder: Path, edited: Callable[..., None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    absent = "sgd_step/ref: no snapshot of this net; train it first (without --no-train)"
+    assert fault(capfd, "--no-train") == absent
+    twice = 'sgd_step/train_val.prototxt: found a second net named "sgd_step"; give each a name of its own'
+    assert fault(capfd, SOLVER) == twice
+    edited("base_lr", "base_rl")
+    assert 'SolverParameter has no field "base_rl"' in fault(capfd)
+
+
+def test_a_command_that_fails_ends_the_chain_with_its_line(
+    edited: Callable[..., None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    edited("sgd_step/init.caffemodel", "nowhere.caffemodel")
+    assert fault(capfd) == "nowhere.caffemodel: cannot be read: No such file or directory"
+    edited('weights: "nowhere.caffemodel"', "snapshot_after_train: false", "snapshot: 5", "")
+    assert fault(capfd).startswith(f"{SOLVER}: its training left no snapshot")
+
+
+def test_a_net_that_is_not_siamese(folder: Path) -> None:
+    net = Path("sgd_step/train_val.prototxt")
+    text = net.read_text()
+    net.write_text(text.replace('"ContrastiveLoss"', '"EuclideanLoss"'))
+    with pytest.raises(SpecError, match="no ContrastiveLoss layer: expected a Siamese net"):
+        read_entry(SOLVER)
+    net.write_text(text.replace('top: "loss"', ""))
+    with pytest.raises(SpecError, match='its ContrastiveLoss "loss" has no top'):
+        read_entry(SOLVER)
+
+
+def test_an_interrupt_lets_the_training_end_with_a_snapshot(edited: Callable[..., None]) -> None:
+    edited("max_iter: 10", "max_iter: 1000000", "snapshot: 5", "")
+    command = [sys.executable, "-m", "lmdb_build", "compare", SOLVER, "--out", "out"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True
+    ) as process:
+        assert process.stderr is not None
+        end = time.monotonic() + 60
+        while "Iteration 5," not in process.stderr.readline():
+            assert time.monotonic() < end
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        said = process.stderr.read()
+    assert process.returncode == 130
+    assert said.splitlines()[-1] == "interrupted"
+    assert "Traceback" not in said
+    (snapshot,) = read_scores("out/sgd_step.scores.json").snapshots
+    assert Path(snapshot.path).is_file()
