@@ -79,11 +79,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def evaluate_loops(argv: Sequence[str] | None = None) -> int:
-    """Run ``loopclosure evaluate``: the door ``tools/evaluate_loops.py``."""
-    return main(["evaluate", *(sys.argv[1:] if argv is None else argv)])
-
-
 def show_progress(items: Iterable[Item], stage: str, total: int | None = None) -> Iterable[Item]:
     """Show a bar on a terminal."""
     return tqdm(items, desc=stage, total=total, disable=None, leave=False, unit="")

@@ -5,10 +5,7 @@ tools/compare.py prototxt/small/siamese_8/solver.prototxt prototxt/small/siamese
 """
 
 import sys
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from door import run
 
-from lmdb_build.cli import main
-
-sys.exit(main(["compare", *sys.argv[1:]]))
+sys.exit(run("lmdb_build.cli", "compare"))
