@@ -15,7 +15,6 @@ import weakref
 from abc import ABC, abstractmethod
 from pathlib import Path
 from types import ModuleType, TracebackType
-from typing import Any
 
 import lmdb
 
@@ -25,8 +24,8 @@ from netspec.errors import SpecError, Where
 BACKENDS = ("lmdb", "leveldb")
 _SCAN = 4096  # keys listed ahead of the one that is asked for
 _PATIENCE = 1.0  # seconds
-_FIRST_MAP_SIZE = 16 << 20
-_COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a transaction's pages stay in memory until it is committed
+_FIRST_MAP_SIZE = 1 << 20  # Caffe's
+_COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a batch stays in memory until it is committed
 
 
 class Reader(ABC):
@@ -237,41 +236,38 @@ class Writer:
 
 
 class _LmdbStore:
-    """A growing LMDB. Growth comes ahead of need: a full map would cost the transaction at hand."""
+    """A growing LMDB: a batch that finds the map full is written once more, into a map twice as large.
+
+    Caffe: LMDBTransaction (src/caffe/util/db_lmdb.cpp), whose files these are byte for byte as long as 1000 records are
+    no more than ``_COMMIT_BYTES``.
+    """
 
     def __init__(self, folder: str) -> None:
         self._env = lmdb.open(folder, map_size=_FIRST_MAP_SIZE, mode=0o664, lock=False, sync=False)
-        self._page: int = self._env.stat()["psize"]
-        self._last = b""
-        self._begin()
-
-    def _begin(self) -> None:
-        info = self._env.info()
-        self._free = info["map_size"] // self._page - info["last_pgno"] - 64  # pages
-        self._bytes = self._records = 0
-        self._transaction: Any = self._env.begin(write=True)
+        self._longest = self._env.max_key_size()
+        self._batch: list[tuple[bytes, bytes]] = []
+        self._bytes = 0
 
     def put(self, key: bytes, value: bytes) -> None:
-        size = len(key) + len(value)
-        pages = size // self._page + 4  # with a leaf that is copied or split, and its branches
-        if pages > self._free:
-            self._transaction.commit()
-            self._env.set_mapsize(2 * max(self._env.info()["map_size"], pages * self._page))
-            self._begin()
-        self._transaction.put(key, value, append=key > self._last)  # in order, pages are filled to the brim
-        self._last = max(self._last, key)
-        self._free -= pages
-        self._bytes += size
-        self._records += 1
-        if self._records >= _COMMIT_RECORDS or self._bytes >= _COMMIT_BYTES:
+        if not 0 < len(key) <= self._longest:
+            raise lmdb.BadValsizeError(f"a key has 1 to {self._longest} bytes, not {len(key)}")
+        self._batch.append((key, value))
+        self._bytes += len(key) + len(value)
+        if len(self._batch) >= _COMMIT_RECORDS or self._bytes >= _COMMIT_BYTES:
             self.commit()
 
     def commit(self) -> None:
-        self._transaction.commit()
-        self._begin()
+        while self._batch:
+            try:
+                with self._env.begin(write=True) as transaction:
+                    for key, value in self._batch:
+                        transaction.put(key, value)
+                self._batch.clear()
+                self._bytes = 0
+            except lmdb.MapFullError:
+                self._env.set_mapsize(2 * self._env.info()["map_size"])
 
     def close(self) -> None:
-        self._transaction.abort()
         self._env.sync(True)
         self._env.close()
 

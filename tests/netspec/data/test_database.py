@@ -180,6 +180,33 @@ def test_an_lmdb_taken_for_a_leveldb_says_what_to_write() -> None:
 # Writing
 
 
+@pytest.mark.parametrize(
+    "folder", ["images/lmdb_plain", "images/lmdb_resized", "images/lmdb_encoded", "features/feat_lmdb"]
+)
+def test_the_file_is_caffes_byte_for_byte(tmp_path: Path, folder: str) -> None:
+    caffes = GOLDEN / folder
+    reader = open_reader(str(caffes))
+    write(tmp_path / "db", {reader.key(i): reader.record(i) for i in range(len(reader))})
+    assert (tmp_path / "db" / "data.mdb").read_bytes() == (caffes / "data.mdb").read_bytes()
+
+
+@pytest.mark.parametrize("batch", [1, 7, 1000])
+def test_a_batch_that_overflows_the_map_is_written_once_more_and_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int
+) -> None:
+    monkeypatch.setattr(database, "_FIRST_MAP_SIZE", 1 << 16)
+    monkeypatch.setattr(database, "_COMMIT_RECORDS", batch)
+    rng = np.random.default_rng(1)
+    records = {b"%08d" % i: rng.bytes(int(size)) for i, size in enumerate(rng.integers(1, 9000, 500))}
+    with Writer(str(tmp_path / "db")) as writer:
+        for i, (key, value) in enumerate(records.items()):
+            if i % 3 == 0:
+                writer.put(key, b"an earlier record of this key")
+            writer.put(key, value)
+    reader = open_reader(str(tmp_path / "db"))
+    assert {reader.key(i): reader.record(i) for i in range(len(reader))} == records
+
+
 def test_the_map_grows_with_the_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "_FIRST_MAP_SIZE", 1 << 20)
     rng = np.random.default_rng(0)
