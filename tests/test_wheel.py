@@ -1,0 +1,103 @@
+"""What ``pip install`` gives: a wheel with all files of the packages, and commands that work without the source."""
+
+import configparser
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from paths import GOLDEN, ROOT
+
+PACKAGES = ("lmdb_build", "loopclosure", "netspec")
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
+
+
+def run(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([str(word) for word in words], cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, source / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source / name)
+    run(*PIP, "wheel", "--no-deps", "--no-build-isolation", "--no-index", "-w", folder, source, cwd=folder)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def commands(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the commands in an environment that has the wheel, and what it depends on from this one."""
+    folder = tmp_path_factory.mktemp("environment") / "venv"
+    venv.create(folder, symlinks=True)
+    run(*PIP, "--python", folder / "bin" / "python", "install", "--no-deps", "--no-index", wheel, cwd=folder)
+    (site,) = folder.glob("lib/python*/site-packages")
+    # Only paths: an editable installation of this project would need its .pth file read.
+    (site / "dependencies.pth").write_text("\n".join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}))
+    return folder / "bin"
+
+
+def test_it_holds_every_file_of_the_packages_and_nothing_else(wheel: Path) -> None:
+    expected = {
+        path.relative_to(ROOT).as_posix()
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    with zipfile.ZipFile(wheel) as file:
+        found = {name for name in file.namelist() if ".dist-info/" not in name}
+    assert found == expected
+    assert {"netspec/proto/caffe.desc", "netspec/py.typed", "netspec/moved/describe.py"} < found
+
+
+def test_it_says_what_it_is(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as file:
+        (info,) = {name.partition("/")[0] for name in file.namelist() if ".dist-info/" in name}
+        metadata = file.read(f"{info}/METADATA").decode()
+        points = configparser.ConfigParser()
+        points.read_string(file.read(f"{info}/entry_points.txt").decode())
+        assert any("licenses/LICENSE" in name for name in file.namelist())
+    assert "\nName: netspec-caffe\n" in metadata
+    assert dict(points["console_scripts"]) == {
+        "netspec": "netspec.cli:main",
+        "loopclosure": "loopclosure.cli:main",
+        "lmdb-build": "lmdb_build.cli:main",
+    }
+
+
+@pytest.mark.parametrize("command", ["convert", "imageset", "mean", "compare"])
+def test_the_commands_of_lmdb_build_are_there(commands: Path, tmp_path: Path, command: str) -> None:
+    said = run(commands / "lmdb-build", command, "--help", cwd=tmp_path).stdout
+    assert said.startswith(f"usage: lmdb-build {command} ")
+
+
+def test_from_a_walk_to_an_lmdb_and_its_mean(commands: Path, tmp_path: Path) -> None:
+    lmdb_build = commands / "lmdb-build"
+    run(lmdb_build, "walk", "w", "--frames", "60", "--size", "48x36", "--laps", "2", cwd=tmp_path)
+    pairs = ("--train", "20", "--val", "0", "--test", "0", "--out", "pairs")
+    run(lmdb_build, "pairs", "w/walk_1", *pairs, cwd=tmp_path)
+    run(lmdb_build, "convert", "-gray", "-shuffle", "w/", "pairs/train.txt", "train_lmdb", cwd=tmp_path)
+    done = run(lmdb_build, "mean", "train_lmdb", "mean.binaryproto", cwd=tmp_path)
+    assert "Number of channels: 2" in done.stderr
+    assert (tmp_path / "mean.binaryproto").is_file()
+
+
+def test_the_other_commands_run_without_the_source(commands: Path, tmp_path: Path) -> None:
+    net = GOLDEN / "snapshot" / "train_val.prototxt"
+    table = run(commands / "netspec", "check", net, "--shape", "pair_data=4,2,28,28", cwd=tmp_path).stdout
+    assert "ContrastiveLoss" in table
+    assert "usage: loopclosure evaluate" in run(commands / "loopclosure", "evaluate", "--help", cwd=tmp_path).stdout
+    code = "import netspec.describe, loopclosure.baselines.thumbnails, lmdb_build; print(netspec.__file__)"
+    where = Path(run(commands / "python", "-c", code, cwd=tmp_path).stdout.strip())
+    assert where.is_relative_to(commands.parent)
