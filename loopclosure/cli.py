@@ -23,6 +23,7 @@ from loopclosure.errors import InputError
 from loopclosure.methods.base import METHODS, Setting
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places import datasets
+from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.frames import Selection, image_paths
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.truth import Exclusion
@@ -172,7 +173,7 @@ def _add_data_set(p: argparse.ArgumentParser) -> None:
     _add_selection(p, "--", "")
     p.add_argument("--truth", metavar="MASK", help=".mat .npy .txt or image: which frames show the same place")
     p.add_argument("--references", metavar="FOLDER", help="of --images, if they are another folder")
-    p.add_argument("--camera", choices=datasets.CAMERAS, help="of --fabmap (default: both)")
+    p.add_argument("--camera", choices=CAMERAS, help="of --fabmap (default: both)")
     p.add_argument("--coordinates", metavar="FILE", help="of --fabmap, if not in the folder")
     p.add_argument("--tolerance", type=int, metavar="FRAMES", help="of --traverses (default: 0)")
     p.add_argument("--soft-tolerance", type=int, metavar="FRAMES", help="no mistake up to here, though not to be found")

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices
 from lmdb_build.pairs.table import as_number, cell, read_table, relative
 from loopclosure.errors import InputError
+from loopclosure.places import cameras
 from loopclosure.places.frames import image_paths
 from loopclosure.places.masks import read_truth_matrix
 
-CAMERAS = ("all", "left", "right", "both")
+CAMERAS = tuple(camera for camera in cameras.CAMERAS if camera != "joined")  # a pair is two files
 
 
 class MaskSource:
@@ -30,20 +31,15 @@ class MaskSource:
 
         A mask marks no neighbours in time, though they show one place: pairs nearer than ``min_gap`` images are left
         out; by default nearer than the nearest marked pair. Soft entries of the mask are left out too.
-        ``camera``: in the FAB-MAP sets left and right images alternate. ``left`` and ``right`` take one camera's,
-        ``both`` all of them but no pair of a left with a right one, which the mask marks though the two look to
-        opposite sides; ``all`` is for a run of a single camera.
+        ``camera`` says which images are taken: see loopclosure.places.cameras.
         """
         hard, soft = read_truth_matrix(mask)
         paths = image_paths(images)
-        if hard.shape != (len(paths), len(paths)):
-            raise InputError(f"is {hard.shape[0]} x {hard.shape[1]}, but {images} has {len(paths)} images", mask)
-        hard, soft = hard | hard.T, soft | soft.T
-        step = 2 if camera in ("left", "right") else 1
-        start = 1 if camera == "right" else 0
-        self._hard, self._soft = hard[start::step, start::step], soft[start::step, start::step]
-        self._sides = np.arange(len(self._hard)) % 2 if camera == "both" else np.zeros(len(self._hard), np.intp)
-        self.names = [relative(path, root) for path in paths[start::step]]
+        places = cameras.images_of_places(camera, len(paths))
+        hard, soft = (cameras.mask_of_places(camera, matrix, len(paths), mask) for matrix in (hard, soft))
+        self._judged = cameras.comparable(camera, places)
+        self._hard, self._soft = (hard | hard.T) & self._judged, soft | soft.T
+        self.names = [relative(paths[image], root) for image in places[:, 0]]
         count = len(self.names)
         self.tracks = self.groups = np.zeros(count, np.intp)
         self.group_names = [images.name]
@@ -63,7 +59,7 @@ class MaskSource:
         labels = np.where(self._hard[first, second], POSITIVE, NEGATIVE).astype(np.int8)
         labels[self._soft[first, second] & ~self._hard[first, second]] = LEFT_OUT
         labels[np.abs(self.stamps[first] - self.stamps[second]) < self._min_gap] = LEFT_OUT
-        labels[self._sides[first] != self._sides[second]] = LEFT_OUT
+        labels[~self._judged[first, second]] = LEFT_OUT
         return labels
 
     def positives(self) -> Indices:

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
+from loopclosure.places.cameras import comparable, images_of_places, mask_of_places
 from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_image
 from loopclosure.places.masks import read_coordinates, read_place_pairs, read_truth_matrix
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
 
-CAMERAS = ("left", "right", "both", "joined")
 # Ten seconds are what TUM's 30 Hz sequences are commonly judged with; the other sets have no time.
 TUM_EXCLUSION = Exclusion(seconds=10.0)
 # New College's own mask has no loop nearer than 142 images (71 pairs of left and right).
@@ -105,29 +105,20 @@ def load_fabmap(
     Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
     the coordinates (``*Coordinates.mat`` or ``.txt``) are looked for in the folder unless given.
 
-    camera   "left" or "right": the images of one; "both": all images, and pairs of a left with a right one are not
-             judged (the mask calls some the same place, though the two look to opposite sides); "joined": left and
-             right side by side as one image, written to ``joined_folder``, the same place if any of their views is
+    camera     which images are taken: see loopclosure.places.cameras; "joined" ones are written to ``joined_folder``
     selection  counts images of one camera, or joined ones, or with "both" single ones
     """
     folder = Path(folder)
-    if camera not in CAMERAS:
-        raise InputError(f'unknown camera "{camera}"; known: {", ".join(CAMERAS)}')
     images = image_paths(folder)
     truth_path = Path(truth_file) if truth_file else _only_file(folder, ("*GroundTruth.mat",), "the mask of loops")
     assert truth_path is not None
     hard, soft, notes = _fold(truth_path, *read_truth_matrix(truth_path))
-    places = _sides(camera, len(images), len(hard), truth_path)
-    if camera == "joined" and len(hard) == len(images):
-        hard, soft = (_any_view(matrix) for matrix in (hard, soft))
-    elif len(hard) == len(images):
-        hard, soft = (matrix[np.ix_(places[:, 0], places[:, 0])] for matrix in (hard, soft))
+    places = images_of_places(camera, len(images))
+    hard, soft = (mask_of_places(camera, matrix, len(images), truth_path) for matrix in (hard, soft))
     taken = selection.numbers(len(places))
     hard, soft, places = hard[np.ix_(taken, taken)], soft[np.ix_(taken, taken)], places[taken]
-    comparable = None
+    judged = comparable(camera, places)
     if camera == "both":
-        side = places[:, 0] % 2
-        comparable = side[:, None] == side[None, :]
         notes.append("pairs of a left with a right image are not judged: the two cameras look to opposite sides")
     if camera == "joined":
         if joined_folder is None:
@@ -137,11 +128,11 @@ def load_fabmap(
         query_images = [images[place[0]] for place in places]
     positions = _fabmap_positions(folder, coordinates_file, len(images), places)
     rule = f"same place: as {truth_path.name} says"
-    truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=comparable)
+    truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
     words = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
     name = f"{folder.resolve().name}, {words}{_selection_words(selection)}"
     data = DataSet(name, query_images, None, truth, exclusion.frames, None, positions, None, notes)
-    return _checked(data, hard if comparable is None else hard & comparable)
+    return _checked(data, hard & judged)
 
 
 def load_folder(
@@ -246,25 +237,6 @@ def _fold(path: Path, hard: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, n
     if above and not np.array_equal(hard, hard.T):
         notes.append(f"{path.name}: {above} entries above the diagonal were taken for loops of the later frame")
     return np.tril(hard | hard.T, -1), np.tril(soft | soft.T, -1), notes
-
-
-def _sides(camera: str, images: int, size: int, path: Path) -> np.ndarray:
-    """Return the image numbers of each place: (places, 1), or (places, 2) left and right for joined images."""
-    if size != images and not (2 * size == images and camera != "both"):
-        halved = "; does the folder hold one camera's images only?" if size == 2 * images else ""
-        raise InputError(f"is {size} x {size}, but there are {images} images{halved}", path)
-    if camera == "both":
-        return np.arange(images)[:, None]
-    if images % 2:
-        raise InputError(f"{images} images cannot be pairs of a left and a right one")
-    left = np.arange(0, images, 2)
-    return {"left": left[:, None], "right": left[:, None] + 1, "joined": np.stack([left, left + 1], axis=1)}[camera]
-
-
-def _any_view(matrix: np.ndarray) -> np.ndarray:
-    """Reduce (2N, 2N) to (N, N): true where any of the four pairs of views is."""
-    half = len(matrix) // 2
-    return np.any(matrix.reshape(half, 2, half, 2), axis=(1, 3))
 
 
 def _fabmap_positions(

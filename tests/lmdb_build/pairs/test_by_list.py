@@ -59,10 +59,28 @@ class TestMask:
         both = MaskSource(run / "mask.png", run / "run", run, camera="both")
         assert label(both, "run/1.png", "run/8.png") == LEFT_OUT
         assert label(both, "run/1.png", "run/7.png") == POSITIVE
+        right = MaskSource(run / "mask.png", run / "run", run, camera="right")
+        assert right.names[:2] == ["run/2.png", "run/4.png"]
+
+    def test_what_is_not_compared_sets_no_gap(self, run: Path) -> None:
+        mask = cv2.imread(str(run / "mask.png"), cv2.IMREAD_GRAYSCALE)
+        mask[1, 0] = 255  # the left and the right image of one place
+        cv2.imwrite(str(run / "mask.png"), mask)
+        source = MaskSource(run / "mask.png", run / "run", run, camera="both")
+        assert label(source, "run/1.png", "run/2.png") == LEFT_OUT
+        assert label(source, "run/1.png", "run/3.png") == LEFT_OUT  # nearer than any marked pair of one camera
+        assert len(source.positives()) == 5
+
+    def test_a_mask_of_places_serves_the_images_of_one_camera(self, run: Path) -> None:
+        mask = np.zeros((6, 6), np.uint8)
+        mask[4, 1] = 255
+        cv2.imwrite(str(run / "six.png"), mask)
+        source = MaskSource(run / "six.png", run / "run", run, camera="right")
+        assert label(source, "run/10.png", "run/4.png") == POSITIVE
 
     def test_a_mask_of_another_size_is_refused(self, run: Path) -> None:
         images(run / "run", "13.png")
-        with pytest.raises(InputError, match=r"mask\.png: is 12 x 12, but .*run has 13 images"):
+        with pytest.raises(InputError, match=r"mask\.png: is 12 x 12, but there are 13 images"):
             MaskSource(run / "mask.png", run / "run", run)
 
     def test_a_mask_of_matlab(self, run: Path) -> None:
