@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lmdb_build.pairs.list_file import write_pair_list
 from lmdb_build.pairs.runs import Indices, Runs
-from lmdb_build.pairs.warp import JPEG_QUALITY
+from lmdb_build.picture import CORNERS, seen_through, write_jpeg
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_image
 from loopclosure.progress import Progress, silent
@@ -131,14 +131,12 @@ def cut_view(
     width, height = size
     part_h = image.shape[0] * np.exp(rng.uniform(-np.log(ZOOM), 0))
     part_w = min(image.shape[1], part_h * width / height * np.exp(rng.uniform(-STRETCH, STRETCH)))
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
     part = np.array([part_w, part_h])
-    quad = (corners - 0.5 + rng.uniform(-CORNER, CORNER, (4, 2))) * part
+    quad = (CORNERS - 0.5 + rng.uniform(-CORNER, CORNER, (4, 2))) * part
     cos, sin = np.cos(np.deg2rad(angle := rng.normal(0, TURN_DEG))), np.sin(np.deg2rad(angle))
     quad = quad @ np.array([[cos, -sin], [sin, cos]]) + part / 2
     quad += np.clip(about + rng.uniform(-SHIFT, SHIFT, 2), 0, 1) * (np.array(image.shape[1::-1]) - part)
-    homography = cv2.getPerspectiveTransform(quad.astype(np.float32), (corners * size).astype(np.float32))
-    seen = cv2.warpPerspective(image, homography, size, borderMode=cv2.BORDER_REFLECT)
+    seen = seen_through(image, quad, CORNERS * size, size)
     if rng.random() < BLURRED:
         seen = cv2.GaussianBlur(seen, (0, 0), rng.uniform(*BLUR))
     light = 255 * (seen.astype(np.float32) / 255) ** np.exp(rng.normal(0, GAMMA))
@@ -173,8 +171,7 @@ def write_views(
         for image, name in zip(pair, names, strict=True):
             picture = read_image(root / runs.names[image])
             view = cut_view(picture[:, ::-1] if mirrored else picture, size, about, rng)
-            if not cv2.imwrite(str(folder.parent / name), view, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
-                raise InputError("cannot be written", folder.parent / name)
+            write_jpeg(folder.parent / name, view)
         listed.append((*names, int(same[number])))
     out = folder.with_name(f"{folder.name}.txt")
     settings = {

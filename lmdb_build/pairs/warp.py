@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from loopclosure.errors import InputError
+from lmdb_build.picture import CORNERS, seen_through, write_jpeg
 from loopclosure.places.frames import read_image
 
 # Each corner of the cut-out is moved inwards by up to this share of the picture's width and height: a crop, a change of
@@ -17,18 +17,15 @@ LARGEST_INSET = 0.2
 GAIN = (0.6, 1.4)
 GAMMA = (0.7, 1.4)
 TINT = 0.08  # each colour channel's gain varies by so much besides
-JPEG_QUALITY = 95
 
 
 def warp(image: NDArray, rng: np.random.Generator) -> NDArray:
     """Return the image (H, W, 3) uint8 as a camera nearby might see it in other light, at the same size."""
     height, width = image.shape[:2]
     inset = rng.uniform(0, LARGEST_INSET, (4, 2))
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
-    quad = (corners + inset * (1 - 2 * corners)) * [width - 1, height - 1]
-    full = corners * [width - 1, height - 1]
-    homography = cv2.getPerspectiveTransform(quad.astype(np.float32), full.astype(np.float32))
-    seen = cv2.warpPerspective(image, homography, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    whole = CORNERS * [width - 1, height - 1]
+    quad = (CORNERS + inset * (1 - 2 * CORNERS)) * [width - 1, height - 1]
+    seen = seen_through(image, quad, whole, (width, height), cv2.BORDER_REPLICATE)
     gain = rng.uniform(*GAIN) * rng.uniform(1 - TINT, 1 + TINT, 3)
     levels = np.linspace(0, 1, 256)[:, None] ** rng.uniform(*GAMMA) * gain
     table = np.clip(np.round(255 * levels), 0, 255).astype(np.uint8)
@@ -39,5 +36,4 @@ def write_warped(source: Path, target: Path, rng: np.random.Generator) -> None:
     """Write a warped copy of an image file. Raises InputError where one cannot be read or the other not written."""
     picture = warp(read_image(source), rng)
     target.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(target), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
-        raise InputError("cannot be written", target)
+    write_jpeg(target, picture)

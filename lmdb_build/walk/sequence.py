@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdb_build.picture import write_jpeg
 from lmdb_build.walk.house import House, build_house
 from lmdb_build.walk.render import Camera, Light, Renderer
 from lmdb_build.walk.textures import Image
@@ -92,8 +93,7 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     frames = [Frame(walk.start_s + time, f"rgb/{walk.start_s + time:.6f}.jpg") for time in times]
     for frame, picture in zip(frames, _pictures(house, walk, carrier, times), strict=True):
         path = folder / frame.path
-        if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 95]):
-            raise InputError("cannot be written", path)
+        write_jpeg(path, picture)
         yield path
     camera = walk.camera
     calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "

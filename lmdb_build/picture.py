@@ -1,0 +1,32 @@
+"""A picture as a camera nearby sees it, and a picture as a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from loopclosure.errors import InputError
+
+JPEG_QUALITY = 95
+CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)  # of a picture of size 1: x, y, clockwise
+
+
+def seen_through(
+    image: NDArray, quad: NDArray, corners: NDArray, size: tuple[int, int], border: int = cv2.BORDER_REFLECT
+) -> NDArray:
+    """Return a part of an image (H, W, 3) in perspective: a picture of ``size`` (width, height).
+
+    ``quad`` (4, 2) are the pixels x, y of the image that come to ``corners`` (4, 2) of the picture; ``border`` is
+    OpenCV's mode for what lies outside of the image.
+    """
+    homography = cv2.getPerspectiveTransform(quad.astype(np.float32), corners.astype(np.float32))
+    return cv2.warpPerspective(image, homography, size, borderMode=border)
+
+
+def write_jpeg(path: Path, picture: NDArray) -> None:
+    """Write a picture (H, W, 3) uint8, BGR, as JPEG. Raises InputError where it cannot be written."""
+    if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
+        raise InputError("cannot be written", path)
