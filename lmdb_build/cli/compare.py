@@ -14,7 +14,10 @@ def add_to(commands: Commands) -> None:
     p = commands.add("compare", _compare, "train nets on the same pairs and print the table that compares them")
     p.add_argument("solvers", nargs="+", metavar="SOLVER", help="solver prototxt files of Siamese nets")
     p.add_argument(
-        "--train", action="store_true", default=True, help="with --no-train the snapshots that there are are judged"
+        "--train",
+        action="store_true",
+        default=True,
+        help="the default; --no-train judges the snapshots of an earlier training",
     )
     p.add_argument("--out", type=Path, default=Path("out/compare"), help="folder for all files (default: out/compare)")
     p.add_argument("--gpu", default="", help="the GPU to run on")

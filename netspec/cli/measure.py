@@ -15,7 +15,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--model", required=True, help="the net's prototxt")
     p.add_argument("--weights", required=True, help="the trained weights")
     p.add_argument("--iterations", type=positive, default=50, help="batches to run (default: 50)")
-    p.add_argument("--scores", metavar="F.json", help="write the means to this file too")
+    p.add_argument("--scores", metavar="F.json", help="also write the mean scores to this file")
     add_device(p)
     add_state(p, phase=None)
     add_python(p)

@@ -27,7 +27,9 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--solver", help="the solver's prototxt")
     p.add_argument("--snapshot", help="a .solverstate to resume from")
     p.add_argument("--weights", help="weights to start from, several separated by commas")
-    p.add_argument("--scores", metavar="F.json", help="keep what its tests find and which snapshots it takes here")
+    p.add_argument(
+        "--scores", metavar="F.json", help="write the scores of each test and the snapshots taken to this file"
+    )
     add_device(p)
     add_state(p, phase=None)
     p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
