@@ -7,7 +7,7 @@ import signal
 import sys
 
 from netspec import log
-from netspec.cli.arguments import add_device, add_python, add_state, devices
+from netspec.cli.arguments import add_device, add_exact, add_python, add_state, devices
 from netspec.cli.run import Commands, WrongUsage, signals
 
 EFFECTS = ("stop", "snapshot", "none")
@@ -25,6 +25,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
     p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="default: snapshot")
     add_python(p)
+    add_exact(p)
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -48,6 +49,7 @@ def _train(arguments: argparse.Namespace) -> None:
             stages=tuple(arguments.stage.split(",")),
             allow_python=arguments.allow_python_layers,
             action=action,
+            exact=arguments.exact,
         )
         log.info("caffe.cpp:239", "Starting Optimization")
         total, first, hidden = solver.param.max_iter, solver.iteration, not sys.stderr.isatty()
