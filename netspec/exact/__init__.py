@@ -12,14 +12,14 @@ The build option ``exact`` says what is computed so, on the CPU:
 ``all``    every sum of Caffe's layers, of any size. It is slower, and it holds for one thread, as Caffe's BLAS had it.
 
 The bits are those of a Caffe whose OpenBLAS chose the same kernels for its CPU. The files in tests/golden come from
-OpenBLAS 0.3.21 with its kernels for AVX-512 (``OPENBLAS_CORETYPE=SkylakeX``) and the C library glibc 2.36. What is
-known to part from them:
+OpenBLAS 0.3.21 with its kernels for AVX-512, in one thread, and glibc 2.36. On newer CPUs OpenBLAS chooses newer
+kernels, unless the environment says ``OPENBLAS_CORETYPE=SkylakeX``. What is known to part from these files:
 
-- Newer OpenBLAS: 0.3.23 to 0.3.30 (SciPy 1.12 to 1.17) compute the same bits in all 20,000 products of random sizes
-  that were compared, transposed or not, and in gemv, dot, asum, axpy and scal. 0.3.31 sums rows of 6 or 7 numbers
-  otherwise in gemv (the sums over maps of 6 or 7 pixels: bias gradients, BatchNorm), 0.3.34 the absolute values of 264
-  numbers and more (asum: HingeLoss, Reduction with ASUM).
-- Newer C libraries: glibc 2.41 rounds tanhf correctly, 2.36 does not (TanH, RNN). expf, logf, powf are the same.
+- Newer OpenBLAS. 0.3.23 to 0.3.30 (SciPy 1.17 has 0.3.30) compute the same bits, in all products of random sizes that
+  were compared, transposed or not, and in gemv, dot, asum, axpy and scal. 0.3.31 sums rows of 6 or 7 numbers otherwise
+  in gemv (over maps of so many pixels: gradients of biases, BatchNorm), 0.3.34 the absolute values of 264 numbers and
+  more (asum: HingeLoss, Reduction with ASUM).
+- Another C library, which may round expf, logf, powf and tanhf otherwise than glibc 2.36.
 - Parameters shared with share_mode PERMISSIVE in another shape than their owner's: autograd adds their gradients.
 - BatchReindex that chooses an item more than 16 times: Caffe sorts with std::sort, which leaves the order open.
 - Scale over a batch of one, or from axis 0 on: Caffe overwrites the gradient of its factors in each pass, where it adds

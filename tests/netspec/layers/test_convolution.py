@@ -112,6 +112,22 @@ def test_the_way_to_sum_does_not_show(build, size: int) -> None:
             torch.testing.assert_close(torchs, other, rtol=1e-4, atol=1e-4 * float(torchs.detach().abs().max()))
 
 
+@pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
+def test_bottoms_add_to_the_filters_gradient_the_first_one_first(build, kind: str) -> None:
+    text = f'type: "{kind}" convolution_param {{ num_output: 4 kernel_size: 3 {FILL} }}'
+    caffes = {"exact": "all", "accumulate_in_place": True}
+    layer = build(text, *[(3, 3, 6, 6)] * 3, tops=3, **caffes)
+    alone = build(text, (3, 3, 6, 6), **caffes)
+    bottoms = [torch.randn(3, 3, 6, 6) for _ in range(3)]
+    tops = layer.run(*bottoms)
+    diffs = [torch.randn_like(top) for top in tops]
+    torch.autograd.backward(tops, diffs)
+    for bottom, diff in zip(bottoms, diffs, strict=True):
+        alone.run(bottom)[0].backward(diff)
+    for together, one_by_one in zip(layer.blobs, alone.blobs, strict=True):
+        assert torch.equal(together.grad, one_by_one.grad)
+
+
 def test_bottoms_share_the_filters_and_each_has_its_top(build) -> None:
     layer = build(
         f'type: "Convolution" convolution_param {{ num_output: 4 kernel_size: 3 {FILL} }}', *[(2, 3, 6, 6)] * 3, tops=3
