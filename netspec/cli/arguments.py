@@ -10,12 +10,23 @@ from typing import Any
 
 from netspec import log
 from netspec.errors import SpecError
+from netspec.exact import CHOICES, SMALL
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add ``--gpu``."""
     parser.add_argument(
         "--gpu", default="", help="the GPU; for training also several: 0,1 or all (default: as the solver says)"
+    )
+
+
+def add_exact(parser: argparse.ArgumentParser) -> None:
+    """Add ``--exact``."""
+    parser.add_argument(
+        "--exact",
+        choices=CHOICES,
+        default=SMALL,
+        help=f"whose sums are Caffe's to the last bit, on the CPU; all is slower (default: {SMALL})",
     )
 
 
@@ -106,6 +117,7 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
         stages=arguments.stage.split(","),  # without --stage an empty one, as in Caffe
         device=chosen,
         allow_python=arguments.allow_python_layers,
+        exact=arguments.exact,
     )
 
 

@@ -6,7 +6,18 @@ import argparse
 from pathlib import Path
 
 from netspec import log
-from netspec.cli.arguments import add_device, add_python, add_state, bar, device, load_weights, positive, shape, stages
+from netspec.cli.arguments import (
+    add_device,
+    add_exact,
+    add_python,
+    add_state,
+    bar,
+    device,
+    load_weights,
+    positive,
+    shape,
+    stages,
+)
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
 from netspec.errors import SpecError
@@ -37,6 +48,7 @@ def add_to(commands: Commands) -> None:
     add_device(p)
     add_state(p, phase="TEST")
     add_python(p)
+    add_exact(p)
 
 
 def _extract(arguments: argparse.Namespace) -> None:
@@ -64,7 +76,7 @@ def _extract(arguments: argparse.Namespace) -> None:
             raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
         images = read_image_list(Path(arguments.images))
         given = arguments.shape[1] if arguments.shape else None
-        net, scaling = image_net(arguments.model, blob, arguments.input, given, chosen)
+        net, scaling = image_net(arguments.model, blob, arguments.input, given, chosen, arguments.exact)
         load_weights(net, arguments.weights)
         arrays = extract_images(net, scaling, blob, images, progress=bar("extract", "batch"), zooms=arguments.zooms)
     elif arguments.zooms:
@@ -73,7 +85,8 @@ def _extract(arguments: argparse.Namespace) -> None:
         message, source = parse_net(arguments.model)
         stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
         stated = with_sources(stated, source, dict(arguments.source))
-        net = build_net(stated, source, BuildOptions(chosen, allow_python=arguments.allow_python_layers))
+        options = BuildOptions(chosen, allow_python=arguments.allow_python_layers, exact=arguments.exact)
+        net = build_net(stated, source, options)
         load_weights(net, arguments.weights)
         arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))
     net.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from netspec.cli.arguments import add_device, add_python, add_state, load, load_weights, positive
+from netspec.cli.arguments import add_device, add_exact, add_python, add_state, load, load_weights, positive
 from netspec.cli.run import Commands
 from netspec.scores import Score, Scores
 
@@ -19,6 +19,7 @@ def add_to(commands: Commands) -> None:
     add_device(p)
     add_state(p, phase=None)
     add_python(p)
+    add_exact(p)
 
     p = commands.add("time", _time, "measure a model's forward and backward milliseconds a layer (caffe time)")
     p.add_argument("--model", required=True, help="the net's prototxt")
@@ -26,6 +27,7 @@ def add_to(commands: Commands) -> None:
     add_device(p)
     add_state(p, phase="TRAIN")
     add_python(p)
+    add_exact(p)
 
 
 def _test(arguments: argparse.Namespace) -> None:

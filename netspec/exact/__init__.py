@@ -1,1 +1,37 @@
-"""Caffe's arithmetic to the last bit: BLAS' sums in BLAS' order, and the C library's functions."""
+"""Caffe's arithmetic to the last bit: one room, and one switch.
+
+Float32 sums differ by their order in the last bits. Those decide between two nearly equal pixels in a max pooling, and
+after that two trainings go different ways. So a run of Caffe can be followed only by computing as it did: its products
+and sums in the order of its BLAS and of its loops, its functions as the C library rounds them.
+
+The build option ``exact`` says what is computed so, on the CPU:
+
+``none``   nothing: torch's kernels.
+``small``  (the default) what costs next to nothing: Convolution and InnerProduct of up to 500,000 multiply-adds an
+           image, BatchNorm, Scale and SoftmaxWithLoss of up to 2,000 values an image, ContrastiveLoss.
+``all``    every sum of Caffe's layers, of any size. It is slower, and it holds for one thread, as Caffe's BLAS had it.
+
+The bits are those of a Caffe whose OpenBLAS chose the same kernels for its CPU. The files in tests/golden come from
+OpenBLAS 0.3.21 with its kernels for AVX-512, in one thread, and glibc 2.36. On newer CPUs OpenBLAS chooses newer
+kernels, unless the environment says ``OPENBLAS_CORETYPE=SkylakeX``. What is known to part from these files:
+
+- Newer OpenBLAS. 0.3.23 to 0.3.30 (SciPy 1.17 has 0.3.30) compute the same bits, in all products of random sizes that
+  were compared, transposed or not, and in gemv, dot, asum, axpy and scal. 0.3.31 sums rows of 6 or 7 numbers otherwise
+  in gemv (over maps of so many pixels: gradients of biases, BatchNorm), 0.3.34 the absolute values of 264 numbers and
+  more (asum: HingeLoss, Reduction with ASUM).
+- Another C library, which may round expf, logf, powf and tanhf otherwise than glibc 2.36.
+- Parameters shared with share_mode PERMISSIVE in another shape than their owner's: autograd adds their gradients.
+- BatchReindex that chooses an item more than 16 times: Caffe sorts with std::sort, which leaves the order open.
+- Scale over a batch of one, or from axis 0 on: Caffe overwrites the gradient of its factors in each pass, where it adds
+  up every other parameter's over iter_size and over layers that share it; here they add up too.
+- Layers of dialects (SSD, R-CNN and other forks) and Python layers.
+
+Caffe: src/caffe/util/math_functions.cpp, include/caffe/util/mkl_alternate.hpp
+"""
+
+NONE, SMALL, ALL = "none", "small", "all"
+CHOICES = (NONE, SMALL, ALL)
+
+# What "small" computes in Caffe's order: beyond, torch's own kernels are faster.
+SMALL_PRODUCT = 500_000  # multiply-adds an image, of a convolution or an inner product
+SMALL_ITEM = 2_000  # values an image, of layers that pass over memory several times: BatchNorm, Scale, SoftmaxWithLoss

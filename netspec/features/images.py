@@ -17,6 +17,7 @@ from netspec.data.blobs import Shape
 from netspec.data.datum import planar
 from netspec.data.mean import read_mean
 from netspec.errors import SpecError, Where
+from netspec.exact import SMALL
 from netspec.features.image_list import ImageList
 from netspec.features.records import Progress
 from netspec.graph.filter import filter_net, with_state
@@ -36,7 +37,9 @@ class Scaling:
     scale: float
 
 
-def image_net(model: str, blob: str, input_blob: str, shape: Shape | None, device: torch.device) -> tuple[Net, Scaling]:
+def image_net(
+    model: str, blob: str, input_blob: str, shape: Shape | None, device: torch.device, exact: str = SMALL
+) -> tuple[Net, Scaling]:
     """Return the part of a net that computes ``blob`` from ``input_blob``, and what its data layer does to pixels.
 
     ``shape`` (N, C, H, W) of the input is read off the net where it is None: from its Input layer, or from the first
@@ -54,7 +57,7 @@ def image_net(model: str, blob: str, input_blob: str, shape: Shape | None, devic
         raise SpecError(message, Where(source.file))
     readers = [layer for layer in net.layer if layer.HasField("transform_param")]
     body, body_source = prune(net, source, [blob], {input_blob: shape})
-    built = build_net(body, body_source, BuildOptions(device, seed=0))
+    built = build_net(body, body_source, BuildOptions(device, seed=0, exact=exact))
     if not readers:
         log.warning("extract.py:1", f"{model} has no data layer with a transform_param: images go in as 0 to 255")
     return built, _scaling(readers[0], shape, source.file) if readers else Scaling(np.zeros(1, np.float32), 1.0)

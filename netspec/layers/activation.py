@@ -5,12 +5,14 @@ Caffe: the neuron layers, include/caffe/layers/neuron_layer.hpp
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 
+from netspec.exact import libm
+from netspec.exact.channels import Slopes
+from netspec.exact.pointwise import Pointwise, tanh_gradient
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 
@@ -21,6 +23,22 @@ class Activation(Layer):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape."""
         return bottom_shapes
+
+
+class Rounded(Activation):
+    """Base of the activations that torch's functions round otherwise than the C library's, which Caffe calls."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the activated bottom."""
+        return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
+
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the activated bottom by torch's functions, whose gradients autograd knows."""
+        raise NotImplementedError
+
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the activated bottom, each step rounded as Caffe's."""
+        raise NotImplementedError
 
 
 @register("ReLU", "relu_param")
@@ -41,8 +59,8 @@ class ReLU(Activation):
         """Return the rectified bottom."""
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * self.slope)
 
 
@@ -66,11 +84,14 @@ class PReLU(Activation):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the rectified bottom."""
-        return F.prelu(x, self.blob(0).reshape(-1))
+        slopes = self.blob(0)
+        if self.is_exact(x):
+            return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.context.accumulate_in_place).reshape(x.shape)
+        return F.prelu(x, slopes.reshape(-1))
 
 
 @register("ELU", "elu_param")
-class ELU(Activation):
+class ELU(Rounded):
     """Return x where x > 0, else alpha (exp(x) - 1); the gradient at 0 is alpha.
 
     bottom[0]  any shape
@@ -83,18 +104,22 @@ class ELU(Activation):
         self.alpha: float = self.param.elu_param.alpha
         self.gradient_reads = frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom."""
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_torch`."""
         # exp(x) - 1 as Caffe computes it, not the more exact expm1.
         return torch.where(x > 0, x, self.alpha * (torch.exp(x.clamp(max=0)) - 1))
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_caffe`."""
+        return torch.where(x > 0, x, self.alpha * (libm.exp(x.clamp(max=0)) - 1))
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
 
 
 @register("Sigmoid", "sigmoid_param")
-class Sigmoid(Activation):
+class Sigmoid(Rounded):
     """1 / (1 + exp(-x)).
 
     bottom[0]  any shape
@@ -104,17 +129,21 @@ class Sigmoid(Activation):
 
     gradient_reads = frozenset({"top"})
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom."""
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_torch`."""
         return torch.sigmoid(x)
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
-        return diff * top * (1 - top)
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_caffe`."""
+        return libm.sigmoid(x)
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
+        return (diff * top * (1 - top.double())).to(diff.dtype)  # 1. is a double to C, and so are its results
 
 
 @register("TanH", "tanh_param")
-class TanH(Activation):
+class TanH(Rounded):
     """Hyperbolic tangent.
 
     bottom[0]  any shape
@@ -124,13 +153,17 @@ class TanH(Activation):
 
     gradient_reads = frozenset({"top"})
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom."""
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_torch`."""
         return torch.tanh(x)
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
-        return diff * (1 - top * top)
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_caffe`."""
+        return libm.tanh(x)
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
+        return tanh_gradient(bottom, top, diff)
 
 
 @register("AbsVal")
@@ -148,7 +181,7 @@ class AbsVal(Activation):
 
 
 @register("Power", "power_param")
-class Power(Activation):
+class Power(Rounded):
     """(shift + scale x) ^ power; the constant shift ^ power where scale or power is 0, whatever x is.
 
     Where shift is 0, Caffe's gradient divides by x and is NaN at x = 0; this one is the derivative there too.
@@ -167,27 +200,44 @@ class Power(Activation):
         self.scale: float = p.scale
         self.shift: float = p.shift
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the powers."""
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_torch`."""
         if self.power * self.scale == 0:
             return torch.full_like(x, self.shift).pow(self.power)
+        inner = self._inner(x)
+        return inner if self.power == 1 else inner.pow(self.power)
+
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_caffe`."""
+        inner = torch.full_like(x, self.shift) if self.power * self.scale == 0 else self._inner(x)
+        return inner.clone() if self.power == 1 else libm.power(inner, self.power)
+
+    def _inner(self, x: torch.Tensor) -> torch.Tensor:
         if self.scale != 1:
             x = x * self.scale
-        if self.shift != 0:
-            x = x + self.shift
-        return x if self.power == 1 else x.pow(self.power)
+        return x + self.shift if self.shift != 0 else x
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
         slope = self.power * self.scale
         if slope == 0 or self.power == 1:
             return diff * slope
-        inner = self.scale * bottom + self.shift
-        return diff * slope * (inner if self.power == 2 else top / inner)
+        if self.power == 2:
+            derivative = slope * self.scale * bottom
+            return diff * (derivative + slope * self.shift if self.shift != 0 else derivative)
+        if self.shift != 0:
+            return diff * (top / self._inner(bottom) * slope)
+        at_zero = slope * bottom.pow(self.power - 1)
+        return diff * torch.where(bottom == 0, at_zero, top / bottom * self.power)
+
+
+def _log(base: float) -> float:
+    """Return the logarithm of a base, a float as Caffe's."""
+    return libm.log(torch.tensor(base)).item()
 
 
 @register("Exp", "exp_param")
-class Exp(Activation):
+class Exp(Rounded):
     """base ^ (shift + scale x); base -1, the default, stands for e.
 
     bottom[0]  any shape
@@ -202,21 +252,30 @@ class Exp(Activation):
         p = self.param.exp_param
         if p.base <= 0 and p.base != -1:
             raise self.error(f"found base {p.base:g}, expected a positive one, or -1 for e", "exp_param", "base")
-        log_base = 1.0 if p.base == -1 else math.log(p.base)
+        log_base = 1.0 if p.base == -1 else _log(p.base)
         self.scale = log_base * p.scale
         self.shift = log_base * p.shift
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the exponentials."""
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_torch`."""
         return torch.exp(x * self.scale + self.shift)
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_caffe`."""
+        p = self.param.exp_param
+        if p.shift == 0:
+            return libm.exp(x * self.scale)
+        factor = libm.exp(x.new_tensor(p.shift)) if p.base == -1 else libm.power(x.new_tensor(p.base), p.shift)
+        # Caffe makes 0 * infinity of what a large shift would bring back to a number.
+        return libm.exp(x * self.scale) * factor if factor.isfinite() else self.as_torch(x)
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
         return diff * top * self.scale
 
 
 @register("Log", "log_param")
-class Log(Activation):
+class Log(Rounded):
     """Logarithm of (shift + scale x) to a base; base -1, the default, stands for e.
 
     bottom[0]  any shape
@@ -233,21 +292,27 @@ class Log(Activation):
             raise self.error(
                 f"found base {p.base:g}, expected a positive one other than 1, or -1 for e", "log_param", "base"
             )
-        self.base_scale = 1.0 if p.base == -1 else 1 / math.log(p.base)
+        log_base = 1.0 if p.base == -1 else _log(p.base)
+        self.base_scale = 1 / log_base
+        self.slope = p.scale / log_base
         self.scale: float = p.scale
         self.shift: float = p.shift
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the logarithms."""
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_torch`."""
         return torch.log(x * self.scale + self.shift) * self.base_scale
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
-        return diff * (self.scale * self.base_scale) / (self.scale * bottom + self.shift)
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_caffe`."""
+        return libm.log(x * self.scale + self.shift) * self.base_scale
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
+        return diff * (libm.power(bottom * self.scale + self.shift, -1) * self.slope)
 
 
 @register("BNLL")
-class BNLL(Activation):
+class BNLL(Rounded):
     """log(1 + exp(x)), the binomial normal log likelihood.
 
     bottom[0]  any shape
@@ -257,13 +322,18 @@ class BNLL(Activation):
 
     gradient_reads = frozenset({"bottom"})
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom."""
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_torch`."""
         return F.softplus(x, threshold=50)  # above it the result is x, in double precision too
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
-        return diff * torch.sigmoid(bottom)
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_caffe`."""
+        return (x.clamp(min=0) + libm.log(1 + libm.exp(-x.abs()).double())).to(x.dtype)
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
+        growth = libm.exp(bottom.clamp(max=50))
+        return (diff * growth / (growth.double() + 1)).to(diff.dtype)
 
 
 @register("Threshold", "threshold_param")
@@ -308,13 +378,13 @@ class Clip(Activation):
         """Return the clipped bottom."""
         return x.clamp(max=self.high).clamp(min=self.low)
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
         return diff * ((bottom >= self.low) & (bottom <= self.high))
 
 
 @register("Swish", "swish_param")
-class Swish(Activation):
+class Swish(Rounded):
     """x sigmoid(beta x).
 
     bottom[0]  any shape
@@ -328,11 +398,15 @@ class Swish(Activation):
         """Read the sigmoid's scale."""
         self.beta: float = self.param.swish_param.beta
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom."""
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_torch`."""
         return x * torch.sigmoid(self.beta * x)
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
-        gate = torch.sigmoid(self.beta * bottom)
-        return diff * (self.beta * top * (1 - gate) + gate)
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Rounded.as_caffe`."""
+        return x * libm.sigmoid(self.beta * x)
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
+        inner, gate = self.beta * top, libm.sigmoid(self.beta * bottom)
+        return (diff * (inner + gate * (1 - inner.double()))).to(diff.dtype)

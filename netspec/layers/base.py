@@ -15,6 +15,7 @@ import torch
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
+from netspec.exact import SMALL, switch
 from netspec.layers import fillers
 from netspec.proto.schema import TEST
 
@@ -50,7 +51,9 @@ class Context:
     ``at(*path)`` is the place in the prototxt of a field of this layer. ``device`` is where blobs are made; on
     ``meta`` they have shapes and no values. Where ``open_data`` is false, a layer that reads files must not: its tops'
     shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``. Of ``ranks`` nets
-    that train side by side the layer's net is number ``rank``.
+    that train side by side the layer's net is number ``rank``. ``exact`` says which sums are to be Caffe's to the last
+    bit (netspec/exact); with ``accumulate_in_place``, layers that sum up their parameters' gradients themselves add
+    them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
     """
 
     phase: int = TEST
@@ -62,6 +65,8 @@ class Context:
     allow_python: bool = False
     rank: int = 0
     ranks: int = 1
+    exact: str = SMALL
+    accumulate_in_place: bool = False
     created: Callable[[], None] = lambda: None  # called when ``construct`` has run: Caffe's log goes by it
 
 
@@ -117,12 +122,17 @@ class Layer(torch.nn.Module):
         """Return the tops."""
         raise NotImplementedError
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """Return the bottom's gradient as Caffe computes it from what its memory holds at the time of backward.
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """Return the bottom's gradient as Caffe computes it, step by step, from the data in memory at backward.
 
         Only for layers of one bottom and top whose ``gradient_reads`` is not empty: see netspec/net/in_place.py.
         """
         raise NotImplementedError
+
+    def is_exact(self, bottom: torch.Tensor, small: bool = False) -> bool:
+        """Return whether to compute in Caffe's order: :func:`netspec.exact.switch.applies`, for one type of numbers."""
+        applies = switch.applies(self.context.exact, bottom, small)
+        return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
 
     def restart(self) -> None:
         """Return to the first record, where the layer reads any."""

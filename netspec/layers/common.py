@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch.nn import functional as F
 
-from netspec.exact.functions import VectorProducts, in_caffes_order
+from netspec.exact import SMALL_PRODUCT
+from netspec.exact.products import ChosenRows, VectorProducts
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.proto.schema import TRAIN
@@ -53,9 +54,9 @@ class InnerProduct(Layer):
         """Return the products."""
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed = self.param.inner_product_param.transpose
-        if in_caffes_order(data, weight, weight.numel()):
-            vectors = data.reshape(-1, self.inputs)
-            return VectorProducts.apply(vectors, weight, bias, transposed).reshape(self.top_shapes[0])
+        if self.is_exact(data, small=weight.numel() <= SMALL_PRODUCT):
+            vectors, in_place = data.reshape(-1, self.inputs), self.context.accumulate_in_place
+            return VectorProducts.apply(vectors, weight, bias, transposed, in_place).reshape(self.top_shapes[0])
         return F.linear(data.flatten(self.axis), weight.t() if transposed else weight, bias)
 
     def multiply_adds(self) -> int:
@@ -125,5 +126,9 @@ class Embed(Layer):
         if len(wrong):
             message = f"found the index {wrong[0]:g}, expected whole numbers from 0 to {rows - 1} (input_dim - 1)"
             raise self.error(message, "bottom")
-        top = F.embedding(index, self.blob(0))
-        return top + self.blob(1) if len(self.blobs) > 1 else top
+        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+        if self.is_exact(weight):
+            tops = ChosenRows.apply(index.flatten(), weight, bias, self.context.accumulate_in_place)
+            return tops.reshape(self.top_shapes[0])
+        top = F.embedding(index, weight)
+        return top if bias is None else top + bias

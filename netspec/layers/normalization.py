@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
-from netspec.exact.blas import root
-from netspec.exact.functions import PASSES, BatchNormalization, ChannelProducts, in_caffes_order
+from netspec.exact import SMALL_ITEM, libm
+from netspec.exact.channels import BatchNormalization, ChannelProducts, RowNormalization
+from netspec.exact.lrn import AcrossChannels, within_channel
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.proto.schema import TEST
@@ -70,8 +71,8 @@ class BatchNorm(Layer):
             factor = torch.where(weight == 0, 0, 1 / weight)
             mean, variance = self.blob(0) * factor, self.blob(1) * factor
         eps = self.param.batch_norm_param.eps
-        if self._in_caffes_order(data):
-            return (data - _along(mean, 1, data)) / _along(root(variance + eps), 1, data)
+        if self._is_exact(data):
+            return (data - _along(mean, 1, data)) / _along(libm.sqrt(variance + eps), 1, data)
         if _far_from_zero(mean, variance, eps):
             data, mean = data - _along(mean, 1, data), torch.zeros_like(mean)
         return torch.batch_norm(data, None, None, mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
@@ -80,8 +81,9 @@ class BatchNorm(Layer):
         eps, keep = self.param.batch_norm_param.eps, self.param.batch_norm_param.moving_average_fraction
         values = data.numel() // self.channels
         unbiased = 1.0
-        if self._in_caffes_order(data):
-            top, mean, variance = BatchNormalization.apply(data, eps)
+        if self._is_exact(data):
+            top, mean, variance = BatchNormalization.apply(data.reshape(*data.shape[:2], -1), eps)
+            top = top.reshape(data.shape)
             unbiased = values / (values - 1) if values > 1 else 1.0
         else:
             top, mean, variance = _normalize(data, eps)
@@ -96,8 +98,8 @@ class BatchNorm(Layer):
             self.blob(2).mul_(keep).add_(1)
         return top
 
-    def _in_caffes_order(self, data: torch.Tensor) -> bool:
-        return in_caffes_order(data, self.blob(0), PASSES * math.prod(data.shape[1:]))
+    def _is_exact(self, data: torch.Tensor) -> bool:
+        return self.is_exact(data, small=math.prod(data.shape[1:]) <= SMALL_ITEM)
 
 
 def _normalize(data: torch.Tensor, eps: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -148,6 +150,16 @@ class _Affine(Layer):
                 raise self.error(message, "bottom", len(shapes) - 1)
         return axis
 
+    def apply_exactly(
+        self, data: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, axis: int
+    ) -> torch.Tensor:
+        """Multiply and add in Caffe's order; the operands lie over the axes from ``axis`` on."""
+        operand = bias if factors is None else factors
+        assert operand is not None
+        values = data.reshape(math.prod(data.shape[:axis]), operand.numel(), -1)
+        tops = ChannelProducts.apply(values, factors, bias, self.context.accumulate_in_place)
+        return tops.reshape(data.shape)
+
 
 @register("Scale", "scale_param")
 class Scale(_Affine):
@@ -179,9 +191,10 @@ class Scale(_Affine):
         """Return the products, and the bias added."""
         scale = self.blob(0) if factors is None else factors
         bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
-        if self.axis == 1 and scale.dim() == 1:
-            if in_caffes_order(data, scale, PASSES * math.prod(data.shape[1:])):
-                return ChannelProducts.apply(data, scale, bias)
+        by_channel = self.axis == 1 and scale.dim() == 1
+        if self.is_exact(data, small=by_channel and math.prod(data.shape[1:]) <= SMALL_ITEM):
+            return self.apply_exactly(data, scale, bias, self.axis)
+        if by_channel:
             # By channel: batch normalisation with mean 0 and variance 1 is this, three times as fast, backward too.
             zero, one = torch.zeros_like(scale), torch.ones_like(scale)
             return torch.batch_norm(data, scale, bias, zero, one, False, 0.0, 0.0, torch.backends.cudnn.enabled)
@@ -213,7 +226,10 @@ class Bias(_Affine):
 
     def forward(self, data: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
         """Return the sums."""
-        return data + _along(self.blob(0) if bias is None else bias, self.axis, data)
+        operand = self.blob(0) if bias is None else bias
+        if self.is_exact(data):
+            return self.apply_exactly(data, None, operand, self.axis)
+        return data + _along(operand, self.axis, data)
 
 
 @register("LRN", "lrn_param")
@@ -246,6 +262,10 @@ class LRN(Layer):
         """Return the normalised values."""
         param = self.param.lrn_param
         size, reach = param.local_size, param.local_size // 2
+        if self.is_exact(data):
+            if param.norm_region == ACROSS_CHANNELS:
+                return AcrossChannels.apply(data, size, param.alpha, param.beta, param.k)
+            return within_channel(data, size, param.alpha, param.beta)
         squares = data * data
         if param.norm_region == ACROSS_CHANNELS:
             framed, channels = F.pad(squares, (0, 0, 0, 0, reach, reach)), data.shape[1]
@@ -281,8 +301,10 @@ class MVN(Layer):
         param, shape = self.param.mvn_param, self.top_shapes[0]
         outer = 1 if param.across_channels else 2
         maps = data.reshape(math.prod(shape[:outer]), math.prod(shape[outer:]))
-        if param.normalize_variance:
-            top: torch.Tensor = _Standardize.apply(maps, param.eps)
+        if self.is_exact(data):
+            top: torch.Tensor = RowNormalization.apply(maps, param.eps if param.normalize_variance else None)
+        elif param.normalize_variance:
+            top = _Standardize.apply(maps, param.eps)
         else:
             top = maps - maps.mean(dim=1, keepdim=True)
         return top.reshape(shape)

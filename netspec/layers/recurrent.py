@@ -12,6 +12,10 @@ from typing import ClassVar
 import torch
 import torch.nn.functional as F
 
+from netspec.exact import libm
+from netspec.exact.pointwise import CellUpdate, Pointwise, tanh_gradient
+from netspec.exact.products import VectorProducts
+from netspec.exact.sums import Copies
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 
@@ -79,14 +83,17 @@ class Recurrent(Layer):
     def forward(self, x: torch.Tensor, cont: torch.Tensor, *others: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the output of every time step and, where exposed, the last state."""
         steps, streams = x.shape[:2]
-        inputs = F.linear(x.reshape(steps, streams, -1), self.blob(0), self.blob(1))
+        self.exact = self.is_exact(x)
+        inputs = self.multiply(x.reshape(steps * streams, -1), 0, bias=1).reshape(steps, streams, -1)
+        statics: Sequence[torch.Tensor] = ()
         if self.has_static:
-            inputs = inputs + F.linear(others[0].reshape(streams, -1), self.blob(2))
+            static = self.multiply(others[0].reshape(streams, -1), 2)
+            statics = Copies.apply(static, steps) if self.exact else [static] * steps
         state = self._first_state(x, others[self.has_static :])
         goes_on = cont.detach().to(x.dtype).unsqueeze(2)
         outputs = []
-        for gate_input, keep in zip(inputs, goes_on, strict=True):
-            output, state = self.step(gate_input, keep, state)
+        for t, keep in enumerate(goes_on):
+            output, state = self.step((inputs[t], *statics[t : t + 1]), keep, state)
             outputs.append(output)
         last = tuple(s.detach() for s in state)
         if self.exposed:
@@ -102,13 +109,28 @@ class Recurrent(Layer):
         return streams * (steps * sum(matrices) + once)
 
     def step(
-        self, inputs: torch.Tensor, keep: torch.Tensor, state: tuple[torch.Tensor, ...]
+        self, inputs: tuple[torch.Tensor, ...], keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Do one time step: return its output (streams, hidden) and the state after it.
 
-        ``inputs`` (streams, gates * hidden) is what x and x_static bring in, bias added; ``keep`` (streams, 1) is cont.
+        ``inputs`` are what x, with the bias, and x_static bring in, (streams, gates * hidden) each; ``keep`` (streams,
+        1) is cont.
         """
         raise NotImplementedError
+
+    def multiply(self, vectors: torch.Tensor, weight: int, bias: int | None = None) -> torch.Tensor:
+        """Return the products of vectors (M, K) with a matrix, its blob's index given, and the bias added."""
+        matrix, added = self.blob(weight), None if bias is None else self.blob(bias)
+        if self.exact:
+            return VectorProducts.apply(vectors, matrix, added, False, self.context.accumulate_in_place)
+        return F.linear(vectors, matrix, added)
+
+    def carry(self, hidden: torch.Tensor, keep: torch.Tensor, inputs: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        """Return what the hidden state before, unless a sequence begins, and the inputs bring in together."""
+        total = self.multiply(keep * hidden, 2 + self.has_static)
+        for brought in inputs:
+            total = total + brought
+        return total
 
     def _first_state(self, x: torch.Tensor, given: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
         if self.exposed:
@@ -145,16 +167,23 @@ class RNN(Recurrent):
         self.add_blob((self.hidden,), p.bias_filler)
 
     def step(
-        self, inputs: torch.Tensor, keep: torch.Tensor, state: tuple[torch.Tensor, ...]
+        self, inputs: tuple[torch.Tensor, ...], keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Do one time step; see :meth:`Recurrent.step`."""
-        hidden = 2 + self.has_static
-        h = torch.tanh(inputs + F.linear(keep * state[0], self.blob(hidden)))
-        return torch.tanh(F.linear(h, self.blob(hidden + 1), self.blob(hidden + 2))), (h,)
+        last = 2 + self.has_static
+        h = self._tanh(self.carry(state[0], keep, inputs))
+        return self._tanh(self.multiply(h, last + 1, bias=last + 2)), (h,)
+
+    def _tanh(self, x: torch.Tensor) -> torch.Tensor:
+        return Pointwise.apply(x, libm.tanh, tanh_gradient) if self.exact else torch.tanh(x)
 
 
-def _lstm_unit(cell: torch.Tensor, gate_input: torch.Tensor, keep: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _lstm_unit(
+    cell: torch.Tensor, gate_input: torch.Tensor, keep: torch.Tensor, exact: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the next cell and hidden state; the gates come as input, forget, output, then the candidate."""
+    if exact:
+        return CellUpdate.apply(cell, gate_input, keep)
     i, f, o, g = gate_input.chunk(4, -1)
     cell = keep * torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)
     return cell, torch.sigmoid(o) * torch.tanh(cell)
@@ -181,11 +210,11 @@ class LSTM(Recurrent):
     gates = 4
 
     def step(
-        self, inputs: torch.Tensor, keep: torch.Tensor, state: tuple[torch.Tensor, ...]
+        self, inputs: tuple[torch.Tensor, ...], keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Do one time step; see :meth:`Recurrent.step`."""
         h, c = state
-        c, h = _lstm_unit(c, inputs + F.linear(keep * h, self.blob(2 + self.has_static)), keep)
+        c, h = _lstm_unit(c, self.carry(h, keep, inputs), keep, self.exact)
         return h, (h, c)
 
 
@@ -219,4 +248,4 @@ class LSTMUnit(Layer):
 
     def forward(self, cell: torch.Tensor, gates: torch.Tensor, cont: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the next cell and hidden state."""
-        return _lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2))
+        return _lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2), self.is_exact(gates))

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from netspec import log
+from netspec.exact import SMALL
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
@@ -33,14 +34,16 @@ def load_net(
     device: str | torch.device = "cpu",
     seed: int | None = None,
     allow_python: bool = False,
+    exact: str = SMALL,
 ) -> Net:
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
 
+    ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
     Raises SpecError for every fault of the files.
     """
     net, source = parse_net(path)
     number = PHASES[phase] if isinstance(phase, str) else phase
-    options = BuildOptions(torch.device(device), seed, allow_python=allow_python)
+    options = BuildOptions(torch.device(device), seed, allow_python=allow_python, exact=exact)
     built = build_net(with_state(net, number, level, stages), source, options)
     if weights is not None:
         load_weights(built, weights)

@@ -54,4 +54,4 @@ class _Overwritten(torch.autograd.Function):
     def backward(ctx: Any, diff: torch.Tensor) -> Any:
         held = ctx.memory.data
         bottom = held if ctx.bottom_is_held else ctx.saved_tensors[0]
-        return ctx.layer.gradient_in_place(bottom, held, diff), None, None, None
+        return ctx.layer.caffes_gradient(bottom, held, diff), None, None, None

@@ -17,6 +17,8 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where, did_you_mean
+from netspec.exact.sums import RowSums
+from netspec.exact.switch import applies
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, layer_types
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
@@ -60,6 +62,7 @@ class Net(torch.nn.Module):
         self.name: str = plan.net.name
         self.phase: int = plan.net.state.phase
         self.device = options.device
+        self._exact = options.exact
         self.keep: str | Iterable[str] = ()
         self.blobs: dict[str, torch.Tensor] = {}
         self.shapes: dict[str, Shape] = {}
@@ -102,6 +105,8 @@ class Net(torch.nn.Module):
                 allow_python=options.allow_python,
                 rank=options.rank,
                 ranks=options.ranks,
+                exact=options.exact,
+                accumulate_in_place=options.accumulate_in_place,
                 created=partial(self._log_wiring, node),
             )
             try:
@@ -220,7 +225,7 @@ class Net(torch.nn.Module):
                     memories[v].data = top.detach()
             for top, weight in zip(tops, self.loss_weights[i], strict=True):
                 if weight:
-                    term = top.sum() if weight == 1 else top.sum() * weight
+                    term = self._weighted_sum(top, weight)
                     loss = term if loss is None else loss + term
             for v in self._last_use[i]:
                 if v not in kept:
@@ -246,6 +251,12 @@ class Net(torch.nn.Module):
         if memory is not None and torch.is_grad_enabled():
             return run_overwritten(layer, bottoms[0], memory, node.in_place[0])
         return layer.run(*bottoms)
+
+    def _weighted_sum(self, top: torch.Tensor, weight: float) -> torch.Tensor:
+        """Return the share of a top in the net's loss (Caffe: Layer::Forward)."""
+        if top.numel() > 1 and applies(self._exact, top):
+            return RowSums.apply(top.reshape(1, -1), weight)[0]
+        return top.sum() if weight == 1 else top.sum() * weight
 
     def _as_input(self, value: Array) -> torch.Tensor:
         if isinstance(value, torch.Tensor):

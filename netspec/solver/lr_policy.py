@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from netspec.errors import SpecError, did_you_mean
-from netspec.exact.blas import power
+from netspec.exact.libm import power
 from netspec.proto.source_map import Place
 
 Rate = Callable[[Any, int, int], Any]

@@ -18,7 +18,7 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where
-from netspec.exact.blas import adding_to_grad
+from netspec.exact import SMALL
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
@@ -51,6 +51,7 @@ def load_solver(
     stages: Iterable[str] = (),
     allow_python: bool = False,
     action: Callable[[], str | None] | None = None,
+    exact: str = SMALL,
 ) -> Solver:
     """Make the solver of a prototxt, its nets built and ready to step.
 
@@ -75,7 +76,9 @@ def load_solver(
         log.info("caffe.cpp:197", "Use CPU.")
     else:
         log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in chosen))
-    solver = Solver(param, node, device=chosen[0], others=chosen[1:], allow_python=allow_python, action=action)
+    solver = Solver(
+        param, node, device=chosen[0], others=chosen[1:], allow_python=allow_python, exact=exact, action=action
+    )
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
         solver.restore(snapshot)
@@ -115,6 +118,7 @@ class Solver:
         device: torch.device | None = None,
         others: Sequence[torch.device] = (),
         allow_python: bool = False,
+        exact: str = SMALL,
         action: Callable[[], str | None] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
@@ -145,6 +149,7 @@ class Solver:
         self._rule = update.find_rule(param, node)
         self._device = device or choose_device(param, node)
         self._allow_python = allow_python
+        self._exact = exact
         drawn = int.from_bytes(os.urandom(4), "little")
         self._seed = param.random_seed if param.random_seed >= 0 else drawn
 
@@ -170,7 +175,15 @@ class Solver:
         self, described: nets.SolverNet, offset: int, device: torch.device, rank: int = 0, ranks: int = 1
     ) -> Net:
         """Build a net; ``offset`` keeps the random draws of a solver's nets apart."""
-        options = BuildOptions(device, self._seed + offset, allow_python=self._allow_python, rank=rank, ranks=ranks)
+        options = BuildOptions(
+            device,
+            self._seed + offset,
+            allow_python=self._allow_python,
+            rank=rank,
+            ranks=ranks,
+            exact=self._exact,
+            accumulate_in_place=True,
+        )
         net = build_net(described.net, described.source, options)
         for paths in self.param.weights:
             for path in paths.split(","):
@@ -244,12 +257,11 @@ class Solver:
         total = np.float32(0)
         outputs: dict[str, torch.Tensor] = {}
         for _ in range(self.param.iter_size):
-            with adding_to_grad():
-                with self._debugged(self.net, self._is_due(self.param.display)):
-                    loss, outputs = self.net.forward_loss()
-                    if loss.requires_grad:
-                        loss.backward()
-                self._replicas.backward()
+            with self._debugged(self.net, self._is_due(self.param.display)):
+                loss, outputs = self.net.forward_loss()
+                if loss.requires_grad:
+                    loss.backward()
+            self._replicas.backward()
             total += np.float32(loss.item())
         self._replicas.reduce()
         return float(total / np.float32(self.param.iter_size)), outputs

@@ -19,7 +19,8 @@ import numpy as np
 import torch
 
 from netspec.errors import SpecError, did_you_mean
-from netspec.exact.blas import power, sum_of_squares
+from netspec.exact.blas import sum_of_squares
+from netspec.exact.libm import power
 from netspec.proto.source_map import Place
 
 Tensors = list[torch.Tensor] | tuple[torch.Tensor, ...]

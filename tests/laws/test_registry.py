@@ -121,7 +121,7 @@ EXAMPLES = {
     "Input": data("input_param { shape { dim: 2 dim: 3 } }", tops=1),
     "LRN": Example("lrn_param { local_size: 3 alpha: 0.5 }"),
     "LSTM": SEQUENCES,
-    "LSTMUnit": Example("", ((1, 2, 3), (1, 2, 12), (1, 2)), 2, batch=1),
+    "LSTMUnit": Example("", ((1, 2, 3), (1, 2, 12), (1, 2)), 2, {2: flags}, batch=1),
     "Log": Example("log_param { base: 2 scale: 0.1 shift: 9 }"),
     "MVN": Example(),
     "MemoryData": data("memory_data_param { batch_size: 2 channels: 3 height: 4 width: 5 }"),
@@ -177,7 +177,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu") -> Layer:
+def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu", exact: str = "small") -> Layer:
     example = EXAMPLES[name]
     param = LayerParameter(name="it", type=name)
     text_format.Merge(example.text.replace("{tmp}", str(folder)), param)
@@ -189,14 +189,26 @@ def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu")
     def at(*path: str | int) -> Where:
         return Where(".".join(map(str, path)))
 
-    context = Context(phase=example.phase, random=Random(0), at=at, allow_python=True, device=torch.device(device))
+    context = Context(
+        phase=example.phase,
+        random=Random(0),
+        at=at,
+        allow_python=True,
+        device=torch.device(device),
+        exact=exact,
+    )
     return cls(param, shapes, context)
 
 
 @pytest.fixture
-def layer(request: pytest.FixtureRequest, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Layer]:
+def exact() -> str:
+    return "small"
+
+
+@pytest.fixture
+def layer(request: pytest.FixtureRequest, folder: Path, monkeypatch: pytest.MonkeyPatch, exact: str) -> Iterator[Layer]:
     monkeypatch.chdir(folder)
-    built = build(request.param, folder, EXAMPLES[request.param].shapes)
+    built = build(request.param, folder, EXAMPLES[request.param].shapes, exact=exact)
     if isinstance(built, MemoryData):
         built.set_input_arrays(np.zeros((4, 3, 4, 5)), np.zeros(4))
     yield built.double()
@@ -238,6 +250,7 @@ def test_declared_shapes_are_the_real_ones(layer: Layer) -> None:
     assert [tuple(blob.shape) for blob in layer.blobs] == layer.blob_shapes
 
 
+@pytest.mark.parametrize("exact", ["none", "all"])
 @pytest.mark.parametrize("layer", [name for name in TYPES if EXAMPLES[name].smooth], indirect=True)
 def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
     bottoms = EXAMPLES[layer.type].bottoms()

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from netspec.exact.sums import SumInOrder
 from netspec.layers.base import Layer, Shape
 
 FULL, VALID, BATCH_SIZE, NONE = 0, 1, 2, 3  # caffe.proto: enum LossParameter.NormalizationMode
@@ -101,6 +102,11 @@ def normalization_mode(loss_param: Any, default: int) -> int:
     if loss_param.HasField("normalize"):
         return VALID if loss_param.normalize else BATCH_SIZE
     return default
+
+
+def total(losses: torch.Tensor, exact: bool) -> torch.Tensor:
+    """Return the sum of all losses; in Caffe's order where ``exact``."""
+    return SumInOrder.apply(losses.flatten(), 0) if exact else losses.sum()
 
 
 def normalizer(mode: int, outer: int, inner: int, valid: torch.Tensor | None) -> torch.Tensor | float:

@@ -15,8 +15,10 @@ import torch.nn.functional as F
 from google.protobuf.message import DecodeError
 
 from netspec.data.blobs import to_array
-from netspec.exact.blas import exponential, root, sum_in_order
-from netspec.exact.functions import PASSES, in_caffes_order
+from netspec.exact import SMALL_ITEM, libm
+from netspec.exact.blas import dots, sum_in_order
+from netspec.exact.losses import Infogain, Logarithm, SigmoidCrossEntropy, softmax
+from netspec.exact.sums import RowMagnitudes, RowSquares
 from netspec.layers.base import Shape
 from netspec.layers.loss.base import (
     BATCH_SIZE,
@@ -27,6 +29,7 @@ from netspec.layers.loss.base import (
     ignore_label,
     normalization_mode,
     normalizer,
+    total,
 )
 from netspec.layers.registry import register
 from netspec.proto.schema import BlobProto
@@ -47,35 +50,31 @@ class SoftmaxLoss(Loss, Classified):
         self.reshape_scores(bottom_shapes, axis, *path)
         return shapes[: self.num_tops]
 
-    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None) -> torch.Tensor:
+    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
         """Return the normalised sum of the losses (outer, inner) that count."""
         if valid is not None:
             losses = losses.where(valid, 0)
-        return losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
+        return total(losses, exact) / normalizer(self.normalization, self.outer, self.inner, valid)
 
 
 class _NegativeLogOfSoftmax(torch.autograd.Function):
     """-log p of the labels' classes, p being the softmax; the logarithm is of no less than FLT_MIN."""
 
     @staticmethod
-    def forward(ctx: Any, scores: torch.Tensor, label: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(ctx: Any, scores: torch.Tensor, label: torch.Tensor, exact: bool) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the losses (outer, inner) and p, for scores (outer, classes, inner) and labels (outer, inner)."""
-        if in_caffes_order(scores, scores, PASSES * math.prod(scores.shape[1:])):
-            p = exponential(scores - scores.amax(1, keepdim=True))
-            p /= sum_in_order(p, 1).unsqueeze(1)
-        else:
-            p = F.softmax(scores, 1)
+        p = softmax(scores) if exact else F.softmax(scores, 1)
         ctx.save_for_backward(p, label)
         ctx.mark_non_differentiable(p)
-        chosen = p.gather(1, label.unsqueeze(1)).squeeze(1)
-        return -chosen.clamp(min=FLT_MIN).log(), p
+        chosen = p.gather(1, label.unsqueeze(1)).squeeze(1).clamp(min=FLT_MIN)
+        return -(libm.log(chosen) if exact else chosen.log()), p
 
     @staticmethod
-    def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
+    def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
         """Return (p - 1 at the label's class) times the losses' gradient."""
         p, label = ctx.saved_tensors
         of_label = torch.zeros_like(p).scatter_(1, label.unsqueeze(1), 1)
-        return (p - of_label) * diff.unsqueeze(1), None
+        return (p - of_label) * diff.unsqueeze(1), None, None
 
 
 @register("SoftmaxWithLoss", "loss_param", "softmax_param")
@@ -106,8 +105,9 @@ class SoftmaxWithLoss(SoftmaxLoss):
         """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
         valid = self.valid(label, self.ignore_label)
-        losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid)
-        return (self.sum_up(losses, valid), p.reshape(scores.shape))[: self.num_tops]
+        exact = self.is_exact(x, small=math.prod(x.shape[1:]) <= SMALL_ITEM)
+        losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, exact)
+        return (self.sum_up(losses, valid, exact), p.reshape(scores.shape))[: self.num_tops]
 
 
 @register("InfogainLoss", "infogain_loss_param", "loss_param")
@@ -175,11 +175,16 @@ class InfogainLoss(SoftmaxLoss):
         matrix = given[0] if given else self.matrix
         assert matrix is not None, "setup reads the matrix where no bottom brings it"
         gain = matrix.detach().to(x.dtype).reshape(self.classes, self.classes)
-        log_p = F.log_softmax(x, 1)
-        weights = gain[label if valid is None else label * valid].movedim(2, 1)  # (outer, classes, inner)
-        losses = -(weights * Floor.apply(log_p, math.log(LOG_THRESHOLD))).sum(1)
-        loss = self.sum_up(losses, valid)
-        return (loss,) if self.num_tops == 1 else (loss, log_p.detach().exp().reshape(scores.shape))
+        weights = gain[label if valid is None else label * valid]  # (outer, inner, classes)
+        if self.is_exact(x):
+            losses, p = Infogain.apply(x, weights, LOG_THRESHOLD)
+            counted = None if valid is None else valid.unsqueeze(2)
+            loss = self.sum_up(losses, counted, exact=True)
+        else:
+            log_p = F.log_softmax(x, 1)
+            losses = -(weights.movedim(2, 1) * Floor.apply(log_p, math.log(LOG_THRESHOLD))).sum(1)
+            loss, p = self.sum_up(losses, valid, exact=False), log_p.detach().exp()
+        return (loss, p.reshape(scores.shape))[: self.num_tops]
 
 
 @register("MultinomialLogisticLoss")
@@ -203,8 +208,9 @@ class MultinomialLogisticLoss(Loss, Classified):
         """Return the loss."""
         p, label = self.scores_and_labels(probabilities, labels)
         self.valid(label, None)
-        chosen = p.gather(1, label.unsqueeze(1))
-        return -Floor.apply(chosen, LOG_THRESHOLD).log().sum() / self.outer
+        chosen = Floor.apply(p.gather(1, label.unsqueeze(1)), LOG_THRESHOLD)
+        exact = self.is_exact(chosen)
+        return -total(Logarithm.apply(chosen) if exact else chosen.log(), exact) / self.outer
 
 
 @register("HingeLoss", "hinge_loss_param")
@@ -234,9 +240,10 @@ class HingeLoss(Loss, Classified):
         self.valid(label, None)
         sign = torch.ones_like(x).scatter(1, label.unsqueeze(1), -1)
         margins = F.relu(1 + sign * x)
-        if self.param.hinge_loss_param.norm == self.L2:
-            margins = margins.square()
-        return margins.sum() / self.outer
+        squared = self.param.hinge_loss_param.norm == self.L2
+        if self.is_exact(margins):
+            return (RowSquares if squared else RowMagnitudes).apply(margins.reshape(1, -1))[0] / self.outer
+        return (margins.square() if squared else margins).sum() / self.outer
 
 
 @register("SigmoidCrossEntropyLoss", "loss_param", "sigmoid_param")
@@ -266,10 +273,14 @@ class SigmoidCrossEntropyLoss(Loss):
         """Return the loss."""
         targets = targets.detach().reshape(x.shape)
         valid = None if self.ignore_label is None else targets.long() != self.ignore_label
-        losses = F.binary_cross_entropy_with_logits(x, targets, reduction="none")
+        exact = self.is_exact(x)
+        if exact:
+            losses = SigmoidCrossEntropy.apply(x, targets)
+        else:
+            losses = F.binary_cross_entropy_with_logits(x, targets, reduction="none")
         if valid is not None:
             losses = losses.where(valid, 0)
-        return losses.sum() / normalizer(self.normalization, x.shape[0], math.prod(x.shape[1:]), valid)
+        return total(losses, exact) / normalizer(self.normalization, x.shape[0], math.prod(x.shape[1:]), valid)
 
 
 @register("EuclideanLoss")
@@ -294,7 +305,10 @@ class EuclideanLoss(Loss):
 
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         """Return the loss."""
-        return (a - b.reshape(a.shape)).square().sum() / (2 * a.shape[0])
+        difference = a - b.reshape(a.shape)
+        exact = self.is_exact(difference)
+        squares = RowSquares.apply(difference.reshape(1, -1))[0] if exact else difference.square().sum()
+        return squares / (2 * a.shape[0])
 
 
 class _Contrastive(torch.autograd.Function):
@@ -302,15 +316,17 @@ class _Contrastive(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, a: torch.Tensor, b: torch.Tensor, similar: torch.Tensor, margin: float, legacy: bool
+        ctx: Any, a: torch.Tensor, b: torch.Tensor, similar: torch.Tensor, margin: float, legacy: bool, exact: bool
     ) -> torch.Tensor:
         difference = a - b
-        squared = difference.square().double().sum(1).to(difference.dtype)  # as OpenBLAS sums up to 31 products
-        distance = root(squared)
+        rows = difference.unsqueeze(2)
+        squared = dots(rows, rows).squeeze(1) if exact else difference.square().sum(1)
+        distance = libm.sqrt(squared)
         dissimilar = (margin - squared).clamp(min=0) if legacy else (margin - distance).clamp(min=0).square()
         ctx.save_for_backward(difference, squared if legacy else distance, similar)
         ctx.margin, ctx.legacy = margin, legacy
-        return sum_in_order(torch.where(similar, squared, dissimilar)) / len(a) / 2
+        losses = torch.where(similar, squared, dissimilar)
+        return (sum_in_order(losses) if exact else losses.sum()) / len(a) / 2
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
@@ -320,7 +336,7 @@ class _Contrastive(torch.autograd.Function):
         dissimilar = -alpha if ctx.legacy else -alpha * lacking / (distance + 1e-4)
         factor = torch.where(similar, alpha, dissimilar.where(lacking > 0, 0))
         grad = factor.unsqueeze(1) * difference
-        return grad, -grad, None, None, None
+        return grad, -grad, None, None, None, None
 
 
 @register("ContrastiveLoss", "contrastive_loss_param")
@@ -356,7 +372,8 @@ class ContrastiveLoss(Loss):
         """Return the loss."""
         p = self.param.contrastive_loss_param
         similar = label.reshape(-1).long() != 0
-        return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version)
+        exact = self.is_exact(a, small=True)
+        return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version, exact)
 
 
 @register("Accuracy", "accuracy_param")

@@ -8,6 +8,9 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 
+from netspec.exact.losses import softmax, softmax_gradient
+from netspec.exact.pointwise import Pointwise
+from netspec.exact.sums import Product, RowMagnitudes, RowSquares, RowSums
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 
@@ -17,8 +20,8 @@ class Eltwise(Layer):
     """Element by element: SUM (coeff_i bottom_i), PROD, or MAX.
 
     In a MAX of equals the second bottom beats the first, and a later one never beats an earlier: it alone gets the
-    gradient. PROD's gradient is always the stable one, product of the others; Caffe's for stable_prod_grad: false is
-    top / bottom, the same number or NaN at 0.
+    gradient. PROD's gradient is the stable one, product of the others; Caffe's for stable_prod_grad: false is top /
+    bottom, the same number but for rounding, which ``exact: all`` follows, or NaN at 0, which it does not.
 
     bottom[i]  equal shapes, two at least
     top[0]     the same shape
@@ -51,6 +54,14 @@ class Eltwise(Layer):
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         """Return the sum, product or maximum."""
+        exact = self.is_exact(bottoms[0])
+        if exact and self.operation == self.PROD:
+            return Product.apply(self.param.eltwise_param.stable_prod_grad, *bottoms)
+        if exact and self.operation == self.SUM:
+            top = bottoms[0] * self.coeff[0]
+            for x, factor in zip(bottoms[1:], self.coeff[1:], strict=True):
+                top = torch.add(top, x, alpha=factor)  # rounds once, as BLAS' axpy does
+            return top
         if self.operation == self.SUM:
             bottoms = tuple(x if c == 1 else x * c for x, c in zip(bottoms, self.coeff, strict=True))
         top, *others = bottoms
@@ -86,11 +97,20 @@ class Reduction(Layer):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the reduced bottom."""
         operation = self.param.reduction_param.operation
+        if self.is_exact(x):
+            return self._reduce_exactly(x.reshape(math.prod(self.top_shapes[0]), -1), operation) * self.coeff
         if operation == self.ASUM:
             x = x.abs()
         elif operation == self.SUMSQ:
             x = x.square()
         return x.flatten(self.axis).sum(self.axis) * self.coeff
+
+    def _reduce_exactly(self, rows: torch.Tensor, operation: int) -> torch.Tensor:
+        if operation == self.ASUM:
+            sums = RowMagnitudes.apply(rows)
+        else:
+            sums = RowSquares.apply(rows) if operation == self.SUMSQ else RowSums.apply(rows, 1.0)
+        return sums.reshape(self.top_shapes[0])
 
 
 @register("ArgMax", "argmax_param")
@@ -151,10 +171,18 @@ class Softmax(Layer):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the probabilities."""
+        if self.is_exact(x):
+            return Pointwise.apply(x, lambda x: softmax(self._by_class(x)).reshape(x.shape), self.caffes_gradient)
         return F.softmax(x, self.axis)
 
-    def gradient_in_place(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.gradient_in_place`."""
+    def _by_class(self, x: torch.Tensor) -> torch.Tensor:
+        """Return x as (outer, classes, inner)."""
+        return x.reshape(math.prod(x.shape[: self.axis]), x.shape[self.axis], -1)
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """See :meth:`Layer.caffes_gradient`."""
+        if self.is_exact(top):
+            return softmax_gradient(self._by_class(top), self._by_class(diff)).reshape(top.shape)
         return (diff - (diff * top).sum(self.axis, keepdim=True)) * top
 
 

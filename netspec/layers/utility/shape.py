@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from netspec.exact.sums import Copies, Tiles
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 
@@ -176,6 +177,8 @@ class Split(Layer):
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return one tensor a top, so that each has a gradient of its own."""
+        if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
+            return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
 
 
@@ -191,7 +194,7 @@ class Tile(Layer):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the top's shape."""
         p, shape = self.param.tile_param, bottom_shapes[0]
-        axis = self.canonical_axis(p.axis, shape, "tile_param", "axis")
+        self.axis = axis = self.canonical_axis(p.axis, shape, "tile_param", "axis")
         if p.tiles <= 0:
             raise self.error(f"found tiles {p.tiles}, expected a positive number", "tile_param", "tiles")
         self.repeats = [p.tiles if i == axis else 1 for i in range(len(shape))]
@@ -199,6 +202,9 @@ class Tile(Layer):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the repeated bottom."""
+        if self.is_exact(x):
+            values = x.reshape(math.prod(x.shape[: self.axis]), -1)
+            return Tiles.apply(values, self.repeats[self.axis]).reshape(self.top_shapes[0])
         return x.repeat(self.repeats)
 
 

@@ -9,7 +9,8 @@ from itertools import chain
 import torch
 from torch.nn import functional as F
 
-from netspec.exact.functions import ColumnProducts, in_caffes_order
+from netspec.exact import SMALL_PRODUCT
+from netspec.exact.products import ColumnProducts, Columns, Filter, SpreadProducts
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 
@@ -164,11 +165,11 @@ class Convolution(_SlidingFilter):
             weight = weight.unsqueeze(2)
         geometry = [v or (n,) for v, n in ((self.stride, 1), (self.pad, 0), (self.dilation, 1))]
         tops = []
-        for bottom, shape in zip(bottoms, self.top_shapes, strict=True):
+        for bottom in reversed(bottoms):  # autograd goes backward from the last: as in Caffe, through the first bottom
             images = math.prod(bottom.shape[: self.channel_axis])
             maps = bottom.reshape(images, self.channels, *(bottom.shape[self.channel_axis + 1 :] or (1,)))
-            tops.append(self.apply_filters(axes, maps, weight, bias, *geometry).reshape(shape))
-        return tuple(tops)
+            tops.append(self.apply_filters(axes, maps, weight, bias, *geometry).reshape(self.top_shapes[0]))
+        return tuple(reversed(tops))
 
     def apply_filters(
         self, axes: int, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, *geometry: Shape
@@ -179,8 +180,9 @@ class Convolution(_SlidingFilter):
             maps = F.pad(maps, overhang)
         stride, pad, dilation = geometry
         work = math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * weight.numel()
-        if axes == 2 and self.group == 1 and in_caffes_order(maps, weight, work):
-            return ColumnProducts.apply(maps, weight, bias, geometry)
+        if self.is_exact(maps, small=axes == 2 and self.group == 1 and work <= SMALL_PRODUCT):
+            sliding, in_place = Filter(weight.shape[2:], *geometry), self.context.accumulate_in_place
+            return ColumnProducts.apply(maps, weight, bias, sliding, self.group, in_place)
         return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
 
     def multiply_adds(self) -> int:
@@ -216,6 +218,10 @@ class Deconvolution(Convolution):
     ) -> torch.Tensor:
         """Run torch's kernel for ``axes`` spatial axes; ``geometry`` is stride, pad, dilation."""
         stride, pad, dilation = geometry
+        if self.is_exact(maps):
+            sliding, in_place = Filter(weight.shape[2:], *geometry), self.context.accumulate_in_place
+            size = self.top_shapes[0][self.channel_axis + 1 :] or (1,)
+            return SpreadProducts.apply(maps, weight, bias, sliding, self.group, in_place, size)
         return _DECONVOLVE[axes](maps, weight, bias, stride, pad, 0, self.group, dilation)
 
     def multiply_adds(self) -> int:
@@ -252,8 +258,12 @@ class Im2col(_SlidingFilter):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the pixels under the filter."""
-        padding = chain.from_iterable((p, p) for p in reversed(self.pad))
         overhang = self.overhang(self.bottom_shapes[0])
+        if self.is_exact(data):
+            maps = F.pad(data, overhang).flatten(0, self.channel_axis - 1) if self.channel_axis else data[None]
+            sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
+            return Columns.apply(maps, sliding).reshape(self.top_shapes[0])
+        padding = chain.from_iterable((p, p) for p in reversed(self.pad))
         windows = F.pad(data, [p + n for p, n in zip(padding, overhang, strict=True)])
         first = self.channel_axis + 1
         geometry = zip(self.extent, self.stride, self.dilation, strict=True)

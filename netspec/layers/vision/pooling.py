@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch.nn import functional as F
 
+from netspec.exact.sums import Copies
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.proto.schema import TRAIN
@@ -245,7 +246,10 @@ class SPP(_PoolingBase):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the features, the coarsest level's first."""
-        pooled = [self.pool(data, windows, self.param.spp_param.pool)[0] for windows in self.levels]
+        several = len(self.levels) > 2 and self.is_exact(data)  # Caffe's SPP is a net of its own, with a Split
+        copies = Copies.apply(data, len(self.levels)) if several else [data] * len(self.levels)
+        method = self.param.spp_param.pool
+        pooled = [self.pool(copy, windows, method)[0] for copy, windows in zip(copies, self.levels, strict=True)]
         return pooled[0] if len(pooled) == 1 else torch.cat([level.flatten(1) for level in pooled], dim=1)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import lmdb
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ import torch
 
 import netspec
 from netspec.layers import layer_types
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
 from netspec.proto.text import read_net, read_solver
 from paths import GOLDEN, ROOT
 
@@ -24,6 +27,37 @@ SOLVER = "sgd_step/solver.prototxt"
 INIT = "sgd_step/init.caffemodel"
 Run = Callable[..., Any]  # the fixtures of conftest.py
 Edit = Callable[..., str]
+
+
+@pytest.mark.parametrize("exact", ["none", "small", "all", ""])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "edited.prototxt"],
+        ["test", "--model", NET, "--weights", INIT, "--iterations", 1],
+        ["time", "--model", NET, "--iterations", 1],
+        ["extract", "--model", NET, "--weights", INIT, "--blob", "feat", "--out", "f.npz", "--iterations", 1],
+        ["extract", "--model", NET, "--weights", INIT, "--blob", "feat", "--out", "f.npz", "--images", "images"],
+    ],
+    ids=lambda words: words[0] + "-images" * ("--images" in words),
+)
+def test_every_net_is_built_as_exact_as_asked_for(
+    run: Run, edited: Edit, words: list[Any], exact: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edited(SOLVER, "max_iter: 60", "max_iter: 1")
+    Path("images").mkdir()
+    cv2.imwrite("images/a.png", np.zeros((28, 28), np.uint8))
+    built = set()
+    build = Net.__init__
+
+    def watched(net: Net, plan: Any, options: BuildOptions) -> None:
+        if options.device.type != "meta":  # where shapes are read off
+            built.add(options.exact)
+        build(net, plan, options)
+
+    monkeypatch.setattr(Net, "__init__", watched)
+    assert run(*words, *(["--exact", exact] if exact else [])).status == 0
+    assert built == {exact or "small"}
 
 
 # train
@@ -273,6 +307,7 @@ def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
         (["test", "--model", "m"], "the following arguments are required: --weights"),
         (["test", "--model", "m", "--weights", "w", "--iterations", "0"], "found 0, expected a positive number"),
         (["check", "net", "--shape", "data=1x2"], "found 'data=1x2', expected BLOB=N,C,H,W, e.g. data=32,3,224,224"),
+        (["time", "--model", "m", "--exact", "some"], "argument --exact: invalid choice: 'some'"),
         (["check", "net", "--phase", "VAL"], "argument --phase: invalid choice: 'VAL'"),
         (["extract", "--model", "m", "--blob", "b", "--out", "o", "--source", "db"], "found 'db', expected LAYER=DB"),
         (

@@ -1,13 +1,13 @@
 """How the tests of single layers build one from text, and check its gradient."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 from google.protobuf import text_format
 
 from netspec.errors import Where
-from netspec.exact import functions as caffes_order
 from netspec.layers import Context, Layer, Random, layer_class
 from netspec.proto.schema import TEST, LayerParameter
 
@@ -17,10 +17,10 @@ def _seeded() -> None:
     torch.manual_seed(0)
 
 
-@pytest.fixture(params=["small", "large"])
-def small_or_large(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is small is summed up in Caffe's order, what is large by torch. Tests run twice: all small, all large."""
-    monkeypatch.setattr(caffes_order, "MOST_WORK", 10**9 if request.param == "small" else 0)
+@pytest.fixture(params=["none", "all"])
+def exact(request: pytest.FixtureRequest) -> str:
+    """Whose sums are Caffe's to the last bit. The tests of a layer run twice, since it sums up in two ways."""
+    return request.param
 
 
 def _at(*path: str | int) -> Where:
@@ -29,20 +29,24 @@ def _at(*path: str | int) -> Where:
 
 
 @pytest.fixture
-def build() -> Callable[..., Layer]:
-    """``build(text, *bottom_shapes, tops=1, phase=TEST, seed=0)``: a layer from the text of a LayerParameter.
+def build(exact: str) -> Callable[..., Layer]:
+    """``build(text, *bottom_shapes, tops=1, phase=TEST, seed=0, ...)``: a layer from the text of a LayerParameter.
 
-    The text holds no bottoms and tops; their names are made up, one bottom for each shape.
+    The text holds no bottoms and tops; their names are made up, one bottom for each shape. Other keywords are fields of
+    the layer's Context.
     """
 
-    def build_layer(text: str, *shapes: tuple[int, ...], tops: int = 1, phase: int = TEST, seed: int = 0) -> Layer:
+    def build_layer(
+        text: str, *shapes: tuple[int, ...], tops: int = 1, phase: int = TEST, seed: int = 0, **context: Any
+    ) -> Layer:
         param = LayerParameter()
         text_format.Parse(text, param)
         param.bottom.extend(f"bottom{i}" for i in range(len(shapes)))
         param.top.extend(f"top{i}" for i in range(tops))
         cls = layer_class(param.type)
         assert cls is not None, param.type
-        return cls(param, shapes, Context(phase=phase, random=Random(seed), at=_at))
+        options = {"phase": phase, "random": Random(seed), "at": _at, "exact": exact, **context}
+        return cls(param, shapes, Context(**options))
 
     return build_layer
 

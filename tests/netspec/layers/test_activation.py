@@ -194,5 +194,5 @@ def test_gradient_is_made_of_what_memory_holds(build, text: str, expected) -> No
     diff = torch.tensor([1.0, 2.0, -3.0, 0.5, 4.0], dtype=torch.double)
     layer = build(text, (5,))
     assert layer.gradient_reads
-    found = layer.gradient_in_place(bottom, top, diff).numpy()
+    found = layer.caffes_gradient(bottom, top, diff).numpy()
     np.testing.assert_allclose(found, diff.numpy() * expected(bottom.numpy(), top.numpy()), rtol=1e-6)

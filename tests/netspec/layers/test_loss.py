@@ -14,9 +14,6 @@ FLT_MIN = np.finfo(np.float32).tiny
 FULL, VALID, BATCH_SIZE, NONE = "FULL", "VALID", "BATCH_SIZE", "NONE"
 
 
-pytestmark = pytest.mark.usefixtures("small_or_large")
-
-
 def softmax(x: np.ndarray, axis: int = 1) -> np.ndarray:
     e = np.exp(x - x.max(axis, keepdims=True))
     return e / e.sum(axis, keepdims=True)

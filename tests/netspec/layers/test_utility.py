@@ -303,7 +303,7 @@ def test_softmax_along_an_axis(build, gradcheck, text: str, axis: int) -> None:
 def test_softmax_gradient_is_made_of_what_memory_holds(build) -> None:
     layer = build('type: "Softmax"', (1, 3))
     top, diff = torch.tensor([[1.0, 2.0, -1.0]]), torch.tensor([[3.0, 0.5, 1.0]])
-    assert layer.gradient_in_place(torch.zeros(1, 3), top, diff).tolist() == [[0, -5, 2]]
+    assert layer.caffes_gradient(torch.zeros(1, 3), top, diff).tolist() == [[0, -5, 2]]
 
 
 # Gradients and faults

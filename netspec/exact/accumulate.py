@@ -1,0 +1,53 @@
+"""Where the gradients of parameters are summed up.
+
+Autograd computes the gradient of each use of a parameter by itself, and then adds up those of all uses and passes.
+Caffe adds each product to the parameter's ``diff`` as it goes, image by image, layer after layer, pass after pass. A
+net built with ``accumulate_in_place`` does as Caffe does: its layers add to ``grad`` themselves and hand nothing to
+autograd. The solver builds its nets so. Hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP see the
+gradients of nets built without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+
+class ParameterSums(torch.autograd.Function):
+    """Base of the functions that sum up gradients of parameters themselves.
+
+    Their arguments begin with one bottom, then the parameters, each a tensor or None.
+    """
+
+    @staticmethod
+    def keep(
+        ctx: Any, bottom: torch.Tensor, parameters: Sequence[torch.Tensor | None], in_place: bool, *others: torch.Tensor
+    ) -> None:
+        """Save the bottom, the parameters and others for backward, and whether it is to add ``in_place``."""
+        ctx.save_for_backward(bottom, *parameters, *others)
+        ctx.adds = [in_place and isinstance(p, torch.nn.Parameter) and p.is_contiguous() for p in parameters]
+
+    @staticmethod
+    def sums(ctx: Any) -> list[torch.Tensor | None]:
+        """Return where to add the gradient of each parameter; None where it is not asked for."""
+        first, last = 1, 1 + len(ctx.adds)
+        found: list[torch.Tensor | None] = []
+        for parameter, asked, adds in zip(
+            ctx.saved_tensors[first:last], ctx.needs_input_grad[first:last], ctx.adds, strict=True
+        ):
+            if not asked:
+                found.append(None)
+            elif not adds:
+                found.append(torch.zeros_like(parameter, memory_format=torch.contiguous_format))
+            else:
+                if parameter.grad is None:
+                    parameter.grad = torch.zeros_like(parameter)
+                found.append(parameter.grad)
+        return found
+
+    @staticmethod
+    def for_autograd(ctx: Any, sums: Sequence[torch.Tensor | None]) -> list[torch.Tensor | None]:
+        """Return what autograd is to add: nothing where it was added already."""
+        return [None if added else total for added, total in zip(ctx.adds, sums, strict=True)]

@@ -1,0 +1,94 @@
+"""What losses compute for each item, with Caffe's gradients. Their sums are in netspec/exact/sums.py."""
+
+# pyright: reportPrivateImportUsage=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from netspec.exact import libm
+from netspec.exact.blas import add_sums, array, dots, one_thread, sum_in_order
+
+
+@one_thread()
+def softmax(scores: torch.Tensor) -> torch.Tensor:
+    """Return the softmax along axis 1 of scores (outer, classes, inner) (src/caffe/layers/softmax_layer.cpp)."""
+    p = libm.exp(scores - scores.amax(1, keepdim=True))
+    sums = p.new_zeros(len(p), p.shape[2])
+    for item, total in zip(array(p), array(sums), strict=True):
+        add_sums(item, total, axis=0)
+    return p.div_(sums.unsqueeze(1))
+
+
+@one_thread()
+def softmax_gradient(p: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+    """Return the gradient of the scores from that of their softmax p, both (outer, classes, inner)."""
+    return (diff - dots(diff, p).unsqueeze(1)) * p
+
+
+class Logarithm(torch.autograd.Function):
+    """Return natural logarithms."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor) -> torch.Tensor:
+        """Return the logarithms."""
+        ctx.save_for_backward(values)
+        return libm.log(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
+        """Return the gradient divided by the values."""
+        (values,) = ctx.saved_tensors
+        return diff / values
+
+
+class SigmoidCrossEntropy(torch.autograd.Function):
+    """Return the cross entropy of sigmoid(x) and the target, of each number.
+
+    Caffe: src/caffe/layers/sigmoid_cross_entropy_loss_layer.cpp
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the losses."""
+        ctx.save_for_backward(x, target)
+        positive = (x >= 0).to(x.dtype)
+        return libm.log(1 + libm.exp(x - 2 * x * positive)) - x * (target - positive)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Return sigmoid(x) - target times the losses' gradient."""
+        x, target = ctx.saved_tensors
+        return (libm.sigmoid(x) - target) * diff, None
+
+
+class Infogain(torch.autograd.Function):
+    """Return -gain log(p) of each class, p being the softmax of the scores, and p.
+
+    scores   (outer, classes, inner)
+    gain     of each class, for the label's: (outer, inner, classes)
+    returns  (outer, inner, classes) and (outer, classes, inner)
+
+    Caffe: src/caffe/layers/infogain_loss_layer.cpp
+    """
+
+    @staticmethod
+    def forward(ctx: Any, scores: torch.Tensor, gain: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the losses, their logarithms of no less than ``least``, and p."""
+        p = softmax(scores)
+        ctx.save_for_backward(p, gain)
+        ctx.mark_non_differentiable(p)
+        return -gain * libm.log(p.clamp(min=least).movedim(1, 2)), p
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
+        """Return the scores' gradient, for losses that go into one sum; it takes no notice of ``least``."""
+        p, gain = ctx.saved_tensors
+        of_scores = p.movedim(1, 2) * sum_in_order(gain, 2).unsqueeze(2) - gain
+        return (of_scores * diff).movedim(2, 1), None, None

@@ -1,0 +1,98 @@
+"""Local response normalization.
+
+Caffe: src/caffe/layers/lrn_layer.cpp
+"""
+
+# pyright: reportPrivateImportUsage=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from netspec.exact import libm
+from netspec.exact.pointwise import Pointwise
+from netspec.exact.sums import Product
+
+
+def within_channel(maps: torch.Tensor, size: int, alpha: float, beta: float) -> torch.Tensor:
+    """Divide each value by a power of the squares around it in its map: (1 + alpha * their mean) ** beta.
+
+    To Caffe this is a net of its own: Power, average Pooling, Power and a product.
+    """
+    squares = Pointwise.apply(maps, lambda x: libm.power(x, 2), lambda x, _, diff: diff * (2 * x))
+    means = F.avg_pool2d(squares, size, stride=1, padding=size // 2)
+
+    def roots(x: torch.Tensor) -> torch.Tensor:
+        return libm.power(alpha * x + 1, -beta)
+
+    def gradient(x: torch.Tensor, root: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        return diff * (root / (alpha * x + 1) * (-beta * alpha))
+
+    return Product.apply(True, maps, Pointwise.apply(means, roots, gradient))
+
+
+class AcrossChannels(torch.autograd.Function):
+    """Divide each value by a power of the squares in the channels around it: (k + alpha / size * their sum) ** beta.
+
+    maps     (N, C, H, W)
+    returns  (N, C, H, W)
+
+    The sums run from channel to channel; each step of them rounds once, as BLAS' axpy does.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, maps: torch.Tensor, size: int, alpha: float, beta: float, k: float) -> torch.Tensor:
+        """Return the normalized values."""
+        base = _forward_sums(maps * maps, size, alpha / size, k)
+        ctx.save_for_backward(maps, base)
+        ctx.settings = size, alpha, beta
+        return libm.power(base, -beta) * maps
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
+        """Return the gradient of the maps."""
+        maps, base = ctx.saved_tensors
+        size, alpha, beta = ctx.settings
+        roots = libm.power(base, -beta)
+        maps_diff = diff * roots
+        sums = _backward_sums(diff * (roots * maps) / base, size)
+        return torch.add(maps_diff, maps * sums, alpha=-2 * alpha * beta / size), None, None, None, None
+
+
+def _framed(maps: torch.Tensor, size: int) -> torch.Tensor:
+    """Return the maps with channels of zeros before and after them: a window of ``size`` channels around each."""
+    return F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
+
+
+def _forward_sums(squares: torch.Tensor, size: int, factor: float, start: float) -> torch.Tensor:
+    """Return start + factor * the sums of each window of channels: the first in full, then one added, one taken off."""
+    framed = _framed(squares, size)
+    sums = torch.empty_like(squares)
+    running = torch.full_like(squares[:, 0], start)
+    for channel in range(size):
+        running = torch.add(running, framed[:, channel], alpha=factor)
+    sums[:, 0] = running
+    for channel in range(1, squares.shape[1]):
+        running = torch.add(running, framed[:, channel + size - 1], alpha=factor)
+        running = torch.add(running, framed[:, channel - 1], alpha=-factor)
+        sums[:, channel] = running
+    return sums
+
+
+def _backward_sums(ratios: torch.Tensor, size: int) -> torch.Tensor:
+    """Return the sums of each window of channels: always one added, and taken off again once it has passed."""
+    framed = _framed(ratios, size)
+    sums = torch.empty_like(ratios)
+    running = torch.zeros_like(ratios[:, 0])
+    for channel in range(size - 1):
+        running = running + framed[:, channel]
+    for channel in range(ratios.shape[1]):
+        running = running + framed[:, channel + size - 1]
+        sums[:, channel] = running
+        running = running - framed[:, channel]
+    return sums

@@ -1,0 +1,154 @@
+"""Sums over blobs and over their axes, each with its gradient: Split, Eltwise, Reduction, Tile, and the losses'."""
+
+# pyright: reportPrivateImportUsage=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from netspec.exact.blas import dots, one_thread, sum_in_order, sum_of_magnitudes
+
+
+class SumInOrder(torch.autograd.Function):
+    """Sum up along an axis, one value after the other (a plain loop of Caffe's)."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, axis: int) -> torch.Tensor:
+        """Return the sums, without that axis."""
+        ctx.shape, ctx.axis = values.shape, axis
+        return sum_in_order(values, axis)
+
+    @staticmethod
+    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Return each sum's gradient for each of its terms."""
+        return diff.unsqueeze(ctx.axis).expand(ctx.shape), None
+
+
+class RowSums(torch.autograd.Function):
+    """Sum up each row times a factor, as its product with a vector of factors (caffe_cpu_dot): (M, K) to (M,)."""
+
+    @staticmethod
+    @one_thread()
+    def forward(ctx: Any, rows: torch.Tensor, factor: float) -> torch.Tensor:
+        """Return the sums."""
+        ctx.shape, ctx.factor = rows.shape, factor
+        return dots(rows.unsqueeze(2), torch.full_like(rows, factor).unsqueeze(2)).squeeze(1)
+
+    @staticmethod
+    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Return each sum's gradient, times the factor, for each of its terms."""
+        return (diff * ctx.factor).unsqueeze(1).expand(ctx.shape), None
+
+
+class RowSquares(torch.autograd.Function):
+    """Sum up the squares of each row (caffe_cpu_dot of it with itself): (M, K) to (M,)."""
+
+    @staticmethod
+    @one_thread()
+    def forward(ctx: Any, rows: torch.Tensor) -> torch.Tensor:
+        """Return the sums."""
+        ctx.save_for_backward(rows)
+        return dots(rows.unsqueeze(2), rows.unsqueeze(2)).squeeze(1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
+        """Return twice the values times their sum's gradient."""
+        (rows,) = ctx.saved_tensors
+        return rows * (2 * diff).unsqueeze(1)
+
+
+class RowMagnitudes(torch.autograd.Function):
+    """Sum up the absolute values of each row (caffe_cpu_asum): (M, K) to (M,)."""
+
+    @staticmethod
+    @one_thread()
+    def forward(ctx: Any, rows: torch.Tensor) -> torch.Tensor:
+        """Return the sums."""
+        ctx.save_for_backward(rows)
+        return torch.stack([sum_of_magnitudes(row) for row in rows])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
+        """Return the signs of the values times their sum's gradient."""
+        (rows,) = ctx.saved_tensors
+        return rows.sign() * diff.unsqueeze(1)
+
+
+class Copies(torch.autograd.Function):
+    """Return a tensor several times; add up the gradients of these, the first one's first.
+
+    Caffe: src/caffe/layers/split_layer.cpp
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, count: int) -> tuple[torch.Tensor, ...]:
+        """Return the tensors; they share their memory."""
+        ctx.set_materialize_grads(False)
+        return tuple(values.view_as(values) for _ in range(count))
+
+    @staticmethod
+    def backward(ctx: Any, *diffs: torch.Tensor | None) -> tuple[torch.Tensor | None, None]:
+        """Return the sum of the gradients that there are."""
+        found = [diff for diff in diffs if diff is not None]
+        return sum(found[1:], found[0]) if found else None, None
+
+
+class Tiles(torch.autograd.Function):
+    """Repeat a tensor along a new axis: (outer, inner) to (outer, count, inner).
+
+    Caffe: src/caffe/layers/tile_layer.cpp
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, count: int) -> torch.Tensor:
+        """Return the copies."""
+        return values.unsqueeze(1).repeat(1, count, 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Return the sum of the copies' gradients, the first one's first."""
+        return sum_in_order(diff, 1), None
+
+
+class Product(torch.autograd.Function):
+    """Multiply tensors element by element.
+
+    The gradient of one is ``stable``, the product of the others times the top's, or the top divided by it, times that.
+
+    Caffe: src/caffe/layers/eltwise_layer.cpp
+    """
+
+    @staticmethod
+    def forward(ctx: Any, stable: bool, *bottoms: torch.Tensor) -> torch.Tensor:
+        """Return the product."""
+        ctx.stable = stable
+        top = _product(bottoms)
+        ctx.save_for_backward(top, *bottoms)
+        return top
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Return the gradients of the bottoms."""
+        top, *bottoms = ctx.saved_tensors
+        found: list[torch.Tensor | None] = []
+        for i, (bottom, asked) in enumerate(zip(bottoms, ctx.needs_input_grad[1:], strict=True)):
+            if not asked:
+                found.append(None)
+                continue
+            others = _product(bottoms[:i] + bottoms[i + 1 :])
+            found.append((others if ctx.stable else torch.where(bottom == 0, others, top / bottom)) * diff)
+        return None, *found
+
+
+def _product(factors: Any) -> torch.Tensor:
+    first, *others = factors
+    for other in others:
+        first = first * other
+    return first

@@ -1,0 +1,126 @@
+"""Golden cases, which real Caffe computed: how they are loaded, how exactly they are repeated, how far off others are.
+
+A folder may hold ``exact.txt``: the least build option ``exact`` with which a net repeats the case to the last bit, on
+a CPU of the kind that Caffe ran on. Without that file it is "all".
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import netspec
+from netspec.exact import CHOICES
+from netspec.graph.filter import with_state
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.proto.schema import PHASES
+from netspec.proto.text import parse_net
+
+Arrays = Mapping[str, np.ndarray]
+SAMPLED, EVERY = 40_000, 97  # of arrays of so many values, the files of the examples have every 97th
+
+
+def promised(case: Path) -> list[str]:
+    """Return the values of ``exact`` with which a case is repeated to the last bit."""
+    file = case / "exact.txt"
+    least = file.read_text().strip() if file.exists() else "all"
+    return list(CHOICES[CHOICES.index(least) :])
+
+
+def set_parameters(net: Net, arrays: Arrays, prefix: str = "") -> None:
+    """Give a net the parameters that ``arrays`` has, named ``PREFIXlayer/index``."""
+    for key in arrays:
+        if key.startswith(prefix):
+            layer, index = key[len(prefix) :].split("/")
+            net.params[layer][int(index)].data.copy_(torch.from_numpy(arrays[key]))
+
+
+def parameters(net: Net, arrays: Arrays, prefix: str) -> dict[str, np.ndarray]:
+    """Return the parameters of a net that ``arrays`` has, under the same names, sampled as the examples' files are."""
+    found = {}
+    for key in arrays:
+        if key.startswith(prefix):
+            layer, index = key[len(prefix) :].split("/")
+            values = net.params[layer][int(index)].detach().cpu().numpy()
+            found[key] = values if values.size < SAMPLED else values.reshape(-1)[::EVERY]
+    return found
+
+
+def assert_same_layers(found: Arrays, expected: Arrays, tolerance: float) -> None:
+    """Compare parameters named ``.../layer/index``: each layer's to a share of its norm.
+
+    A blob that Caffe left at zero is not compared: what cancels to zero there leaves rounding on other CPUs, and the
+    solvers that divide a gradient by its size make a step of it.
+    """
+    for layer in {key.rpartition("/")[0] for key in found}:
+        names = [key for key in found if key.rpartition("/")[0] == layer and expected[key].any()]
+        if names:
+            theirs = np.concatenate([expected[key].reshape(-1) for key in names])
+            ours = np.concatenate([found[key].reshape(-1) for key in names])
+            distance = np.linalg.norm(ours - theirs) / np.linalg.norm(theirs)
+            assert distance <= tolerance, f"{layer}: off by {distance:.1e} of its norm"
+
+
+class LayerCase:
+    """A net of one layer or a few: inputs, parameters and top gradients, and what Caffe made of them.
+
+    Keys of ``golden``: in/BLOB, param_init/LAYER/INDEX, topdiff/BLOB, and the results out/BLOB, indiff/BLOB,
+    paramdiff/LAYER/INDEX, param_after/LAYER/INDEX.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.golden = dict(np.load(folder / "golden.npz"))
+        self.meta = json.loads(str(self.golden.pop("meta")))
+
+    def compute(self, exact: str = "small", device: str = "cpu") -> dict[str, np.ndarray]:
+        """Return this project's results, under Caffe's keys."""
+        net, source = parse_net(self.folder / "net.prototxt")
+        options = BuildOptions(torch.device(device), exact=exact, accumulate_in_place=True)
+        built = build_net(with_state(net, PHASES[self.meta["phase"]]), source, options)
+        set_parameters(built, self.golden, "param_init/")
+        inputs = {
+            name: torch.from_numpy(self.golden[f"in/{name}"]).to(device).requires_grad_(bool(self.meta["grad"]))
+            for name in built.inputs
+        }
+        for _ in range(self.meta["warmup"]):
+            built(**inputs)
+        outputs = built(**inputs)
+        found = {f"out/{name}": blob.detach().cpu().numpy() for name, blob in outputs.items()}
+        if self.meta["grad"]:
+            found.update(self._gradients(built, inputs, outputs))
+        return {**found, **parameters(built, self.golden, "param_after/")}
+
+    def _gradients(
+        self, net: Net, inputs: Mapping[str, torch.Tensor], outputs: Mapping[str, torch.Tensor]
+    ) -> dict[str, np.ndarray]:
+        """Go backward; return the gradients that Caffe computed too.
+
+        Without force_backward, it leaves those of what is not under a loss at zero. Torch's are real.
+        """
+        reached = {k: blob for k, blob in outputs.items() if blob.requires_grad and f"topdiff/{k}" in self.golden}
+        diffs = [
+            torch.from_numpy(self.golden[f"topdiff/{k}"]).reshape(b.shape).to(b.device) for k, b in reached.items()
+        ]
+        torch.autograd.backward(list(reached.values()), diffs)
+        found = {f"indiff/{name}": _gradient(blob) for name, blob in inputs.items()}
+        ran_backward = [node.name for node, ran in zip(net.plan.nodes, net.backward_plan.layers, strict=True) if ran]
+        for layer in set(net.params) & set(ran_backward):
+            found.update({f"paramdiff/{layer}/{i}": _gradient(blob) for i, blob in enumerate(net.params[layer])})
+        return {key: value for key, value in found.items() if key in self.golden}
+
+
+def _gradient(tensor: torch.Tensor) -> np.ndarray:
+    return np.zeros(tuple(tensor.shape), np.float32) if tensor.grad is None else tensor.grad.cpu().numpy()
+
+
+def train(solver: netspec.Solver, iterations: int) -> list[float]:
+    """Run some iterations of a solver; return the loss of each."""
+    losses: list[float] = []
+    solver.on_iteration = lambda: losses.append(solver.loss)
+    solver.step(iterations)
+    return losses

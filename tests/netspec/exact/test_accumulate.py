@@ -1,0 +1,82 @@
+"""Gradients go where the net was built to have them: to autograd, or product by product into ``grad``."""
+
+import numpy as np
+import pytest
+import torch
+
+SIAMESE = """
+    layer { name: "data" type: "Input" top: "a" top: "b"
+            input_param { shape { dim: 2 dim: 1 dim: 4 dim: 4 } shape { dim: 2 dim: 1 dim: 4 dim: 4 } } }
+    layer { name: "conv" type: "Convolution" bottom: "a" top: "conv" param { name: "w" } param { name: "v" }
+            convolution_param { num_output: 2 kernel_size: 3 weight_filler { type: "gaussian" } } }
+    layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip" param { name: "x" } param { name: "y" }
+            inner_product_param { num_output: 3 weight_filler { type: "gaussian" } } }
+    layer { name: "conv_p" type: "Convolution" bottom: "b" top: "conv_p" param { name: "w" } param { name: "v" }
+            convolution_param { num_output: 2 kernel_size: 3 } }
+    layer { name: "ip_p" type: "InnerProduct" bottom: "conv_p" top: "ip_p" param { name: "x" } param { name: "y" }
+            inner_product_param { num_output: 3 } }
+    layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "ip_p" top: "loss" }
+"""
+
+
+def images() -> dict[str, torch.Tensor]:
+    return {name: torch.randn(2, 1, 4, 4) for name in "ab"}
+
+
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+@pytest.mark.parametrize("in_place", [False, True])
+def test_passes_add_up_in_grad(net_of, exact: str, in_place: bool) -> None:
+    inputs = images()
+    plain = net_of(SIAMESE, phase=0, exact=exact)
+    expected = torch.autograd.grad(plain.forward_loss(**inputs)[0], [item.parameter for item in plain.learnable])
+    net = net_of(SIAMESE, phase=0, exact=exact, accumulate_in_place=in_place)
+    for passes in (1, 2):
+        net.forward_loss(**inputs)[0].backward()
+        for item, one in zip(net.learnable, expected, strict=True):
+            torch.testing.assert_close(item.parameter.grad, passes * one)
+
+
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+def test_a_net_shows_its_gradients_to_hooks_and_to_autograd(net_of, exact: str) -> None:
+    net, inputs = net_of(SIAMESE, phase=0, exact=exact), images()
+    parameters = [item.parameter for item in net.learnable]
+    gradients = torch.autograd.grad(net.forward_loss(**inputs)[0], parameters)
+    assert all(parameter.grad is None for parameter in parameters)
+    seen: list[torch.Tensor] = []
+    for parameter in parameters:
+        parameter.register_hook(lambda gradient: seen.append(gradient.clone()))
+    net.forward_loss(**inputs)[0].backward()
+    total = sum(float(gradient.sum()) for gradient in gradients)
+    np.testing.assert_allclose(sum(float(gradient.sum()) for gradient in seen), total, rtol=1e-4)
+
+
+def test_a_net_trains_side_by_side_as_torchs_wrappers_have_it(net_of, tmp_path) -> None:
+    net, inputs = net_of(SIAMESE, phase=0), images()
+    store = torch.distributed.FileStore(str(tmp_path / "store"), 1)
+    torch.distributed.init_process_group("gloo", store=store, rank=0, world_size=1)
+    try:
+        wrapped = torch.nn.parallel.DistributedDataParallel(net)
+        wrapped(**inputs)["loss"].backward()
+    finally:
+        torch.distributed.destroy_process_group()
+    expected = net_of(SIAMESE, phase=0)
+    expected.forward_loss(**inputs)[0].backward()
+    for mine, theirs in zip(net.learnable, expected.learnable, strict=True):
+        torch.testing.assert_close(mine.parameter.grad, theirs.parameter.grad)
+
+
+def test_in_place_leaves_nothing_for_autograd(net_of) -> None:
+    """What one asks for when one builds so."""
+    net = net_of(SIAMESE, phase=0, accumulate_in_place=True)
+    parameters = [item.parameter for item in net.learnable]
+    gradients = torch.autograd.grad(net.forward_loss(**images())[0], parameters, allow_unused=True)
+    assert gradients == (None,) * 4
+    assert all(parameter.grad is not None for parameter in parameters)
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_frozen_parameters_get_no_gradient(net_of, in_place: bool) -> None:
+    text = SIAMESE.replace('"w" }', '"w" lr_mult: 0 }').replace('"y" }', '"y" lr_mult: 0 }')
+    net = net_of(text, phase=0, accumulate_in_place=in_place)
+    net.forward_loss(**images())[0].backward()
+    assert [item.parameter.grad is None for item in net.learnable] == [True, False, False, True]
