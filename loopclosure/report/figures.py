@@ -1,14 +1,16 @@
-"""The pictures of the report: matrices, precision-recall curves, maps, matches; matplotlib figures, nothing written."""
+"""The pictures of the report: matrices, precision-recall curves, maps, matches; matplotlib figures, nothing written.
+
+They are made without pyplot, which would choose a backend for the whole program. Names of methods and data sets are
+drawn as they are: ``parse_math=False``, since a dollar sign in them begins no formula.
+"""
 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterable
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -16,6 +18,7 @@ from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.transforms import ScaledTranslation
 
 from loopclosure.evaluate import Evaluation, Outcome
 from loopclosure.places.truth import Truth
@@ -24,6 +27,9 @@ from loopclosure.precision_recall import BEST_MATCH, PrecisionRecall
 # Told apart by colour-blind readers too (Okabe and Ito).
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 FOUND, FALSE, MISSED = "#1a9641", "#d7191c", "#9e9e9e"
+LINES = ("-", "--", ":", "-.")  # a second round of the colours is dashed, and so on
+LABEL_WIDTH = 60  # letters of a legend's line that fit below a panel
+LABELS_HEIGHT = 0.5  # inches for the tick labels and the label of the horizontal axis
 NOT_JUDGED = "#ececec"
 SHOWN_CELLS = (
     700  # a matrix with more rows or columns is drawn by the greatest of each block, or thin loops would vanish
@@ -46,7 +52,7 @@ def matrices(evaluation: Evaluation) -> Figure:
     """Draw the truth and beside it the scores of every method (the paper's figures 5 and 6)."""
     truth = evaluation.data.truth
     panels = 1 + len(evaluation.outcomes)
-    with plt.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, axes = _grid(panels, 1.0 if truth.hard.shape[0] == truth.hard.shape[1] else 0.9)
         shown = np.where(truth.hard, 2.0, np.where(truth.soft, 1.0, 0.0))
         _draw_matrix(
@@ -57,8 +63,8 @@ def matrices(evaluation: Evaluation) -> Figure:
             scores = np.where(truth.judged & np.isfinite(outcome.scores), outcome.scores, np.nan)
             some = scores[np.isfinite(scores)]
             low, high = np.percentile(some, [1, 99.5]) if len(some) else (0.0, 1.0)
-            _draw_matrix(axis, scores, plt.get_cmap("viridis"), float(low), float(high))
-            axis.set_title(outcome.name)
+            _draw_matrix(axis, scores, matplotlib.colormaps["viridis"], float(low), float(high))
+            axis.set_title(outcome.name, parse_math=False)
         references = "earlier frame" if evaluation.data.reference_images is None else "reference"
         for axis in axes:
             axis.set_xlabel(references)
@@ -69,8 +75,9 @@ def matrices(evaluation: Evaluation) -> Figure:
 
 def curves(evaluation: Evaluation) -> Figure:
     """Draw the precision-recall curves of all methods, one panel for each convention."""
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+        axes = figure.subplots(1, 2)
         for axis, kind in zip(axes, ("pairs", "best"), strict=True):
             convention = ""
             for number, outcome in enumerate(evaluation.outcomes):
@@ -86,18 +93,18 @@ def curves(evaluation: Evaluation) -> Figure:
             axis.set_xlim(-0.01, 1.01)
             axis.set_ylim(0, 1.03)
             axis.grid(color="#e6e6e6", linewidth=0.5)
-            axis.legend(title="average precision", fontsize=8, title_fontsize=8, loc="best", alignment="left")
+        _legends_below(figure, axes)
         _state_truth(figure, evaluation)
         return figure
 
 
 def matches(evaluation: Evaluation) -> Figure:
     """Draw for each method, frame against frame, the loops found, false and missed over the truth."""
-    with plt.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(evaluation.outcomes), 1.0)
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_matches(axis, outcome, evaluation.data.truth)
-            axis.set_title(outcome.name)
+            axis.set_title(outcome.name, parse_math=False)
         _label_left(axes, "query")
         _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
@@ -113,11 +120,11 @@ def maps(evaluation: Evaluation) -> Figure:
     """Draw for each method the loops found, false and missed as chords of the trajectory."""
     positions = evaluation.data.positions
     assert positions is not None
-    with plt.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(evaluation.outcomes), 1.0)
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_map(axis, outcome, evaluation.data.truth, positions)
-            axis.set_title(outcome.name)
+            axis.set_title(outcome.name, parse_math=False)
         _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
         return figure
@@ -171,13 +178,35 @@ def _greatest_of_blocks(values: np.ndarray, step: int) -> np.ndarray:
 def _draw_curve(axis: Axes, curve: PrecisionRecall, name: str, number: int) -> None:
     """Draw the steps whose area is the average precision, and a dot where precision leaves 1."""
     colour = COLOURS[number % len(COLOURS)]
-    line = "-" if number < len(COLOURS) else "--"
+    line = LINES[number // len(COLOURS) % len(LINES)]
     recall, precision = np.append(0.0, curve.recall), np.append(curve.precision[:1], curve.precision)
     recall = recall[: len(precision)]  # a method that says nothing has no point
     area = f"{curve.average_precision:.3f}"
-    axis.plot(recall, precision, line, color=colour, linewidth=1.3, label=f"{area}  {name}", drawstyle="steps-pre")
+    label = textwrap.fill(f"{area}  {name}", LABEL_WIDTH, subsequent_indent=" " * 11)
+    axis.plot(recall, precision, line, color=colour, linewidth=1.3, label=label, drawstyle="steps-pre")
     if curve.recall_at_full_precision > 0:
         axis.plot([curve.recall_at_full_precision], [1.0], "o", color=colour, markersize=4, clip_on=False)
+
+
+def _legends_below(figure: Figure, axes: Iterable[Axes]) -> None:
+    """Put the legend of each panel below it, and make the figure higher by what the highest legend takes."""
+    heights = []
+    for axis in axes:
+        below = axis.transAxes + ScaledTranslation(0, -LABELS_HEIGHT, figure.dpi_scale_trans)
+        legend = axis.legend(
+            title="average precision",
+            fontsize=8,
+            title_fontsize=8,
+            loc="upper left",
+            bbox_to_anchor=(0, 0),
+            bbox_transform=below,
+            borderaxespad=0,
+            alignment="left",
+        )
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+        heights.append(legend.get_window_extent().height / figure.dpi)
+    figure.set_figheight(figure.get_figheight() + max(heights))
 
 
 def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray) -> None:
@@ -229,7 +258,7 @@ def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -
     """Print below the figure what it is judged by, so that it stands by itself."""
     words = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.sentence}"
     width = int(figure.get_figwidth() * 22)  # letters of this size that fit into the width
-    figure.supxlabel(textwrap.fill(words, width), fontsize=6.5, color="#777777")
+    figure.supxlabel(textwrap.fill(words, width), fontsize=6.5, color="#777777", parse_math=False)
 
 
 def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
@@ -239,8 +268,8 @@ def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
     width = 2.75 if columns > 2 else 3.4
     size = (width * columns, width * ratio * rows + 0.35)
     layout = ConstrainedLayoutEngine(h_pad=0.07)  # inches: a title stands clear of the panel above
-    figure, axes = plt.subplots(rows, columns, figsize=size, layout=layout, squeeze=False)
-    flat = list(axes.flat)
+    figure = Figure(figsize=size, layout=layout)
+    flat = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axis in flat[panels:]:
         axis.remove()
     return figure, flat[:panels]

@@ -12,7 +12,6 @@ from html import escape
 from pathlib import Path
 
 import cv2
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -252,7 +251,6 @@ def _save(figure: Figure, path: Path) -> str:
     """Write a figure as PNG and return the same bytes in base64."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
-    plt.close(figure)
     path.write_bytes(stream.getvalue())
     return base64.b64encode(stream.getvalue()).decode("ascii")
 

@@ -13,11 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from loopclosure.errors import InputError
 from loopclosure.report.pair_metrics import PairMetrics, judge_pairs, pair_distances
@@ -146,7 +143,8 @@ def write_report(runs: Sequence[Run], folder: Path) -> list[Path]:
 
 
 def _draw_losses(runs: Sequence[Run], path: Path) -> None:
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
     for run in runs:
         if run.losses:
             line = axes.plot(*zip(*run.losses, strict=True), marker="o", markersize=3, label=run.name)[0]
@@ -162,11 +160,11 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
     axes.grid(alpha=0.3, which="both")
     axes.legend()
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def _draw_distances(runs: Sequence[Run], path: Path) -> None:
-    figure, grid = plt.subplots(1, len(runs), figsize=(3.6 * len(runs) + 0.6, 3.4), layout="constrained", squeeze=False)
+    figure = Figure(figsize=(3.6 * len(runs) + 0.6, 3.4), layout="constrained")
+    grid = figure.subplots(1, len(runs), squeeze=False)
     for axes, run in zip(grid[0], runs, strict=True):
         edges = np.histogram_bin_edges(run.distances, 40)
         axes.hist(run.distances[run.labels], edges, alpha=0.65, color="tab:green", label="same place")
@@ -177,4 +175,3 @@ def _draw_distances(runs: Sequence[Run], path: Path) -> None:
     grid[0][0].set_ylabel("validation pairs")
     grid[0][0].legend(fontsize=8)
     figure.savefig(path, dpi=120)
-    plt.close(figure)
