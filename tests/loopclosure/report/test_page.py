@@ -3,6 +3,8 @@
 import csv
 import json
 import re
+from dataclasses import replace
+from html.parser import HTMLParser
 
 import cv2
 import numpy as np
@@ -22,11 +24,27 @@ class Says:
 
     name = "says"
 
-    def __init__(self, scores):
-        self.scores = scores
+    def __init__(self, scores, result=None):
+        self.result = result or MethodResult(scores, {"vocabulary": 3.0, "looking": 0.4}, ["a <note>"], ("vocabulary",))
 
     def score(self, query_images, reference_images, train_images, progress):
-        return MethodResult(self.scores, {"vocabulary": 3.0, "looking": 0.4}, ["a <note>"], ("vocabulary",))
+        return self.result
+
+
+class Tags(HTMLParser):
+    """What a browser would find in a page: tags, attributes, the schemes of sources, and texts."""
+
+    def __init__(self):
+        super().__init__()
+        self.names, self.attributes, self.sources, self.texts = set(), set(), set(), []
+
+    def handle_starttag(self, tag, attributes):
+        self.names.add(tag)
+        self.attributes |= {name for name, _ in attributes}
+        self.sources |= {value.partition(":")[0] for name, value in attributes if name == "src"}
+
+    def handle_data(self, data):
+        self.texts.append(data)
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +79,22 @@ def test_the_page_stands_alone_and_says_what_it_judges_by(evaluation, folder):
         assert words in page
     assert "<noise>" not in page
     assert "loopclosure evaluate --x" in page
+
+
+def test_what_is_named_maliciously_is_text(two_laps, tmp_path):
+    evil = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7 * 7 }}{% raw %}$\\frac{"
+    data = load_tum(two_laps)
+    data = replace(data, name=evil, notes=[evil], truth=replace(data.truth, sentence=evil))
+    says = MethodResult(np.zeros((40, 40)), {evil: 1.0}, [evil])
+    evaluation = evaluate(data, [(evil, Says(says.scores, says)), (evil.upper(), Says(says.scores))], train=evil)
+    page = write_report(evaluation, tmp_path, evil, f"loopclosure evaluate --title {evil}").read_text()
+    reader = Tags()
+    reader.feed(page)
+    assert "script" not in reader.names
+    assert not any(name.startswith("on") for name in reader.attributes)
+    assert reader.sources == {"data"}
+    assert {evil, f"loopclosure evaluate --title {evil}"} <= set(reader.texts)
+    assert reader.texts.count(evil) >= 8  # title, heading, training, note of the data, name of the method, stage, note
 
 
 def test_pictures_are_written_and_in_the_page(folder):
