@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.pairs.choose import NEGATIVE, Indices, PairSource
+from loopclosure.descriptors.similarity import squared_distances
 
 # How many nearest images of each image are looked at: in a video the first hundreds may be neighbours in time.
 DEEPEST = 512
@@ -28,7 +29,7 @@ def hard_negatives(source: PairSource, images: Indices, features: NDArray[np.flo
     parts = []
     for start in range(0, count, ROWS_AT_ONCE):
         rows = np.arange(start, min(start + ROWS_AT_ONCE, count))
-        distances = squares[rows, None] - 2 * features[rows] @ features.T + squares[None]
+        distances = squared_distances(features[rows], features, squares[rows, None], squares)
         distances[np.arange(len(rows)), rows] = np.inf
         nearest = np.argpartition(distances, depth - 1, axis=1)[:, :depth]
         near = np.take_along_axis(distances, nearest, axis=1)

@@ -54,16 +54,31 @@ class Descriptors:
 
     def scores(self, queries: Descriptors, rows: slice, columns: slice) -> np.ndarray:
         """Return the scores of some of ``queries`` (rows) against some of these (columns)."""
-        products = queries.rows[rows] @ self.rows[columns].T
         if self.metric == "cosine":
-            return products
-        products *= -2
-        products += queries.squares[rows, None]
-        products += self.squares[columns]
-        np.maximum(products, 0, out=products)
-        np.sqrt(products, out=products)
-        np.negative(products, out=products)
-        return products
+            return queries.rows[rows] @ self.rows[columns].T
+        distances = squared_distances(
+            queries.rows[rows], self.rows[columns], queries.squares[rows, None], self.squares[columns]
+        )
+        np.maximum(distances, 0, out=distances)
+        np.sqrt(distances, out=distances)
+        np.negative(distances, out=distances)
+        return distances
+
+
+def squared_distances(a: np.ndarray, b: np.ndarray, squares_a: np.ndarray | float, squares_b: np.ndarray) -> np.ndarray:
+    """Return |a|^2 + |b|^2 - 2 a.b for each row of ``a`` (N, D) and of ``b`` (M, D): (N, M), rounded below 0 at times.
+
+    squares_a  (N, 1) squared lengths of the rows; 0 leaves them out, which is enough to order a row of the result
+    squares_b  (M,) squared lengths of the rows
+
+    scikit-learn's euclidean_distances and pairwise_distances_argmin compute float32 in float64, which takes several
+    times as long; the caller who needs more digits passes float64.
+    """
+    products = a @ b.T
+    products *= -2
+    products += squares_a
+    products += squares_b
+    return products
 
 
 def prepare(features: np.ndarray, metric: str = "euclidean", mean: np.ndarray | None = None) -> Descriptors:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.descriptors.similarity import check_metric
+from loopclosure.descriptors.similarity import check_metric, squared_distances
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.precision_recall import PrecisionRecall, curve
@@ -310,11 +310,11 @@ class LoopDetector:
             end = min(end, int(np.searchsorted(frames.stamps[:end], stamp - settings.exclude_seconds, side="right")))
         if end == 0:
             return []
-        scores = frames.rows[:end].reshape(-1, row.shape[1]) @ row.T
-        if settings.metric == "euclidean":  # as the distances are ordered, so are these
-            scores *= 2
-            scores -= frames.squares[:end].reshape(-1, 1)
-            scores -= np.square(row).sum(1)
+        rows = frames.rows[:end].reshape(-1, row.shape[1])
+        if settings.metric == "euclidean":  # as the distances are ordered, so are their squares
+            scores = -squared_distances(rows, row, frames.squares[:end].reshape(-1, 1), np.square(row).sum(1))
+        else:
+            scores = rows @ row.T
         scores = scores.reshape(end, -1).max(axis=1)
         k = min(settings.top_k, end)
         best = np.argpartition(scores, end - k)[end - k :]

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from loopclosure.descriptors.similarity import squared_distances
 from loopclosure.errors import InputError
 from loopclosure.places.frames import grey
 
@@ -96,11 +97,11 @@ class Vocabulary:
 
 def nearest_centres(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """Return the index (n,) of the centre (k, d) nearest to each descriptor (n, d) in Euclidean distance."""
-    half_norms = 0.5 * np.einsum("kd,kd->k", centres, centres)
+    squares = np.einsum("kd,kd->k", centres, centres)
     nearest = np.empty(len(descriptors), np.intp)
     for start in range(0, len(descriptors), BLOCK_ROWS):
         block = descriptors[start : start + BLOCK_ROWS]
-        nearest[start : start + len(block)] = np.argmax(block @ centres.T - half_norms, axis=1)
+        nearest[start : start + len(block)] = np.argmin(squared_distances(block, centres, 0, squares), axis=1)
     return nearest
 
 

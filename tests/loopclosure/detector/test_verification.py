@@ -47,6 +47,19 @@ def test_matches_join_what_is_the_same_point(check):
     assert np.mean(np.all(np.abs(steps - [20, 10]) < 1.0, axis=1)) > 0.9
 
 
+def test_matches_are_those_of_the_plain_ratio_test(check):
+    a, b = check.describe(wall(0)), check.describe(seen_from_the_side(wall(0)))
+    distances = np.linalg.norm(a.descriptors[:, None].astype(float) - b.descriptors[None], axis=2)
+    best: dict[int, tuple[float, int]] = {}
+    for point, row in enumerate(distances):
+        nearest, second = np.argsort(row, kind="stable")[:2]
+        if row[nearest] < check.ratio * row[second]:
+            best[int(nearest)] = min(best.get(int(nearest), (np.inf, -1)), (row[nearest], point))
+    expected = sorted([point, nearest] for nearest, (_, point) in best.items())
+    assert check.matches(a, b).tolist() == expected
+    assert len(expected) > 50
+
+
 def test_an_image_without_a_point_is_no_crash(check):
     blank = check.describe(np.full((60, 80, 3), 200, np.uint8))
     assert blank.points.shape == (0, 2)
