@@ -259,10 +259,13 @@ def _detect(a: argparse.Namespace) -> None:
     options = dict(_key_value(text) for text in a.options)
     features = read_features(a.features) if a.features else None
     describe = None if features is not None else detect.load_describe(a.describe, options)
+    validation = read_features(a.calibrate_features) if a.calibrate_features else None
     views = detect.views_of(describe, features)
-    whitening = None if a.whiten is None else WhitenBy(a.whiten).learn()
-    if describe is not None and whitening is not None:
-        describe = detect.whitened(describe, whitening, views)
+    if a.whiten is not None:
+        whitening = WhitenBy(a.whiten).learn()
+        describe = None if describe is None else detect.whitened(describe, whitening, views)
+        features = None if features is None else features.whitened(whitening)
+        validation = None if validation is None else validation.whitened(whitening)
     changes = {name: getattr(a, name) for name in SETTINGS if getattr(a, name) is not None}
     if a.resume:
         if changes or a.verify:
@@ -281,10 +284,9 @@ def _detect(a: argparse.Namespace) -> None:
         else:
             exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
             data = datasets.load_tum(a.calibrate, chosen, exclusion)
-        validation = read_features(a.calibrate_features) if a.calibrate_features else None
-        print(detect.calibrate(detector, data, a.precision, validation, show_progress, whitening))
+        print(detect.calibrate(detector, data, a.precision, validation, show_progress))
     before = len(detector)
-    results = detect.run_detector(detector, recording, features, show_progress, whitening)
+    results = detect.run_detector(detector, recording, features, show_progress)
     loops = [result for result in results if result.accepted is not None]
     out = Path(a.out)
     # Frames of the run that was resumed have numbers but no names here.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from loopclosure.descriptors.whitening import Whitening
 from loopclosure.errors import InputError
 
 # Arrays of the file that describe the images rather than being descriptors.
@@ -61,6 +62,10 @@ class Features:
                     raise InputError(f"names {image.name} {len(numbers)} times, which of them is {image}?", self.path)
             return self.features[[numbers[0] for numbers in found]]
         raise InputError(f"{missing}; its names are like {self.names[0]}", self.path)
+
+    def whitened(self, whitening: Whitening) -> Features:
+        """Return the same images with whitened descriptors, each view by itself."""
+        return replace(self, features=whitening.of_views(self.features, self.views))
 
     def described_too(self, images: list[Path], rows: np.ndarray) -> list[Path]:
         """Return those of ``images``, with descriptors ``rows`` (len(images), D), that this file describes as well.

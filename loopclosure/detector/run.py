@@ -98,20 +98,13 @@ def run_detector(
     recording: Recording,
     features: Features | None = None,
     progress: Progress = silent,
-    whitening: Whitening | None = None,
 ) -> list[LoopResult]:
-    """Add every frame of a recording.
-
-    ``features``, with a descriptor of each image, replace ``describe``; ``whitening`` is of these alone: a
-    ``describe`` is given whitened (see :func:`whitened`).
-    """
+    """Add every frame of a recording; ``features``, with a descriptor of each image, replace ``describe``."""
     rows = None
     if features is not None:
         if recording.images is None:
             raise InputError("the frames of a video have no names to find features by; give --describe", features.path)
         rows = features.rows_of(recording.images)
-        if whitening is not None:
-            rows = whitening.of_views(rows, detector.settings.views)
     results = []
     if rows is not None and detector.check is None:
         for i, row in enumerate(progress(rows, "frames", len(rows))):
@@ -132,7 +125,6 @@ def calibrate(
     precision: float,
     features: Features | None = None,
     progress: Progress = silent,
-    whitening: Whitening | None = None,
 ) -> str:
     """Set the threshold of ``detector`` on a validation sequence with its truth; return a sentence on what came out.
 
@@ -144,7 +136,7 @@ def calibrate(
     trial = LoopDetector(detector.describe, detector.settings)
     images = data.query_images
     recording = Recording(Path(data.name), [p.name for p in images], images, np.arange(len(images)), data.stamps)
-    results = run_detector(trial, recording, features, progress, whitening)
+    results = run_detector(trial, recording, features, progress)
     found = detector.calibrate(results, data.truth.soft, precision)
     return (
         f"threshold {detector.settings.threshold:.6g}: on {data.name} precision at least {precision:g} at recall "

@@ -10,6 +10,7 @@ from scipy.spatial.distance import pdist
 from scipy.stats import ortho_group
 
 from loopclosure.cli import main
+from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.descriptors.whitening import learn_whitening
@@ -200,6 +201,16 @@ def test_each_view_is_whitened(files, training, laps):
     assert min(shares.values()) >= 0.95
     with pytest.raises(InputError, match=r"laps.npz: describes 1 view\(s\) of an image, .*views.npz 2"):
         make_method(f"features:{files}/views.npz,{files}/laps.npz").score(images, images, [], silent)
+
+
+def test_whitened_features_are_those_of_the_same_images(files, training, laps):
+    stamps = np.arange(len(laps), dtype=float)
+    np.savez(files / "views.npz", features=np.hstack([laps, laps[::-1]]), stamps=stamps, zooms=np.array([1, 0.7]))
+    features, whitening = read_features(files / "views.npz"), learn_whitening(training, components=5)
+    white = features.whitened(whitening)
+    np.testing.assert_allclose(white.features, np.hstack([whitening(laps), whitening(laps[::-1])]), atol=1e-6)
+    assert (white.names, white.views, white.path) == (features.names, 2, features.path)
+    np.testing.assert_array_equal(white.stamps, stamps)
 
 
 def test_detect_finds_loops_through_the_views(two_laps, tmp_path):
