@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Method, Setting, make_method
+from loopclosure.methods.base import Images, Method, Setting, make_method
 from loopclosure.places.datasets import DataSet
 from loopclosure.precision_recall import BestMatches, PrecisionRecall, all_pairs, best_match, best_matches, recall_at_k
 from loopclosure.progress import Progress, silent
@@ -80,13 +80,15 @@ def evaluate(
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f'two methods are called "{twice[0]}"; name them, as in --method "first=features:a.npz"')
-    outcomes = [judge(name, method, data, list(train_images), progress) for name, method in methods]
+    outcomes = [judge(name, method, data, train_images, progress) for name, method in methods]
     return Evaluation(data, outcomes, train or f"{len(train_images)} training images")
 
 
-def judge(name: str, method: Method, data: DataSet, train_images: list[Path], progress: Progress = silent) -> Outcome:
+def judge(
+    name: str, method: Method, data: DataSet, train_images: Sequence[Path] = (), progress: Progress = silent
+) -> Outcome:
     """Run one method and judge what it says."""
-    result = method.score(data.query_images, data.reference_images, train_images, progress)
+    result = method.score(Images(data.query_images, data.reference_images, list(train_images)), progress)
     pairs = all_pairs(result.scores, data.truth)
     silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
     notes = list(result.notes)

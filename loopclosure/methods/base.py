@@ -18,6 +18,26 @@ from loopclosure.errors import InputError
 from loopclosure.progress import Progress
 
 
+@dataclass(frozen=True)
+class Images:
+    """The images that a method is given.
+
+    queries     Q paths
+    references  R paths; None for one sequence that meets its own places again: the queries are the references, and
+                frame i may match the frames before it
+    train       for vocabularies and the like; may be empty, which a method that needs them refuses with an InputError
+    """
+
+    queries: list[Path]
+    references: list[Path] | None = None
+    train: list[Path] = field(default_factory=list)
+
+    @property
+    def tested(self) -> list[Path]:
+        """The queries, then the references where they are other images."""
+        return self.queries + (self.references or [])
+
+
 @dataclass
 class MethodResult:
     """What a method says of every query and every reference.
@@ -39,19 +59,8 @@ class Method(Protocol):
 
     name: str
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
-        """Score each query against each reference.
-
-        ``reference_images`` is None for one sequence that closes loops upon itself: the queries are the references,
-        and frame i may match the frames before it. ``train_images`` are for vocabularies and the like; they may be
-        empty, which a method that needs them refuses with an InputError.
-        """
+    def score(self, images: Images, progress: Progress) -> MethodResult:
+        """Score each query against each reference."""
         ...
 
 

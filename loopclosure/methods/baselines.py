@@ -13,7 +13,7 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer, differences
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Method, MethodResult, Setting, refuse_overlap
+from loopclosure.methods.base import Images, Method, MethodResult, Setting, refuse_overlap
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_grey
 from loopclosure.progress import Progress, timed
@@ -30,21 +30,19 @@ class Words:
     training: Training = field(default_factory=Training)
     model: str = ""
 
-    def learn(
-        self, train_images: list[Path], test_images: list[Path], progress: Progress, seconds: dict[str, float]
-    ) -> tuple[WordModel, list[str]]:
+    def learn(self, images: Images, progress: Progress, seconds: dict[str, float]) -> tuple[WordModel, list[str]]:
         """Return the model and notes on it; refuse one that was trained on a test image."""
         path = Path(self.model)
         if self.model and path.exists():
             model = WordModel.load(path)
             source = f"read from {path}"
         else:
-            refuse_overlap(train_images, test_images)
-            model = train(train_images, self.training, progress, seconds)
+            refuse_overlap(images.train, images.tested)
+            model = train(images.train, self.training, progress, seconds)
             source = f"written to {path}" if self.model else "made for this run"
             if self.model:
                 model.save(path)
-        refuse_overlap(model.training_images, test_images, self.model)
+        refuse_overlap(model.training_images, images.tested, self.model)
         present = (model.training_words > 0).mean(axis=0)
         return model, [
             f"vocabulary ({source}): {model.vocabulary.made}; {model.vocabulary.extractor}",
@@ -60,22 +58,16 @@ class _WordsOfImages:
     words: Words = field(default_factory=Words)
 
     def _count(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-        seconds: dict[str, float],
+        self, images: Images, progress: Progress, seconds: dict[str, float]
     ) -> tuple[WordModel, np.ndarray, np.ndarray | None, list[str]]:
         """Return the model, the words of queries and references, and notes."""
-        tested = query_images + (reference_images or [])
-        model, notes = self.words.learn(train_images, tested, progress, seconds)
-        counts = model.words(tested, progress, seconds)
+        model, notes = self.words.learn(images, progress, seconds)
+        counts = model.words(images.tested, progress, seconds)
         empty = int((counts.sum(axis=1) == 0).sum())
         if empty:
-            notes.append(f"{empty} of {len(tested)} images have no feature at all: places without words")
-        references = None if reference_images is None else counts[len(query_images) :]
-        return model, counts[: len(query_images)], references, notes
+            notes.append(f"{empty} of {len(counts)} images have no feature at all: places without words")
+        size = len(images.queries)
+        return model, counts[:size], None if images.references is None else counts[size:], notes
 
 
 @dataclass
@@ -90,16 +82,10 @@ class FabMapMethod(_WordsOfImages):
         if self.scored not in ("log_odds", "posterior"):
             raise InputError(f'FAB-MAP\'s score is "log_odds" or "posterior", not "{self.scored}"')
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
-        model, queries, references, notes = self._count(query_images, reference_images, train_images, progress, seconds)
+        model, queries, references, notes = self._count(images, progress, seconds)
         with timed(seconds, "likelihoods"):
             fabmap = FabMapModel(model.tree, model.training_words, self.settings)
             if references is None:
@@ -121,16 +107,10 @@ class BagOfWordsMethod(_WordsOfImages):
     def __post_init__(self) -> None:
         check_metric(self.metric)
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
-        model, queries, references, notes = self._count(query_images, reference_images, train_images, progress, seconds)
+        model, queries, references, notes = self._count(images, progress, seconds)
         with timed(seconds, "similarity"):
             bag = BagOfWords.learn(model.training_words, self.metric)
             scores = bag.similarity(queries, queries if references is None else references)
@@ -145,23 +125,17 @@ class ThumbnailMethod:
     thumbnailer: Thumbnailer = field(default_factory=Thumbnailer)
     name: str = "thumbnails"
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
-        tested = query_images + (reference_images or [])
+        tested = images.tested
         small = np.zeros((len(tested), self.thumbnailer.height, self.thumbnailer.width), np.float32)
         for i, path in enumerate(progress(tested, "thumbnails", len(tested))):
             with timed(seconds, "thumbnails"):
                 small[i] = self.thumbnailer(read_grey(path))
         with timed(seconds, "differences"):
-            queries = small[: len(query_images)]
-            scores = -differences(queries, queries if reference_images is None else small[len(query_images) :])
+            queries, references = np.split(small, [len(images.queries)])
+            scores = -differences(queries, queries if images.references is None else references)
         return MethodResult(scores, seconds, [f"mean absolute difference of grey thumbnails; {self.thumbnailer}"])
 
 

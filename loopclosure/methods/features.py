@@ -12,7 +12,7 @@ from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS, check_metric, similarity_matrix
 from loopclosure.descriptors.whitening import COMPONENTS, Whitening, learn_whitening
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Method, MethodResult, Setting, refuse_overlap
+from loopclosure.methods.base import Images, Method, MethodResult, Setting, refuse_overlap
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
 
@@ -56,19 +56,13 @@ class FeatureMethod:
         """The file's name, the metric, whether whitened."""
         return f"{self.query_file.stem} ({self.metric}{', whitened' if self.whitening.whiten else ''})"
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says; the seconds of the net are those the file carries."""
         query_features = read_features(self.query_file)
         views = query_features.views
-        judged = [query_images]
-        rows = [query_features.rows_of(query_images)]
-        if reference_images is not None:
+        described = [images.queries]
+        rows = [query_features.rows_of(images.queries)]
+        if images.references is not None:
             same = self.reference_file == self.query_file
             reference_features = query_features if same else read_features(self.reference_file)
             if reference_features.views != views:
@@ -77,13 +71,13 @@ class FeatureMethod:
                     "give netspec extract the same --zooms",
                     self.reference_file,
                 )
-            judged.append(reference_images)
-            rows.append(reference_features.rows_of(reference_images))
+            described.append(images.references)
+            rows.append(reference_features.rows_of(images.references))
         size = rows[0].shape[1] // views
         notes = [f"{f'{views} views of ' if views > 1 else ''}{size} dimensions, {self.metric}"]
         seconds: dict[str, float] = {}
         if np.isfinite(query_features.seconds_per_image):
-            seconds["features"] = query_features.seconds_per_image * sum(map(len, judged))
+            seconds["features"] = query_features.seconds_per_image * len(images.tested)
         else:
             notes.append("the file does not say how long the features took")
         once: tuple[str, ...] = ()
@@ -91,7 +85,7 @@ class FeatureMethod:
             once = ("training whitening",)
             with timed(seconds, *once):
                 whole = [descriptors[:, :size] for descriptors in rows]
-                whitening = self.whitening.learn(*zip(judged, whole, strict=True))
+                whitening = self.whitening.learn(*zip(described, whole, strict=True))
             with timed(seconds, "whitening"):
                 rows = [whitening.of_views(descriptors, views) for descriptors in rows]
             notes.append(str(whitening))

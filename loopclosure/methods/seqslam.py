@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Method, MethodResult, Setting
+from loopclosure.methods.base import Images, Method, MethodResult, Setting
 from loopclosure.methods.baselines import ThumbnailMethod
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
@@ -186,20 +185,14 @@ class SeqSlam:
         if self.scored not in ("cost", "uniqueness"):
             raise InputError(f'SeqSLAM\'s score is "cost" or "uniqueness", not "{self.scored}"')
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
-        found = self.inner.score(query_images, reference_images, train_images, progress)
+        found = self.inner.score(images, progress)
         seconds = dict(found.seconds)
         with timed(seconds, "sequences"):
             valid = np.isfinite(found.scores)
-            if reference_images is None:
-                valid &= earlier(len(query_images), self.exclude_frames)
+            if images.references is None:
+                valid &= earlier(len(images.queries), self.exclude_frames)
             distances = np.where(valid, -found.scores, np.nan)
             if self.settings.contrast:
                 distances = enhance_contrast(distances, self.settings.contrast, valid)

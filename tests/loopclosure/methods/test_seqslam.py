@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import MethodResult, Setting, make_method
+from loopclosure.methods.base import Images, MethodResult, Setting, make_method
 from loopclosure.methods.seqslam import (
     SeqSlam,
     SequenceSettings,
@@ -165,7 +165,7 @@ def two_laps() -> np.ndarray:
 
 def test_one_sequence_never_matches_its_neighbours() -> None:
     method = SeqSlam(Fixed(two_laps()), exclude_frames=5)
-    result = method.score(frames(40), None, [], silent)
+    result = method.score(Images(frames(40)), silent)
     assert not np.isfinite(result.scores[~earlier(40, 5)]).any()
     best = np.argmax(np.nan_to_num(result.scores[20:], nan=-np.inf), axis=1)
     assert np.mean(best == np.arange(20)) > 0.9
@@ -177,13 +177,13 @@ def test_two_traverses_use_the_whole_matrix() -> None:
     scores = -noise_with_path(30, 30, [(q, q) for q in range(30)])
     noisy = scores + np.random.default_rng(9).normal(0, 0.3, scores.shape)
     alone = np.argmax(noisy, axis=1) == np.arange(30)
-    result = SeqSlam(Fixed(noisy)).score(frames(30), frames(30), [], silent)
+    result = SeqSlam(Fixed(noisy)).score(Images(frames(30), frames(30)), silent)
     together = np.argmax(np.nan_to_num(result.scores, nan=-np.inf), axis=1) == np.arange(30)
     assert together.mean() > 0.85 > 0.5 > alone.mean()  # what sequences are for
 
 
 def test_uniqueness_as_the_score() -> None:
-    result = SeqSlam(Fixed(two_laps()), exclude_frames=5, scored="uniqueness").score(frames(40), None, [], silent)
+    result = SeqSlam(Fixed(two_laps()), exclude_frames=5, scored="uniqueness").score(Images(frames(40)), silent)
     assert np.all(np.isfinite(result.scores).sum(axis=1) <= 1)
     query, reference = np.argwhere(np.isfinite(result.scores)).T
     second = query >= 20
@@ -194,9 +194,7 @@ def test_uniqueness_as_the_score() -> None:
 def test_uniqueness_of_scores_that_may_be_of_either_sign() -> None:
     log_odds = 40.0 * (two_laps() + 1.0)
     settings = SequenceSettings(contrast=0)
-    result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(
-        frames(40), None, [], silent
-    )
+    result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(Images(frames(40)), silent)
     found = result.scores[np.isfinite(result.scores)]
     assert len(found) > 20
     assert np.all((found >= 0) & (found <= 1))
@@ -206,7 +204,7 @@ def test_a_sequence_shorter_than_the_exclusion_has_no_scores() -> None:
     for settings in (SequenceSettings(), SequenceSettings(contrast=0)):
         for scored in ("cost", "uniqueness"):
             method = SeqSlam(Fixed(np.zeros((4, 4))), settings, scored, exclude_frames=5)
-            assert np.isnan(method.score(frames(4), None, [], silent).scores).all()
+            assert np.isnan(method.score(Images(frames(4)), silent).scores).all()
 
 
 def test_the_command_line_builds_it() -> None:

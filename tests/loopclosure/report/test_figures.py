@@ -26,7 +26,7 @@ class Says:
     def __init__(self, scores):
         self.scores = scores
 
-    def score(self, query_images, reference_images, train_images, progress):
+    def score(self, images, progress):
         return MethodResult(self.scores)
 
 

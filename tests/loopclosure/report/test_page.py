@@ -27,7 +27,7 @@ class Says:
     def __init__(self, scores, result=None):
         self.result = result or MethodResult(scores, {"vocabulary": 3.0, "looking": 0.4}, ["a <note>"], ("vocabulary",))
 
-    def score(self, query_images, reference_images, train_images, progress):
+    def score(self, images, progress):
         return self.result
 
 
