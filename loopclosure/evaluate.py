@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, Setting, make_method
 from loopclosure.places.datasets import DataSet
-from loopclosure.precision_recall import BestMatches, PrecisionRecall, all_pairs, best_match, best_matches, recall_at_k
+from loopclosure.precision_recall import BestMatches, JudgedScores, PrecisionRecall
 from loopclosure.progress import Progress, silent
 
 RECALL_AT = (1, 5, 10)
@@ -43,6 +44,20 @@ class Outcome:
     def seconds_on_frames(self) -> float:
         """Return the seconds in all that grew with the frames, training left out."""
         return sum(seconds for stage, seconds in self.seconds.items() if stage not in self.once)
+
+    @cached_property
+    def measures(self) -> dict[str, dict[str, float]]:
+        """How good the method is, by convention: convention -> name of the measure -> value in 0..1."""
+        table = {
+            curve.convention: {
+                "average precision": curve.average_precision,
+                "recall at 100 % precision": curve.recall_at_full_precision,
+                "best F1": curve.best_f1,
+            }
+            for curve in (self.pairs, self.best)
+        }
+        table[self.best.convention].update({f"recall at {k}": value for k, value in self.recall_at.items()})
+        return table
 
 
 @dataclass(frozen=True)
@@ -89,7 +104,7 @@ def judge(
 ) -> Outcome:
     """Run one method and judge what it says."""
     result = method.score(Images(data.query_images, data.reference_images, list(train_images)), progress)
-    pairs = all_pairs(result.scores, data.truth)
+    judged_scores = JudgedScores(result.scores, data.truth)
     silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
     notes = list(result.notes)
     if silent_pairs:
@@ -98,25 +113,11 @@ def judge(
     return Outcome(
         name=name,
         scores=result.scores,
-        pairs=pairs,
-        best=best_match(result.scores, data.truth),
-        matches=best_matches(result.scores, data.truth),
-        recall_at=recall_at_k(result.scores, data.truth, RECALL_AT),
+        pairs=judged_scores.all_pairs_curve(),
+        best=judged_scores.best_match_curve(),
+        matches=judged_scores.best_matches,
+        recall_at=judged_scores.recall_at(RECALL_AT),
         seconds=result.seconds,
         once=result.once,
         notes=notes,
     )
-
-
-def figures(outcome: Outcome) -> dict[str, dict[str, float]]:
-    """Return the figures of a method by convention: convention -> name of the figure -> value in 0..1."""
-    table = {
-        curve.convention: {
-            "average precision": curve.average_precision,
-            "recall at 100 % precision": curve.recall_at_full_precision,
-            "best F1": curve.best_f1,
-        }
-        for curve in (outcome.pairs, outcome.best)
-    }
-    table[outcome.best.convention].update({f"recall at {k}": value for k, value in outcome.recall_at.items()})
-    return table

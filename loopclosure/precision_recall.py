@@ -13,6 +13,7 @@ best match that hits soft truth alone is right for a query that has a loop, and 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -120,13 +121,6 @@ def curve(
     )
 
 
-def all_pairs(scores: np.ndarray, truth: Truth) -> PrecisionRecall:
-    """Judge every pair for itself; ``scores`` (Q, R), higher = more alike. NaN is never found, yet may be missed."""
-    _check_size(scores, truth)
-    counted = truth.judged & (truth.hard | ~truth.soft)
-    return curve(scores[counted], truth.hard[counted], convention=ALL_PAIRS, exclusion=truth.sentence)
-
-
 @dataclass(frozen=True)
 class BestMatches:
     """The best judged reference of each query.
@@ -143,55 +137,68 @@ class BestMatches:
     ignored: np.ndarray
 
 
-def best_matches(scores: np.ndarray, truth: Truth) -> BestMatches:
-    """Find and judge the best match of each query; ``scores`` (Q, R)."""
-    candidates = _candidates(scores, truth)
-    rows = np.arange(len(candidates))
-    reference = np.argmax(candidates, axis=1)
-    score = candidates[rows, reference]
-    none = np.isneginf(score)
-    soft = truth.soft[rows, reference] & ~none
-    loops = truth.queries_with_a_loop
-    return BestMatches(np.where(none, -1, reference), score, soft & loops, soft & ~loops)
+@dataclass(frozen=True)
+class JudgedScores:
+    """The scores (Q, R) of a method, higher = more alike, and the truth that they are judged by.
 
-
-def best_match(scores: np.ndarray, truth: Truth) -> PrecisionRecall:
-    """Judge the best match of each query; ``scores`` (Q, R). A wrong match of a query with a loop is one mistake."""
-    found = best_matches(scores, truth)
-    kept = ~found.ignored
-    positives = int(np.count_nonzero(truth.queries_with_a_loop))
-    return curve(found.score[kept], found.right[kept], positives, BEST_MATCH, truth.sentence)
-
-
-def recall_at_k(scores: np.ndarray, truth: Truth, ks: tuple[int, ...] = (1, 5, 10, 20)) -> dict[int, float]:
-    """Return, for each k, the share of the queries with a loop that have a hard or soft one among their best k.
-
-    Of equal scores the first references count. Queries without a loop are left out; NaN where none has one.
+    A NaN is never found, yet may be missed. What several measures need is computed once.
     """
-    candidates = _candidates(scores, truth)
-    queries = np.flatnonzero(truth.queries_with_a_loop)
-    if not len(queries):
-        return {k: float("nan") for k in ks}
-    if min(ks) < 1:
-        raise InputError(f"recall at {min(ks)} was asked for; expected 1 or more")
-    ranked = np.argsort(-candidates[queries], axis=1, kind="stable")[:, : max(ks)]
-    hits = np.take_along_axis(truth.soft[queries], ranked, axis=1)
-    hits &= ~np.isneginf(np.take_along_axis(candidates[queries], ranked, axis=1))
-    found = np.cumsum(hits, axis=1) > 0
-    return {k: float(np.mean(found[:, min(k, found.shape[1]) - 1])) for k in ks}
 
+    scores: np.ndarray
+    truth: Truth
 
-def _candidates(scores: np.ndarray, truth: Truth) -> np.ndarray:
-    """Return the scores with -inf for what is not judged and for NaN."""
-    _check_size(scores, truth)
-    return np.where(truth.judged & ~np.isnan(scores), scores, -np.inf)
+    def __post_init__(self) -> None:
+        if self.scores.shape != self.truth.hard.shape:
+            raise InputError(
+                f"the scores are {_by(self.scores.shape)}, the truth is {_by(self.truth.hard.shape)} "
+                "(query x reference)"
+            )
 
+    def all_pairs_curve(self) -> PrecisionRecall:
+        """Judge every pair for itself."""
+        truth = self.truth
+        counted = truth.judged & (truth.hard | ~truth.soft)
+        return curve(self.scores[counted], truth.hard[counted], convention=ALL_PAIRS, exclusion=truth.sentence)
 
-def _check_size(scores: np.ndarray, truth: Truth) -> None:
-    if scores.shape != truth.hard.shape:
-        raise InputError(
-            f"the scores are {_by(scores.shape)}, the truth is {_by(truth.hard.shape)} (query x reference)"
-        )
+    def best_match_curve(self) -> PrecisionRecall:
+        """Judge the best match of each query. A wrong match of a query with a loop is one mistake."""
+        found = self.best_matches
+        kept = ~found.ignored
+        positives = int(np.count_nonzero(self.truth.queries_with_a_loop))
+        return curve(found.score[kept], found.right[kept], positives, BEST_MATCH, self.truth.sentence)
+
+    @cached_property
+    def best_matches(self) -> BestMatches:
+        """The best match of each query, judged."""
+        rows = np.arange(len(self._candidates))
+        reference = np.argmax(self._candidates, axis=1)
+        score = self._candidates[rows, reference]
+        none = np.isneginf(score)
+        soft = self.truth.soft[rows, reference] & ~none
+        loops = self.truth.queries_with_a_loop
+        return BestMatches(np.where(none, -1, reference), score, soft & loops, soft & ~loops)
+
+    def recall_at(self, ks: tuple[int, ...] = (1, 5, 10, 20)) -> dict[int, float]:
+        """Return, for each k, the share of the queries with a loop that have a hard or soft one among their best k.
+
+        Of equal scores the first references count. Queries without a loop are left out; NaN where none has one.
+        """
+        queries = np.flatnonzero(self.truth.queries_with_a_loop)
+        if not len(queries):
+            return {k: float("nan") for k in ks}
+        if min(ks) < 1:
+            raise InputError(f"recall at {min(ks)} was asked for; expected 1 or more")
+        candidates = self._candidates[queries]
+        ranked = np.argsort(-candidates, axis=1, kind="stable")[:, : max(ks)]
+        hits = np.take_along_axis(self.truth.soft[queries], ranked, axis=1)
+        hits &= ~np.isneginf(np.take_along_axis(candidates, ranked, axis=1))
+        found = np.cumsum(hits, axis=1) > 0
+        return {k: float(np.mean(found[:, min(k, found.shape[1]) - 1])) for k in ks}
+
+    @cached_property
+    def _candidates(self) -> np.ndarray:
+        """The scores (Q, R), -inf for what is not judged and for NaN."""
+        return np.where(self.truth.judged & ~np.isnan(self.scores), self.scores, -np.inf)
 
 
 def _by(shape: tuple[int, ...]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome, figures
+from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, PrecisionRecall
 
 EXPLANATION = {
@@ -52,7 +52,7 @@ def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
                 "name": outcome.name,
                 "figures": {
                     convention: {name: _number(value) for name, value in values.items()}
-                    for convention, values in figures(outcome).items()
+                    for convention, values in outcome.measures.items()
                 },
                 "seconds": {stage: round(seconds, 6) for stage, seconds in outcome.seconds.items()},
                 "milliseconds_a_frame": {
@@ -72,7 +72,7 @@ def figures_text(evaluation: Evaluation) -> str:
     heads = ["method", "AP", "R@P=1", "F1", "AP", "R@P=1", "F1", *(f"R@{k}" for k in RECALL_AT), "ms/frame"]
     rows = []
     for outcome in evaluation.outcomes:
-        values = figures(outcome)
+        values = outcome.measures
         cells = [share(v) for v in (*values[ALL_PAIRS].values(), *values[BEST_MATCH].values())]
         rows.append([outcome.name, *cells, f"{1e3 * outcome.seconds_on_frames / evaluation.images:.2f}"])
     widths = [max(len(row[i]) for row in [heads, *rows]) for i in range(len(heads))]
@@ -89,7 +89,7 @@ def figures_text(evaluation: Evaluation) -> str:
 def _write_figures_csv(evaluation: Evaluation, path: Path) -> None:
     rows = [["method", "convention", "figure", "value", "truth and exclusion"]]
     for outcome in evaluation.outcomes:
-        for convention, values in figures(outcome).items():
+        for convention, values in outcome.measures.items():
             for name, value in values.items():
                 rows.append([outcome.name, convention, name, f"{value:.6f}", evaluation.data.truth.sentence])
     _write_csv(path, rows)

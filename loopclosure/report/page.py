@@ -17,7 +17,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome, figures
+from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
 from loopclosure.places.frames import read_image
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import figures as report_figures
@@ -108,7 +108,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
 
 def _figures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, bool]]]]:
     """Return for each method its name and its figures, each with whether it is the best of several methods."""
-    rows = [[v for values in figures(o).values() for v in values.values()] for o in evaluation.outcomes]
+    rows = [[v for values in o.measures.values() for v in values.values()] for o in evaluation.outcomes]
     best = [max((row[i] for row in rows if not math.isnan(row[i])), default=None) for i in range(len(rows[0]))]
     return [
         (outcome.name, [(value, len(rows) > 1 and value == top) for value, top in zip(row, best, strict=True)])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.evaluate import evaluate, figures, named_method
+from loopclosure.evaluate import evaluate, named_method
 from loopclosure.methods.base import METHODS, MethodResult, Setting, make_method
 from loopclosure.methods.features import FeatureMethod
 from loopclosure.places.datasets import load_tum
@@ -33,8 +33,8 @@ def test_perfect_features_find_every_loop(two_laps, two_laps_features):
     assert outcome.best.positives == 20
     assert outcome.seconds["features"] == pytest.approx(40 * 0.004)
     assert found.images == 40
-    assert figures(outcome)[BEST_MATCH]["recall at 1"] == 1.0
-    assert figures(outcome)[ALL_PAIRS]["average precision"] == pytest.approx(1.0)
+    assert outcome.measures[BEST_MATCH]["recall at 1"] == 1.0
+    assert outcome.measures[ALL_PAIRS]["average precision"] == pytest.approx(1.0)
 
 
 def test_silence_is_said_and_costs_recall(two_laps):
