@@ -20,7 +20,7 @@ from loopclosure.detector import run as detect
 from loopclosure.detector.detector import DetectorSettings, LoopDetector
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
-from loopclosure.methods.base import METHODS, Setting
+from loopclosure.methods.base import METHODS, MethodContext
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places import datasets
 from loopclosure.places.frames import Selection, image_paths
@@ -57,9 +57,9 @@ SETTINGS = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    arguments = _parser().parse_args(words)
-    arguments.command_line = shlex.join(["loopclosure", *words])
+    given = list(sys.argv[1:] if argv is None else argv)
+    arguments = _parser().parse_args(given)
+    arguments.command_line = shlex.join(["loopclosure", *given])
     try:
         return arguments.run(arguments) or 0
     except InputError as fault:
@@ -236,21 +236,21 @@ def _data_set(a: argparse.Namespace) -> datasets.DataSet:
 
 def _evaluate(a: argparse.Namespace) -> None:
     # Drawing takes seconds to import, which the other commands need not wait for.
-    from loopclosure.report.files import figures_text
+    from loopclosure.report.files import measures_text
     from loopclosure.report.page import write_report
 
     data = _data_set(a)
-    setting = Setting(data.exclude_frames, a.seed)
-    methods = [evaluate.named_method(text, setting) for text in a.method]
+    context = MethodContext(data.exclude_frames, a.seed)
+    methods = [evaluate.named_method(text, context) for text in a.method]
     chosen = Selection(a.train_start, a.train_stop, a.train_stride, a.train_limit)
     train: list[Path] = []
     for source in a.train:
         images = image_paths(source)
         train += [images[i] for i in chosen.numbers(len(images))]
-    words = f"{len(train)} images of {', '.join(Path(t).name for t in a.train)}" if train else "no training images"
-    evaluation = evaluate.evaluate(data, methods, train, words, show_progress)
+    described = f"{len(train)} images of {', '.join(Path(t).name for t in a.train)}" if train else "no training images"
+    evaluation = evaluate.evaluate(data, methods, train, described, show_progress)
     page = write_report(evaluation, a.out, a.title, a.command_line)
-    print(figures_text(evaluation))
+    print(measures_text(evaluation))
     print(f"report: {page}")
 
 
@@ -284,7 +284,7 @@ def _detect(a: argparse.Namespace) -> None:
         else:
             exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
             data = datasets.load_tum(a.calibrate, chosen, exclusion)
-        print(detect.calibrate(detector, data, a.precision, validation, show_progress))
+        print(detect.calibrate_on_data_set(detector, data, a.precision, validation, show_progress))
     before = len(detector)
     results = detect.run_detector(detector, recording, features, show_progress)
     loops = [result for result in results if result.accepted is not None]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, Setting, make_method
+from loopclosure.methods.base import Images, Method, MethodContext, make_method
 from loopclosure.places.datasets import DataSet
 from loopclosure.precision_recall import BestMatches, JudgedScores, PrecisionRecall
 from loopclosure.progress import Progress, silent
@@ -27,7 +27,7 @@ class Outcome:
     matches    the best match of each query
     recall_at  k -> share of the queries with a loop that have one among their best k
     seconds    stage -> seconds in all
-    once       the stages done once, on training images
+    training_stages  the stages done once, on training images
     """
 
     name: str
@@ -37,13 +37,13 @@ class Outcome:
     matches: BestMatches
     recall_at: dict[int, float]
     seconds: dict[str, float]
-    once: tuple[str, ...]
+    training_stages: tuple[str, ...]
     notes: list[str]
 
     @property
     def seconds_on_frames(self) -> float:
         """Return the seconds in all that grew with the frames, training left out."""
-        return sum(seconds for stage, seconds in self.seconds.items() if stage not in self.once)
+        return sum(seconds for stage, seconds in self.seconds.items() if stage not in self.training_stages)
 
     @cached_property
     def measures(self) -> dict[str, dict[str, float]]:
@@ -69,18 +69,18 @@ class Evaluation:
     train: str = "no training images"
 
     @property
-    def images(self) -> int:
+    def image_count(self) -> int:
         """Return the number of images a method has to describe."""
         return len(self.data.query_images) + len(self.data.reference_images or [])
 
 
-def named_method(text: str, setting: Setting) -> tuple[str, Method]:
+def named_method(text: str, context: MethodContext) -> tuple[str, Method]:
     """Build a method from ``LABEL=METHOD`` or ``METHOD``, and the name it is shown by."""
     label, equals, spec = text.partition("=")
     if not equals or ":" in label:  # the = of a setting, which follows the colon of its method
-        method = make_method(text, setting)
+        method = make_method(text, context)
         return method.name, method
-    return label.strip(), make_method(spec, setting)
+    return label.strip(), make_method(spec, context)
 
 
 def evaluate(
@@ -118,6 +118,6 @@ def judge(
         matches=judged_scores.best_matches,
         recall_at=judged_scores.recall_at(RECALL_AT),
         seconds=result.seconds,
-        once=result.once,
+        training_stages=result.training_stages,
         notes=notes,
     )

@@ -33,7 +33,7 @@ class PrecisionRecall:
     precision, recall  (n,)
     positives          what there is to find: judged pairs, or queries with a loop
     samples            how many scores were judged
-    exclusion          what makes a place the same, and what was left out
+    truth_description  what makes a place the same, and what was left out
     """
 
     convention: str
@@ -42,7 +42,7 @@ class PrecisionRecall:
     recall: np.ndarray
     positives: int
     samples: int
-    exclusion: str = ""
+    truth_description: str = ""
 
     @property
     def average_precision(self) -> float:
@@ -89,7 +89,7 @@ def curve(
     right: np.ndarray,
     positives: int | None = None,
     convention: str = "samples",
-    exclusion: str = "",
+    truth_description: str = "",
 ) -> PrecisionRecall:
     """Build the curve of samples with a score and a right or wrong answer.
 
@@ -117,7 +117,7 @@ def curve(
         recall=true_positives / positives if positives else np.zeros(len(last_of_tie)),
         positives=positives,
         samples=samples,
-        exclusion=exclusion,
+        truth_description=truth_description,
     )
 
 
@@ -158,14 +158,16 @@ class JudgedScores:
         """Judge every pair for itself."""
         truth = self.truth
         counted = truth.judged & (truth.hard | ~truth.soft)
-        return curve(self.scores[counted], truth.hard[counted], convention=ALL_PAIRS, exclusion=truth.sentence)
+        return curve(
+            self.scores[counted], truth.hard[counted], convention=ALL_PAIRS, truth_description=truth.description
+        )
 
     def best_match_curve(self) -> PrecisionRecall:
         """Judge the best match of each query. A wrong match of a query with a loop is one mistake."""
         found = self.best_matches
         kept = ~found.ignored
         positives = int(np.count_nonzero(self.truth.queries_with_a_loop))
-        return curve(found.score[kept], found.right[kept], positives, BEST_MATCH, self.truth.sentence)
+        return curve(found.score[kept], found.right[kept], positives, BEST_MATCH, self.truth.description)
 
     @cached_property
     def best_matches(self) -> BestMatches:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -89,12 +89,12 @@ class PlaceSource:
     def __init__(
         self,
         names: list[str],
-        groups: SequenceOf[str],
-        positives: SequenceOf[tuple[int, int]],
+        groups: Sequence[str],
+        positives: Sequence[tuple[int, int]],
         settings: dict[str, str],
         group_word: str = "place",
         min_gap: float = 0.0,
-        sides: SequenceOf[int] | None = None,
+        sides: Sequence[int] | None = None,
     ) -> None:
         """Take images, the name of each one's group, and pairs of indices that are the same place.
 

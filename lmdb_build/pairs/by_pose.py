@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from loopclosure.places.same_place import (
     same_place,
     view_angles_deg,
 )
-from loopclosure.places.trajectory import Poses, Sequence
+from loopclosure.places.trajectory import PosedSequence, Poses
 
 # How the images of two sequences relate.
 SAME_SEQUENCE, ONE_FRAME, ONE_SCENE, OTHER_SCENE = range(4)
@@ -61,7 +61,7 @@ class Scenes:
     same_frame: tuple[tuple[str, ...], ...] = ()
     all_others_differ: bool = False
 
-    def relations(self, names: SequenceOf[str]) -> NDArray[np.int8]:
+    def relations(self, names: Sequence[str]) -> NDArray[np.int8]:
         """Return (S, S): how each two of the sequences relate. Raises InputError for a name that is not among them."""
         table = np.full((len(names), len(names)), OTHER_SCENE, np.int8)
         for sets, relation in ((self.same_scene, ONE_SCENE), (self.same_frame, ONE_FRAME)):
@@ -82,8 +82,8 @@ class PoseSource:
 
     def __init__(
         self,
-        sequences: SequenceOf[Sequence],
-        folders: SequenceOf[str],
+        sequences: Sequence[PosedSequence],
+        folders: Sequence[str],
         rule: PoseRule = PoseRule(),
         scenes: Scenes = Scenes(),
     ) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lmdb_build.pairs.list_file import ListedPair, read_pair_list
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_image
+from loopclosure.places.frames import read_bgr
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 240, 180
 BORDER, CAPTION, TITLE = 6, 40, 44
@@ -67,7 +67,7 @@ def _pair(pair: ListedPair, list_file: Path, root: Path, colour: tuple[int, int,
     cv2.rectangle(tile, (0, 0), (_width() - 1, IMAGE_HEIGHT + 2 * BORDER - 1), colour, -1)
     for number, name in enumerate((pair.first, pair.second)):
         try:
-            picture = read_image(root / name)
+            picture = read_bgr(root / name)
         except InputError as error:
             raise InputError(f"{root / name} {error.message}", list_file, pair.line, 1) from error
         left = BORDER + number * (IMAGE_WIDTH + BORDER)

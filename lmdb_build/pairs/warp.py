@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_image
+from loopclosure.places.frames import read_bgr
 
 # Each corner of the cut-out is moved inwards by up to this share of the picture's width and height: a crop, a change of
 # scale to 0.6 at least, a shift, a turn and a change of perspective at once, and never a black border.
@@ -37,7 +37,7 @@ def warp(image: NDArray, rng: np.random.Generator) -> NDArray:
 
 def write_warped(source: Path, target: Path, rng: np.random.Generator) -> None:
     """Write a warped copy of an image file. Raises InputError where one cannot be read or the other not written."""
-    picture = warp(read_image(source), rng)
+    picture = warp(read_bgr(source), rng)
     target.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(target), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
         raise InputError("cannot be written", target)

@@ -1,7 +1,7 @@
 """PCA whitening: what descriptors of many places vary in together should not decide which two are of one place.
 
 After Jegou and Chum, "Negative evidences and co-occurences in image retrieval: the benefit of PCA and whitening"
-(ECCV 2012): centre the descriptors, turn them to their principal directions, keep the strongest, give these equal
+(ECCV 2012): center the descriptors, turn them to their principal directions, keep the strongest, give these equal
 variance, scale to length 1. All of it is learnt from images of other places.
 """
 

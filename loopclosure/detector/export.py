@@ -65,9 +65,9 @@ def write_loops_csv(
             assert loop.accepted is not None
             ends = (loop.query_id, loop.accepted)
             times = ["" if stamps is None or np.isnan(stamps[i]) else f"{stamps[i]:.6f}" for i in ends]
-            words = ["" if names is None else names[i] for i in ends]
+            names_of_ends = ["" if names is None else names[i] for i in ends]
             inliers = "" if loop.inliers is None else loop.inliers
-            writer.writerow([*ends, f"{loop.score:.9g}", inliers, *times, *words])
+            writer.writerow([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends])
 
 
 def write_g2o(

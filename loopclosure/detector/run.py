@@ -23,7 +23,7 @@ from loopclosure.places.frames import (
     VIDEO_SUFFIXES,
     Selection,
     image_paths,
-    read_image,
+    read_bgr,
     video_frames,
     video_length,
 )
@@ -54,7 +54,7 @@ class Recording:
         """Yield each image (H, W, 3) uint8 BGR and its stamp."""
         if self.images is not None:
             for i, path in enumerate(self.images):
-                yield read_image(path), None if self.stamps is None else float(self.stamps[i])
+                yield read_bgr(path), None if self.stamps is None else float(self.stamps[i])
             return
         wanted = iter(self.numbers.tolist())
         following = next(wanted, None)
@@ -119,7 +119,7 @@ def run_detector(
     return results
 
 
-def calibrate(
+def calibrate_on_data_set(
     detector: LoopDetector,
     data: DataSet,
     precision: float,

@@ -42,16 +42,17 @@ class Images:
 class MethodResult:
     """What a method says of every query and every reference.
 
-    scores   (Q, R) floats, higher = more alike; NaN where the method says nothing (the upper triangle of an online one)
-    seconds  stage -> seconds spent on it in all, in the order of the work
-    once     those of the stages that are done once, on training images, rather than for each frame
-    notes    sentences for the report: settings, sizes of vocabularies, what was left out
+    scores           (Q, R) floats, higher = more alike; NaN where the method gives no score (the upper triangle of an
+                     online one)
+    seconds          stage -> total seconds spent on it, in the order of the work
+    notes            sentences for the report: settings, sizes of vocabularies, what was left out
+    training_stages  the stages done once, on training images, rather than for each frame
     """
 
     scores: np.ndarray
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    once: tuple[str, ...] = ()
+    training_stages: tuple[str, ...] = ()
 
 
 class Method(Protocol):
@@ -65,7 +66,7 @@ class Method(Protocol):
 
 
 @dataclass(frozen=True)
-class Setting:
+class MethodContext:
     """What a method may have to know of the evaluation it takes part in.
 
     exclude_frames   in one sequence, |i - j| <= exclude_frames is no candidate (SeqSLAM has to know before it searches)
@@ -76,9 +77,9 @@ class Setting:
     seed: int = 0
 
 
-# name -> "module:factory"; a factory takes (argument: str, setting: Setting, inner: Method | None), returns a Method.
-# On the command line a method is written name, name:argument, or name+inner[:argument], where inner is a method again
-# whose scores the first one refines: seqslam+features:siamese.npz:cosine.
+# name -> "module:factory", a Factory. On the command line a method is written name, name:argument, or
+# name+inner[:argument], where inner is a method again, whose scores the first one refines:
+# seqslam+features:siamese.npz:cosine.
 METHODS: dict[str, str] = {
     "fabmap": "loopclosure.methods.baselines:fabmap",
     "bow": "loopclosure.methods.baselines:bag_of_words",
@@ -87,22 +88,23 @@ METHODS: dict[str, str] = {
     "features": "loopclosure.methods.features:features",
 }
 
-Factory = Callable[[str, Setting, "Method | None"], Method]
+# The argument after the colon, the context, the inner method.
+Factory = Callable[[str, MethodContext, "Method | None"], Method]
 
 
-def make_method(spec: str, setting: Setting | None = None) -> Method:
+def make_method(spec: str, context: MethodContext | None = None) -> Method:
     """Build the method that a specification such as ``seqslam+features:siamese.npz`` names."""
-    setting = setting or Setting()
+    context = context or MethodContext()
     head, _, argument = spec.partition(":")
     name, plus, inner_name = head.partition("+")
     if name not in METHODS:
         raise InputError(f'unknown method "{name}" in "{spec}"; known: {", ".join(METHODS)}')
-    inner = make_method(spec[len(name) + 1 :], setting) if plus else None
+    inner = make_method(spec[len(name) + 1 :], context) if plus else None
     if inner_name:
         argument = ""
     module_name, _, factory_name = METHODS[name].partition(":")
     factory: Any = getattr(importlib.import_module(module_name), factory_name)
-    return factory(argument, setting, inner)
+    return factory(argument, context, inner)
 
 
 def refuse_overlap(train_images: list[Path], test_images: list[Path], model: str | Path = "") -> None:

@@ -13,9 +13,9 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer, differences
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodResult, Setting, refuse_overlap
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_overlap
 from loopclosure.methods.settings import configure
-from loopclosure.places.frames import read_grey
+from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
 from loopclosure.words.bag_of_words import BagOfWords, check_metric
 from loopclosure.words.fabmap import FabMapModel, FabMapSettings, score_sequence, score_sets
@@ -24,7 +24,7 @@ from loopclosure.words.word_model import TRAINING_STAGES, Training, WordModel, t
 
 
 @dataclass(frozen=True)
-class Words:
+class WordModelSource:
     """Where the words of images come from: trained, or read from ``model`` (written there when it does not exist)."""
 
     training: Training = field(default_factory=Training)
@@ -52,17 +52,17 @@ class Words:
 
 
 @dataclass
-class _WordsOfImages:
+class _WordMethod:
     """The part that methods on words have in common."""
 
-    words: Words = field(default_factory=Words)
+    source: WordModelSource = field(default_factory=WordModelSource)
 
     def _count(
         self, images: Images, progress: Progress, seconds: dict[str, float]
     ) -> tuple[WordModel, np.ndarray, np.ndarray | None, list[str]]:
         """Return the model, the words of queries and references, and notes."""
-        model, notes = self.words.learn(images, progress, seconds)
-        counts = model.words(images.tested, progress, seconds)
+        model, notes = self.source.learn(images, progress, seconds)
+        counts = model.count_words(images.tested, progress, seconds)
         empty = int((counts.sum(axis=1) == 0).sum())
         if empty:
             notes.append(f"{empty} of {len(counts)} images have no feature at all: places without words")
@@ -71,7 +71,7 @@ class _WordsOfImages:
 
 
 @dataclass
-class FabMapMethod(_WordsOfImages):
+class FabMapMethod(_WordMethod):
     """FAB-MAP; ``scored`` is "log_odds" (evidence against a new place) or "posterior"."""
 
     settings: FabMapSettings = field(default_factory=FabMapSettings)
@@ -98,7 +98,7 @@ class FabMapMethod(_WordsOfImages):
 
 
 @dataclass
-class BagOfWordsMethod(_WordsOfImages):
+class BagOfWordsMethod(_WordMethod):
     """Bag of words with tf-idf; ``metric`` as in :class:`BagOfWords`."""
 
     metric: str = "l1"
@@ -132,39 +132,39 @@ class ThumbnailMethod:
         small = np.zeros((len(tested), self.thumbnailer.height, self.thumbnailer.width), np.float32)
         for i, path in enumerate(progress(tested, "thumbnails", len(tested))):
             with timed(seconds, "thumbnails"):
-                small[i] = self.thumbnailer(read_grey(path))
+                small[i] = self.thumbnailer(read_gray(path))
         with timed(seconds, "differences"):
             queries, references = np.split(small, [len(images.queries)])
             scores = -differences(queries, queries if images.references is None else references)
         return MethodResult(scores, seconds, [f"mean absolute difference of grey thumbnails; {self.thumbnailer}"])
 
 
-def fabmap(argument: str, setting: Setting, inner: Method | None) -> FabMapMethod:
+def fabmap(argument: str, context: MethodContext, inner: Method | None) -> FabMapMethod:
     """Build ``fabmap[:setting=value,...]``."""
     refuse_inner("fabmap", inner)
-    method, words, training, extractor, settings = configure(
+    method, source, training, extractor, settings = configure(
         "fabmap",
         argument,
         FabMapMethod(),
-        Words(),
-        Training(seed=setting.seed),
+        WordModelSource(),
+        Training(seed=context.seed),
         Extractor(),
-        FabMapSettings(recent=setting.exclude_frames, seed=setting.seed),
+        FabMapSettings(recent=context.exclude_frames, seed=context.seed),
     )
-    words = replace(words, training=replace(training, extractor=extractor))
-    return replace(method, words=words, settings=settings)
+    source = replace(source, training=replace(training, extractor=extractor))
+    return replace(method, source=source, settings=settings)
 
 
-def bag_of_words(argument: str, setting: Setting, inner: Method | None) -> BagOfWordsMethod:
+def bag_of_words(argument: str, context: MethodContext, inner: Method | None) -> BagOfWordsMethod:
     """Build ``bow[:setting=value,...]``."""
     refuse_inner("bow", inner)
-    method, words, training, extractor = configure(
-        "bow", argument, BagOfWordsMethod(), Words(), Training(seed=setting.seed), Extractor()
+    method, source, training, extractor = configure(
+        "bow", argument, BagOfWordsMethod(), WordModelSource(), Training(seed=context.seed), Extractor()
     )
-    return replace(method, words=replace(words, training=replace(training, extractor=extractor)))
+    return replace(method, source=replace(source, training=replace(training, extractor=extractor)))
 
 
-def thumbnails(argument: str, setting: Setting, inner: Method | None) -> ThumbnailMethod:
+def thumbnails(argument: str, context: MethodContext, inner: Method | None) -> ThumbnailMethod:
     """Build ``thumbnails[:setting=value,...]``."""
     refuse_inner("thumbnails", inner)
     method, thumbnailer = configure("thumbnails", argument, ThumbnailMethod(), Thumbnailer())

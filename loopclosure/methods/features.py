@@ -12,7 +12,7 @@ from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS, check_metric, similarity_matrix
 from loopclosure.descriptors.whitening import COMPONENTS, Whitening, learn_whitening
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodResult, Setting, refuse_overlap
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_overlap
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
 
@@ -80,10 +80,10 @@ class FeatureMethod:
             seconds["features"] = query_features.seconds_per_image * len(images.tested)
         else:
             notes.append("the file does not say how long the features took")
-        once: tuple[str, ...] = ()
+        training_stages: tuple[str, ...] = ()
         if self.whitening.whiten:
-            once = ("training whitening",)
-            with timed(seconds, *once):
+            training_stages = ("training whitening",)
+            with timed(seconds, *training_stages):
                 whole = [descriptors[:, :size] for descriptors in rows]
                 whitening = self.whitening.learn(*zip(described, whole, strict=True))
             with timed(seconds, "whitening"):
@@ -91,10 +91,10 @@ class FeatureMethod:
             notes.append(str(whitening))
         with timed(seconds, "similarity"):
             scores = similarity_matrix(rows[0], rows[1] if len(rows) == 2 else None, self.metric, views)
-        return MethodResult(scores, seconds, notes, once)
+        return MethodResult(scores, seconds, notes, training_stages)
 
 
-def features(argument: str, setting: Setting, inner: Method | None) -> FeatureMethod:
+def features(argument: str, context: MethodContext, inner: Method | None) -> FeatureMethod:
     """Build the method ``features:FILES[:euclidean|cosine][:whiten=OTHER.npz,components=512,power=1]``.
 
     FILES is PATH.npz, or QUERIES.npz,REFERENCES.npz.

@@ -14,13 +14,13 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodResult, Setting
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult
 from loopclosure.methods.baselines import ThumbnailMethod
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
 
 DIRECTIONS = ("forward", "both")
-ANCHORS = ("centre", "start")
+ANCHORS = ("center", "start")
 EDGES = ("shorten", "drop")
 
 
@@ -32,9 +32,9 @@ class SequenceSettings:
     slowest        velocities, in reference frames a query frame
     fastest
     velocity_step
-    contrast       local contrast: references i - contrast/2 .. i + contrast/2 are the neighbourhood; 0 leaves it out
+    contrast       local contrast: references i - contrast/2 .. i + contrast/2 are the neighborhood; 0 leaves it out
     directions     "forward", or "both": the references may also be passed the other way round
-    anchor         "centre" of the trajectory is the reference it stands for, or, as in OpenSeqSLAM, "start" + length/2
+    anchor         "center" of the trajectory is the reference it stands for, or, as in OpenSeqSLAM, "start" + length/2
     edges          where a trajectory leaves the matrix: "drop" it (OpenSeqSLAM), or "shorten" it, to half at the least
     """
 
@@ -44,10 +44,12 @@ class SequenceSettings:
     velocity_step: float = 0.1
     contrast: int = 10
     directions: str = "forward"
-    anchor: str = "centre"
+    anchor: str = "center"
     edges: str = "shorten"
 
     def __post_init__(self) -> None:
+        if self.anchor == "centre":  # the British spelling, still accepted
+            object.__setattr__(self, "anchor", "center")
         for value, choices, name in (
             (self.directions, DIRECTIONS, "directions"),
             (self.anchor, ANCHORS, "anchor"),
@@ -84,9 +86,9 @@ class SequenceSettings:
 
 
 def enhance_contrast(distances: np.ndarray, window: int = 10, valid: np.ndarray | None = None) -> np.ndarray:
-    """Return the distances (Q, R), each less the mean of its neighbourhood among the references, over its deviation.
+    """Return the distances (Q, R), each less the mean of its neighborhood among the references, over its deviation.
 
-    Neighbourhood: the references i - window/2 .. i + window/2 that exist and are ``valid`` (Q, R). Deviation with
+    Neighborhood: the references i - window/2 .. i + window/2 that exist and are ``valid`` (Q, R). Deviation with
     n - 1; where all are alike the result is 0. The least of all is then subtracted. What is not valid is NaN.
     """
     valid = np.ones(distances.shape, bool) if valid is None else valid
@@ -94,12 +96,12 @@ def enhance_contrast(distances: np.ndarray, window: int = 10, valid: np.ndarray 
         return np.full(distances.shape, np.nan)
     known = np.where(valid, distances, 0.0)
     count, mean, squares = (np.zeros(distances.shape) for _ in range(3))
-    neighbours = list(_neighbours(distances.shape[1], window // 2))
-    for here, there in neighbours:
+    neighbors = list(_neighbors(distances.shape[1], window // 2))
+    for here, there in neighbors:
         count[:, here] += valid[:, there]
         mean[:, here] += known[:, there]
     mean /= np.maximum(count, 1)
-    for here, there in neighbours:
+    for here, there in neighbors:
         squares[:, here] += np.where(valid[:, there], known[:, there] - mean[:, here], 0.0) ** 2
     deviation = np.sqrt(squares / np.maximum(count - 1, 1))
     differ = deviation > 1e-12 * np.abs(mean)  # the rounded mean of equal distances may leave a trace of a deviation
@@ -108,8 +110,8 @@ def enhance_contrast(distances: np.ndarray, window: int = 10, valid: np.ndarray 
     return enhanced - np.nanmin(enhanced)
 
 
-def _neighbours(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
-    """Return, for each shift up to ``reach``, the columns that have such a neighbour, and these neighbours."""
+def _neighbors(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
+    """Return, for each shift up to ``reach``, the columns that have such a neighbor, and these neighbors."""
     shifts = range(-min(reach, size - 1), min(reach, size - 1) + 1)
     return [(slice(max(0, -s), size - max(0, s)), slice(max(0, s), size - max(0, -s))) for s in shifts]
 
@@ -140,7 +142,7 @@ def trajectory_costs(distances: np.ndarray, settings: SequenceSettings) -> np.nd
     return np.where(np.isfinite(best), best, np.nan)
 
 
-def best_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray, np.ndarray]:
+def least_cost_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray, np.ndarray]:
     """Return each query's reference of least cost (Q,), -1 where none, and how unrivalled it is (Q,).
 
     The second is the ratio of that cost to the least one more than ``window`` / 2 references away, in [0, 1], smaller =
@@ -169,7 +171,7 @@ class SeqSlam:
     """SeqSLAM on the scores of another method, its own thumbnails by default.
 
     scored          "cost" of the best trajectory at each pair (sign changed), or "uniqueness": only each query's best
-                    match gets a score, 1 - its ratio to the next best (see :func:`best_matches`)
+                    match gets a score, 1 - its ratio to the next best (see :func:`least_cost_matches`)
     match_window    of the uniqueness
     exclude_frames  in one sequence, references within so many frames of the query are no candidates
     """
@@ -201,27 +203,27 @@ class SeqSlam:
             costs = np.where(valid, trajectory_costs(distances, self.settings), np.nan)
             scores = -costs if self.scored == "cost" else self._unique(costs)
         notes = [*found.notes, f"SeqSLAM, score: {self.scored}; {self.settings}"]
-        return MethodResult(scores, seconds, notes, found.once)
+        return MethodResult(scores, seconds, notes, found.training_stages)
 
     def _unique(self, costs: np.ndarray) -> np.ndarray:
-        match, ratio = best_matches(costs, self.match_window)
+        match, ratio = least_cost_matches(costs, self.match_window)
         scores = np.full(costs.shape, np.nan)
         judged = np.flatnonzero(np.isfinite(ratio))
         scores[judged, match[judged]] = 1.0 - ratio[judged]
         return scores
 
 
-def seqslam(argument: str, setting: Setting, inner: Method | None) -> SeqSlam:
+def seqslam(argument: str, context: MethodContext, inner: Method | None) -> SeqSlam:
     """Build ``seqslam[:setting=value,...]`` on SeqSLAM's thumbnails, or ``seqslam+METHOD`` on another method's scores.
 
     The second without contrast enhancement: it makes up for differences of thumbnails that mean little by themselves,
     while the scores of a descriptor are comparable from query to query, which it would undo.
     """
-    own = Thumbnailer(width=64, height=32, normalise="patch", patch=8)
+    own = Thumbnailer(width=64, height=32, normalize="patch", patch=8)
     method, settings, thumbnailer = configure(
         "seqslam",
         argument,
-        SeqSlam(ThumbnailMethod(own), exclude_frames=setting.exclude_frames),
+        SeqSlam(ThumbnailMethod(own), exclude_frames=context.exclude_frames),
         SequenceSettings(),
         own,
     )

@@ -10,6 +10,8 @@ from loopclosure.errors import InputError
 YES_NO = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 # Not of the argument: the name is the method's, the seed that of the whole evaluation.
 FIXED = ("name", "seed")
+# British spellings of settings, still accepted.
+BRITISH = {"normalise": "normalize"}
 
 
 def configure(method: str, argument: str, *parts: Any) -> list[Any]:
@@ -22,6 +24,7 @@ def configure(method: str, argument: str, *parts: Any) -> list[Any]:
     known = {f.name: i for i, part in reversed(list(enumerate(parts))) for f in fields(part) if _settable(part, f.name)}
     for item in filter(None, (text.strip() for text in argument.split(","))):
         key, equals, value = (text.strip() for text in item.partition("="))
+        key = BRITISH.get(key, key)
         if not equals or key not in known:
             raise InputError(f'{method} has no setting "{item}"; write setting=value with {", ".join(sorted(known))}')
         part = changed[known[key]]

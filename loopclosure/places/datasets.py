@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_image
+from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_bgr
 from loopclosure.places.masks import read_coordinates, read_place_pairs, read_truth_matrix
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
@@ -86,7 +86,7 @@ def load_tum(
         rule += f" (soft: {wide_m:g} m, {wide_deg:g} degrees)"
     notes = [f"frames without a pose, left out: {sequence.dropped}"] if sequence.dropped else []
     truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
-    name = f"{sequence.name}{_selection_words(selection)}"
+    name = f"{sequence.name}{_selection_text(selection)}"
     frames = _excluded_frames(exclusion, stamps)
     return _checked(DataSet(name, images, None, truth, frames, stamps, poses.positions, poses.quaternions, notes), hard)
 
@@ -138,8 +138,8 @@ def load_fabmap(
     positions = _fabmap_positions(folder, coordinates_file, len(images), places)
     rule = f"same place: as {truth_path.name} says"
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=comparable)
-    words = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
-    name = f"{folder.resolve().name}, {words}{_selection_words(selection)}"
+    views = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
+    name = f"{folder.resolve().name}, {views}{_selection_text(selection)}"
     data = DataSet(name, query_images, None, truth, exclusion.frames, None, positions, None, notes)
     return _checked(data, hard if comparable is None else hard & comparable)
 
@@ -157,7 +157,7 @@ def load_folder(
     """
     queries = image_paths(images)
     hard, soft = read_truth_matrix(truth_file)
-    name = f"{_folder_name(images)}{_selection_words(selection)}"
+    name = f"{_folder_name(images)}{_selection_text(selection)}"
     rule = f"same place: as {Path(truth_file).name} says"
     if references is not None:
         reference_images = image_paths(references)
@@ -206,7 +206,7 @@ def load_traverses(
     rule = f"same place: at most {tolerance} frames apart" if tolerance else "same place: the frame of the same number"
     soft = None if soft_tolerance is None else apart <= soft_tolerance
     truth = traverse_truth(apart <= tolerance, rule, soft=soft)
-    name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_words(selection)}"
+    name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_text(selection)}"
     return DataSet(name, [query_images[i] for i in taken], [reference_images[i] for i in taken], truth)
 
 
@@ -217,18 +217,18 @@ def load_place_pairs(folder: str | Path, selection: Selection = ALL_FRAMES) -> D
     rows = [rows[i] for i in selection.numbers(len(rows))]
     places = np.array([place for place, _, _ in rows])
     truth = traverse_truth(places[:, None] == places[None, :], "same place: the same place_id in pairs.csv")
-    name = f"{folder.resolve().name}{_selection_words(selection)}"
+    name = f"{folder.resolve().name}{_selection_text(selection)}"
     return DataSet(name, [query for _, query, _ in rows], [reference for _, _, reference in rows], truth)
 
 
-def join_images(pairs: SequenceOf[tuple[Path, Path]], folder: Path) -> list[Path]:
+def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
     """Write left and right images side by side as PNG files into ``folder``; those already there are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     joined = []
     for left, right in pairs:
         path = folder / f"{left.stem}_{right.stem}.png"
         if not path.is_file():
-            images = read_image(left), read_image(right)
+            images = read_bgr(left), read_bgr(right)
             if images[0].shape[0] != images[1].shape[0]:
                 raise InputError(f"is {images[1].shape[0]} pixels high, {left.name} {images[0].shape[0]}", right)
             if not cv2.imwrite(str(path), np.hstack(images)):
@@ -281,7 +281,7 @@ def _fabmap_positions(
     raise InputError(f"has {len(coordinates)} rows, but there are {images} images", path)
 
 
-def _only_file(folder: Path, patterns: SequenceOf[str], needed: str = "") -> Path | None:
+def _only_file(folder: Path, patterns: Sequence[str], needed: str = "") -> Path | None:
     """Return the first file of the folder that fits a pattern; without one, None, or InputError where it is needed."""
     for pattern in patterns:
         found = sorted(folder.glob(pattern))
@@ -311,15 +311,15 @@ def _excluded_frames(exclusion: Exclusion, stamps: np.ndarray) -> int:
     return max(exclusion.frames, int(np.max(np.arange(len(stamps)) - earliest)))
 
 
-def _selection_words(selection: Selection) -> str:
-    words = []
+def _selection_text(selection: Selection) -> str:
+    parts = []
     if selection.start not in (0, "0", "0%") or selection.stop is not None:
-        words.append(f"frames {selection.start} to {'the last' if selection.stop is None else selection.stop}")
+        parts.append(f"frames {selection.start} to {'the last' if selection.stop is None else selection.stop}")
     if selection.stride > 1:
-        words.append(f"every {selection.stride}{ {2: 'nd', 3: 'rd'}.get(selection.stride, 'th') }")
+        parts.append(f"every {selection.stride}{ {2: 'nd', 3: 'rd'}.get(selection.stride, 'th') }")
     if selection.limit is not None:
-        words.append(f"at most {selection.limit}")
-    return f" ({', '.join(words)})" if words else ""
+        parts.append(f"at most {selection.limit}")
+    return f" ({', '.join(parts)})" if parts else ""
 
 
 def _checked(data: DataSet, hard: np.ndarray) -> DataSet:
@@ -331,6 +331,6 @@ def _checked(data: DataSet, hard: np.ndarray) -> DataSet:
             data.notes.append(f"{lost} of {whole} pairs that show the same place are excluded as too near in time")
     if not data.truth.positives:
         raise InputError(
-            f"{data.name}: no judged pair shows the same place ({data.truth.sentence}); nothing can be found"
+            f"{data.name}: no judged pair shows the same place ({data.truth.description}); nothing can be found"
         )
     return data

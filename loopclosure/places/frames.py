@@ -102,7 +102,7 @@ def image_paths(source: str | Path) -> list[Path]:
     return images
 
 
-def read_image(path: str | Path) -> np.ndarray:
+def read_bgr(path: str | Path) -> np.ndarray:
     """Read an image (H, W, 3) uint8, BGR; InputError where it cannot be read."""
     # Read by Python, decoded by OpenCV: imread prints a warning of its own for a missing file.
     try:
@@ -143,11 +143,11 @@ def video_length(path: str | Path) -> int | None:
     return count if count > 0 else None
 
 
-def grey(image: np.ndarray) -> np.ndarray:
+def gray(image: np.ndarray) -> np.ndarray:
     """Return an (H, W, 3) BGR or (H, W) grey image, uint8, as (H, W) grey values."""
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
-def read_grey(path: Path) -> np.ndarray:
+def read_gray(path: Path) -> np.ndarray:
     """Return the picture as (H, W) uint8 grey values; InputError where there is none."""
-    return grey(read_image(path))
+    return gray(read_bgr(path))

@@ -21,7 +21,7 @@ MAX_ANGLE_DEG = 15.0
 
 
 def distances_m(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
-    """Distances (...) between the optical centres, in metres."""
+    """Distances (...) between the optical centers, in metres."""
     step = pose_a.positions - pose_b.positions
     return np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2 + step[..., 2] ** 2)
 

@@ -1,7 +1,7 @@
 """Where the camera was: the files of the TUM RGB-D benchmark.
 
 A sequence is a folder with ``rgb.txt`` (``timestamp filename``) and ``groundtruth.txt`` (``timestamp tx ty tz qx qy qz
-qw``). A pose is camera-to-world: the position of the optical centre in metres and a unit quaternion with w last; the
+qw``). A pose is camera-to-world: the position of the optical center in metres and a unit quaternion with w last; the
 camera looks along its +z, x to the right, y down. Stamps are in seconds.
 """
 
@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -33,7 +32,7 @@ class Posed(Protocol):
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Optical centres (..., 3) in metres."""
+        """Optical centers (..., 3) in metres."""
         ...
 
     @property
@@ -82,7 +81,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class PosedSequence:
     """The N frames of a sequence that have a pose, in order of time.
 
     ``stamps`` (N,) in seconds are the frames' own; ``positions`` (N, 3) in metres and ``quaternions`` (N, 4) xyzw are
@@ -154,7 +153,7 @@ def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
     return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), quaternions)
 
 
-def write_rgb_list(path: str | os.PathLike[str], frames: SequenceOf[Frame]) -> None:
+def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame]) -> None:
     """Write ``rgb.txt`` with TUM's three comment lines; stamps with microseconds."""
     lines = ["# color images", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
     lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
@@ -189,7 +188,7 @@ def associate(
     return np.where(np.abs(stamps[nearest] - frame_stamps) <= max_difference, nearest, -1)
 
 
-def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MAX_DIFFERENCE_S) -> Sequence:
+def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MAX_DIFFERENCE_S) -> PosedSequence:
     """Read a folder in TUM RGB-D layout; frames without a pose within ``max_difference`` s are counted and left out.
 
     Raises InputError where a file is missing or broken, or where no frame at all has a pose.
@@ -208,7 +207,7 @@ def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MA
             f"{stamps[-1]:.3f} s, poses from {trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s",
             folder,
         )
-    return Sequence(
+    return PosedSequence(
         name=folder.resolve().name,
         frames=tuple(frame for frame, kept in zip(frames, posed, strict=True) if kept),
         stamps=stamps[posed],

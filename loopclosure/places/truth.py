@@ -57,13 +57,13 @@ class Truth:
     hard      (Q, R) bool: the same place; must be found
     soft      (Q, R) bool, holds hard: near enough to be no mistake; what is soft alone is ignored when found
     judged    (Q, R) bool: the pairs that count; all others are no candidates, neither right nor wrong
-    sentence  what makes two frames the same place and what is excluded, to be printed with every figure
+    description  what makes two frames the same place and what is excluded, to be printed with every figure
     """
 
     hard: np.ndarray
     soft: np.ndarray
     judged: np.ndarray
-    sentence: str
+    description: str
 
     def __post_init__(self) -> None:
         assert self.hard.shape == self.soft.shape == self.judged.shape
@@ -93,7 +93,7 @@ def sequence_truth(
     """Make the truth of one sequence that meets its own places again: frame i against each earlier frame j < i.
 
     hard, soft   (N, N) bool; only the lower triangle is read
-    rule         the words for what makes two frames the same place
+    rule         text that says what makes two frames the same place
     stamps       (N,) seconds
     comparable   (N, N) bool: pairs that can be judged at all (not, say, a left with a right camera's); all by default
     """
@@ -103,8 +103,8 @@ def sequence_truth(
         judged &= comparable
     hard = np.asarray(hard, dtype=bool)
     soft = hard if soft is None else np.asarray(soft, dtype=bool) | hard
-    sentence = f"{rule}; each frame against the earlier ones; {exclusion}{_soft_words(hard, soft, judged)}"
-    return Truth(hard, soft, judged, sentence)
+    description = f"{rule}; each frame against the earlier ones; {exclusion}{_soft_text(hard, soft, judged)}"
+    return Truth(hard, soft, judged, description)
 
 
 def traverse_truth(hard: np.ndarray, rule: str, *, soft: np.ndarray | None = None) -> Truth:
@@ -112,10 +112,10 @@ def traverse_truth(hard: np.ndarray, rule: str, *, soft: np.ndarray | None = Non
     hard = np.asarray(hard, dtype=bool)
     soft = hard if soft is None else np.asarray(soft, dtype=bool) | hard
     judged = np.ones(hard.shape, dtype=bool)
-    sentence = f"{rule}; each query against all references; no pair excluded{_soft_words(hard, soft, judged)}"
-    return Truth(hard, soft, judged, sentence)
+    description = f"{rule}; each query against all references; no pair excluded{_soft_text(hard, soft, judged)}"
+    return Truth(hard, soft, judged, description)
 
 
-def _soft_words(hard: np.ndarray, soft: np.ndarray, judged: np.ndarray) -> str:
+def _soft_text(hard: np.ndarray, soft: np.ndarray, judged: np.ndarray) -> str:
     count = int(np.count_nonzero(soft & ~hard & judged))
     return f"; {count} pairs that nearly show the same place are ignored when found" if count else ""

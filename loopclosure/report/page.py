@@ -18,9 +18,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
-from loopclosure.places.frames import read_image
+from loopclosure.places.frames import read_bgr
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
-from loopclosure.report import figures as report_figures
+from loopclosure.report import plots
 from loopclosure.report.files import EXPLANATION, share, write_files
 
 PAIRS_SHOWN = 4
@@ -55,12 +55,12 @@ def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", co
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {
-        "precision_recall": report_figures.curves(evaluation),
-        "matrices": report_figures.matrices(evaluation),
-        "matches": report_figures.matches(evaluation),
+        "precision_recall": plots.curves(evaluation),
+        "matrices": plots.matrices(evaluation),
+        "matches": plots.matches(evaluation),
     }
-    if report_figures.has_map(evaluation):
-        pictures["map"] = report_figures.maps(evaluation)
+    if plots.has_map(evaluation):
+        pictures["map"] = plots.maps(evaluation)
     encoded = {name: _save(figure, folder / f"{name}.png") for name, figure in pictures.items()}
     page = folder / "report.html"
     page.write_text(_page(evaluation, encoded, title or f"Loop closure on {evaluation.data.name}", command), "utf-8")
@@ -77,7 +77,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
         frames = f"{len(data.query_images)} queries, {len(data.references)} references"
     facts = {
         "data": f"{data.name}: {frames}",
-        "truth": truth.sentence,
+        "truth": truth.description,
         "to find": f"{truth.positives:,} true pairs of {judged:,} judged ({100 * truth.positives / judged:.2f} %); "
         f"{loops} of {len(data.query_images)} queries have a loop",
         "training": evaluation.train,
@@ -90,23 +90,23 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
         title=title,
         command=command,
         data=data,
-        truth=truth.sentence,
+        truth=truth.description,
         frames=frames,
         facts=facts,
-        images=evaluation.images,
+        images=evaluation.image_count,
         outcomes=evaluation.outcomes,
         all_pairs=ALL_PAIRS,
         best_match=BEST_MATCH,
         explanation=EXPLANATION,
         recall_at=RECALL_AT,
-        figures=_figures_rows(evaluation),
+        figures=_measures_rows(evaluation),
         pictures=pictures,
         stages=_stages,
         pairs=[(outcome.name, _kinds_of_pairs(evaluation, outcome)) for outcome in evaluation.outcomes],
     )
 
 
-def _figures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, bool]]]]:
+def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, bool]]]]:
     """Return for each method its name and its figures, each with whether it is the best of several methods."""
     rows = [[v for values in o.measures.values() for v in values.values()] for o in evaluation.outcomes]
     best = [max((row[i] for row in rows if not math.isnan(row[i])), default=None) for i in range(len(rows[0]))]
@@ -118,8 +118,8 @@ def _figures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, b
 
 def _stages(outcome: Outcome) -> list[tuple[str, float, bool]]:
     """Return each stage, its seconds and whether it is done once; and the sum of those that are not."""
-    stages = [(stage, seconds, stage in outcome.once) for stage, seconds in outcome.seconds.items()]
-    return [*stages, ("all but training" if outcome.once else "in all", outcome.seconds_on_frames, False)]
+    stages = [(stage, seconds, stage in outcome.training_stages) for stage, seconds in outcome.seconds.items()]
+    return [*stages, ("all but training" if outcome.training_stages else "in all", outcome.seconds_on_frames, False)]
 
 
 def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:
@@ -129,7 +129,7 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:
     right = np.flatnonzero(matches.right)
     wrong = np.flatnonzero(answered & ~matches.right & ~matches.ignored)
     loops = np.flatnonzero(truth.queries_with_a_loop)
-    true = report_figures.best_true_references(outcome, truth, loops)
+    true = plots.best_true_references(outcome, truth, loops)
     true_scores = np.nan_to_num(outcome.scores[loops, true], nan=-np.inf)
     right = right[np.argsort(-matches.score[right], kind="stable")]
     wrong = wrong[np.argsort(-matches.score[wrong], kind="stable")]
@@ -146,7 +146,7 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:
 
 
 def _spread(queries: np.ndarray, evaluation: Evaluation) -> list[int]:
-    """Return the places of the first few queries that are not neighbours of one already taken.
+    """Return the places of the first few queries that are not neighbors of one already taken.
 
     Five times the same view says little.
     """
@@ -161,7 +161,7 @@ def _spread(queries: np.ndarray, evaluation: Evaluation) -> list[int]:
 def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) -> _Pair:
     score = outcome.scores[query, reference]
     caption = f"{query} and {reference}, {f'score {score:.4g}' if np.isfinite(score) else 'no score'}"
-    images = [read_image(path) for path in (evaluation.data.query_images[query], evaluation.data.references[reference])]
+    images = [read_bgr(path) for path in (evaluation.data.query_images[query], evaluation.data.references[reference])]
     small = [
         cv2.resize(
             image,

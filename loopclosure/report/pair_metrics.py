@@ -63,7 +63,7 @@ def pair_distances(features_a: np.ndarray, features_b: np.ndarray, metric: str =
 def best_threshold(distances: np.ndarray, labels: np.ndarray) -> float:
     """Return the threshold with the best accuracy on these pairs.
 
-    It lies half-way between two neighbouring distances. Of equally good ones the smallest is taken, since a false
+    It lies half-way between two neighboring distances. Of equally good ones the smallest is taken, since a false
     loop costs a map more than a missed one. It equals the smallest distance where calling no pair the same is best.
 
     distances   (N,); labels   (N,) 1 or True = same place

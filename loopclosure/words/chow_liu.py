@@ -92,14 +92,14 @@ def _smoothed_share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
 def _strongest_tree(
     together: np.ndarray, images: int, marginal: np.ndarray, lower_bound: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (neighbour (v,), information (v,)): each word but word 0 and the edge that ties it to the tree.
+    """Return (neighbor (v,), information (v,)): each word but word 0 and the edge that ties it to the tree.
 
     Prim's algorithm, which needs one row of information at a time. Of equally strong edges the one that comes first in
     the order (lower word, higher word) wins: the tree of Kruskal's algorithm on stably sorted edges.
     """
     size = len(together)
     frequency = np.diag(together).astype(np.float64) / images
-    neighbour = np.zeros(size, np.intp)
+    neighbor = np.zeros(size, np.intp)
     information = np.full(size, -np.inf, np.float32)
     order = np.full(size, np.iinfo(np.int64).max)
     outside = np.ones(size, bool)
@@ -110,7 +110,7 @@ def _strongest_tree(
         row = mutual_information(together[word].astype(np.float64) / images, frequency, marginal, word)
         rank = np.minimum(words, word) * size + np.maximum(words, word)
         better = outside & ((row > information) | ((row == information) & (rank < order)))
-        neighbour[better], information[better], order[better] = word, row[better], rank[better]
+        neighbor[better], information[better], order[better] = word, row[better], rank[better]
         left = np.flatnonzero(outside)
         best = left[information[left] == information[left].max()]
         word = int(best[np.argmin(order[best])])
@@ -119,12 +119,12 @@ def _strongest_tree(
                 f"{len(left)} of {size} words, word {word} among them, share less than {lower_bound:g} nat with the "
                 "others, so no tree spans them; take more training images, fewer words or a lower bound"
             )
-    return neighbour, information
+    return neighbor, information
 
 
-def _rooted(neighbour: np.ndarray, information: np.ndarray) -> np.ndarray:
+def _rooted(neighbor: np.ndarray, information: np.ndarray) -> np.ndarray:
     """Return the parents (v,) when the tree hangs from the lower word of its strongest edge."""
-    parent = neighbour.copy()
+    parent = neighbor.copy()
     strongest = np.flatnonzero(information == information.max())
     root = min((min(int(word), int(parent[word])), max(int(word), int(parent[word]))) for word in strongest)[0]
     # The edges point to word 0; those between it and the root are turned round.

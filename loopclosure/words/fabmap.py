@@ -38,7 +38,7 @@ class FabMapSettings:
     recent       the last so many images are not on the map yet: in one sequence they all look like the present one
     smoothing    share of the posterior that is kept; the rest is spread evenly
     p_new        of the motion model: prior of a new place
-    bias         of the motion model: share of the neighbours' weight that the next place gets, the rest the one before
+    bias         of the motion model: share of the neighbors' weight that the next place gets, the rest the one before
     seed         of the draws
     """
 

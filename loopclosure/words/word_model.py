@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_grey
+from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
 from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
@@ -33,7 +33,7 @@ class WordModel:
     training_images: list[Path]
     tree: WordTree
 
-    def words(
+    def count_words(
         self, images: list[Path], progress: Progress = silent, seconds: dict[str, float] | None = None
     ) -> np.ndarray:
         """Return how often each word occurs in each image: (n, v) int32."""
@@ -41,7 +41,7 @@ class WordModel:
         counts = np.zeros((len(images), len(self.vocabulary)), np.int32)
         for i, path in enumerate(progress(images, "features", len(images))):
             with timed(seconds, "features"):
-                descriptors = self.vocabulary.extractor(read_grey(path))
+                descriptors = self.vocabulary.extractor(read_gray(path))
             with timed(seconds, "words"):
                 counts[i] = self.vocabulary.count_descriptors(descriptors)
         return counts
@@ -53,7 +53,7 @@ class WordModel:
             np.savez_compressed(
                 file,
                 settings=json.dumps(settings),
-                centres=self.vocabulary.centres,
+                centres=self.vocabulary.centers,
                 training_words=self.training_words,
                 training_images=np.array([str(image) for image in self.training_images], str),
                 parent=self.tree.parent,
@@ -121,17 +121,17 @@ def train(
     found = []
     for path in progress(paths, "training features", len(paths)):
         with timed(seconds, "training features"):
-            found.append(training.extractor(read_grey(path)))
+            found.append(training.extractor(read_gray(path)))
     with timed(seconds, "vocabulary"):
         sample = np.concatenate([d if len(d) <= share else rng.choice(d, share, replace=False) for d in found])
         if training.words:
-            centres = kmeans(sample, training.words, training.seed)
-            how = f"k-means, {len(centres)} words"
+            centers = kmeans(sample, training.words, training.seed)
+            how = f"k-means, {len(centers)} words"
         else:
-            centres = sequential_clusters(sample, training.radius, training.seed)
-            how = f"sequential clustering, radius {training.radius:g}, {len(centres)} words"
+            centers = sequential_clusters(sample, training.radius, training.seed)
+            how = f"sequential clustering, radius {training.radius:g}, {len(centers)} words"
     made = f"{how} of {len(sample)} descriptors of {len(paths)} training images, seed {training.seed}"
-    vocabulary = Vocabulary(centres, training.extractor, made)
+    vocabulary = Vocabulary(centers, training.extractor, made)
     with timed(seconds, "training words"):
         words = np.stack([vocabulary.count_descriptors(descriptors) for descriptors in found])
     with timed(seconds, "tree"):

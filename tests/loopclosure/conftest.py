@@ -15,9 +15,9 @@ def blots(seed: int, height: int = 48, width: int = 64) -> np.ndarray:
     rng = np.random.default_rng(seed)
     image = np.full((height, width, 3), 128, np.uint8)
     for _ in range(40):
-        centre = rng.integers(0, (width, height))
-        colour = [int(c) for c in rng.integers(0, 256, 3)]
-        cv2.circle(image, (int(centre[0]), int(centre[1])), int(rng.integers(2, 9)), colour, -1)
+        center = rng.integers(0, (width, height))
+        color = [int(c) for c in rng.integers(0, 256, 3)]
+        cv2.circle(image, (int(center[0]), int(center[1])), int(rng.integers(2, 9)), color, -1)
     return image
 
 
@@ -25,7 +25,7 @@ def blots(seed: int, height: int = 48, width: int = 64) -> np.ndarray:
 def two_laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two rounds on a circle of 20 places, one a second, in TUM RGB-D layout; the second is a little darker.
 
-    Neighbouring places are 18 degrees apart, so that only frames i and i + 20 show the same place.
+    Neighboring places are 18 degrees apart, so that only frames i and i + 20 show the same place.
     """
     folder = tmp_path_factory.mktemp("data") / "two_laps"
     (folder / "rgb").mkdir(parents=True)

@@ -118,10 +118,10 @@ def test_one_sequence_is_judged_below_the_diagonal_and_outside_the_exclusion():
     assert {(3, 0), (4, 0), (4, 1)} == {(int(i), int(j)) for i, j in np.argwhere(truth.judged)}
     assert truth.positives == 3
     assert list(truth.queries_with_a_loop) == [False, False, False, True, True]
-    assert "at most 2 frames apart" in truth.sentence
+    assert "at most 2 frames apart" in truth.description
     scores = np.arange(25.0).reshape(5, 5)
     assert list(JudgedScores(scores, truth).best_matches.reference) == [-1, -1, -1, 0, 1]
-    assert JudgedScores(scores, truth).all_pairs_curve().exclusion == truth.sentence
+    assert JudgedScores(scores, truth).all_pairs_curve().truth_description == truth.description
 
 
 def test_seconds_exclude_by_stamps():

@@ -7,16 +7,16 @@ from scipy.spatial.transform import Rotation
 from lmdb_build.pairs.by_pose import PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import Frame, Sequence
+from loopclosure.places.trajectory import Frame, PosedSequence
 
 
-def sequence(name: str, views: list[tuple[float, float, float]]) -> Sequence:
+def sequence(name: str, views: list[tuple[float, float, float]]) -> PosedSequence:
     """Frames at (second, x in metres, heading in degrees)."""
     stamps, x, heading = np.array(views, float).T
     quaternions = Rotation.from_euler("y", heading[:, None], degrees=True).as_quat()
     positions = np.column_stack([x, np.zeros((len(x), 2))])
     frames = tuple(Frame(stamp, f"rgb/{stamp:g}.png") for stamp in stamps)
-    return Sequence(name, frames, stamps, positions, quaternions, 0)
+    return PosedSequence(name, frames, stamps, positions, quaternions, 0)
 
 
 # Index: 0 and 1 are neighbours in time and place, 2 a revisit of 0, 3 turned by 20 degrees, 4 by 90, 5 far away.

@@ -13,10 +13,10 @@ from lmdb_build.pairs.choose import NEGATIVE, POSITIVE, choose_pairs, find_pairs
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import same_place
-from loopclosure.places.trajectory import Frame, Poses, Sequence
+from loopclosure.places.trajectory import Frame, PosedSequence, Poses
 
 
-def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> Sequence:
+def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> PosedSequence:
     """A camera that turns and strays about, back to where it was now and then."""
     rng = np.random.default_rng(seed)
     stamps = start_s + np.arange(count) / 10
@@ -24,7 +24,7 @@ def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> Sequence:
     positions = np.cumsum(rng.normal(0, 0.15, (count, 3)), axis=0)
     quaternions = np.column_stack([np.zeros((count, 2)), np.sin(yaw / 2), np.cos(yaw / 2)])
     frames = tuple(Frame(float(stamp), f"rgb/{stamp:.6f}.png") for stamp in stamps)
-    return Sequence(name, frames, stamps, positions, quaternions, 0)
+    return PosedSequence(name, frames, stamps, positions, quaternions, 0)
 
 
 def pose_source(lengths: tuple[int, ...] = (120, 90, 110), rule: PoseRule | None = None) -> PoseSource:

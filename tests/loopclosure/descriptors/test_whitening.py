@@ -17,7 +17,7 @@ from loopclosure.descriptors.whitening import learn_whitening
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, make_method
 from loopclosure.methods.features import FeatureMethod, WhitenBy
-from loopclosure.places.frames import read_image
+from loopclosure.places.frames import read_bgr
 from loopclosure.progress import silent
 
 PLACES = 20
@@ -180,7 +180,7 @@ def test_queries_and_references(tmp_path, training, laps):
     result = method.score(Images(images, images), silent)
     assert found(result.scores) == 1
     assert list(result.seconds) == ["training whitening", "whitening", "similarity"]
-    assert result.once == ("training whitening",)
+    assert result.training_stages == ("training whitening",)
 
 
 def test_each_view_is_whitened(files, training, laps):
@@ -288,7 +288,7 @@ def test_detect(two_laps, files, tmp_path, capsys):
 
 def test_detect_whitens_what_describe_returns(two_laps, tmp_path, capsys):
     describe = Thumbnailer()
-    rows = np.stack([describe(read_image(two_laps / "rgb" / f"{i}.png")).reshape(-1) for i in range(PLACES)])
+    rows = np.stack([describe(read_bgr(two_laps / "rgb" / f"{i}.png")).reshape(-1) for i in range(PLACES)])
     np.savez(tmp_path / "other.npz", features=rows)
     saved = tmp_path / "detector.npz"
     words = ["detect", str(two_laps), "--threshold", "-0.5", "--save", str(saved), "--out", str(tmp_path)]

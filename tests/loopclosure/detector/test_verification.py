@@ -14,8 +14,8 @@ def wall(seed):
     rng = np.random.default_rng(seed)
     image = np.full((240, 320, 3), 128, np.uint8)
     for _ in range(220):
-        centre = rng.integers(0, (320, 240))
-        cv2.circle(image, tuple(int(c) for c in centre), int(rng.integers(3, 22)), rng.integers(0, 256, 3).tolist(), -1)
+        center = rng.integers(0, (320, 240))
+        cv2.circle(image, tuple(int(c) for c in center), int(rng.integers(3, 22)), rng.integers(0, 256, 3).tolist(), -1)
     return cv2.GaussianBlur(image, (0, 0), 1.0)
 
 

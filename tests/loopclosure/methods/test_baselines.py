@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from loopclosure.descriptors.thumbnails import Thumbnailer
+from loopclosure.detector.run import load_describe
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Setting, make_method
+from loopclosure.methods.base import Images, MethodContext, make_method
 from loopclosure.methods.baselines import BagOfWordsMethod, FabMapMethod, ThumbnailMethod
 from loopclosure.progress import silent
 from loopclosure.words.word_model import WordModel
@@ -49,7 +51,7 @@ def test_two_traverses(spec: str, images: dict[str, list[Path]]) -> None:
 @pytest.mark.parametrize("spec", [f"fabmap:{WORDS}", f"bow:{WORDS}", "thumbnails"])
 def test_one_sequence(spec: str, images: dict[str, list[Path]]) -> None:
     walk = images["first"] + images["again"]
-    result = make_method(spec, Setting(exclude_frames=2)).score(Images(walk, None, images["train"]), silent)
+    result = make_method(spec, MethodContext(exclude_frames=2)).score(Images(walk, None, images["train"]), silent)
     assert result.scores.shape == (2 * PLACES, 2 * PLACES)
     assert np.isfinite(result.scores[np.tril_indices(2 * PLACES, -1)]).all()
     earlier = np.where(np.tri(2 * PLACES, 2 * PLACES, -3, dtype=bool), result.scores, -np.inf)
@@ -92,21 +94,35 @@ def test_training_images_are_needed_and_are_not_tested(spec: str, images: dict[s
         make_method(spec).score(Images(images["again"], images["first"], images["first"]), silent)
 
 
+@pytest.mark.parametrize(
+    ("american", "british"),
+    [
+        ("thumbnails:normalize=none", "thumbnails:normalise=none"),
+        ("seqslam:normalize=image,anchor=center", "seqslam:normalise=image,anchor=centre"),
+    ],
+)
+def test_settings_may_be_spelled_the_british_way(american: str, british: str) -> None:
+    assert make_method(british) == make_method(american) != make_method(american.partition(":")[0])
+    options = {"normalise": "patch"}
+    assert load_describe("loopclosure.baselines.thumbnails:Thumbnailer", options) == Thumbnailer(normalize="patch")
+
+
 def test_settings_reach_the_part_they_belong_to() -> None:
     fabmap = make_method(
-        "fabmap:words=77, kind=orb,version=1,samples=9,motion=yes,scored=posterior", Setting(exclude_frames=6, seed=4)
+        "fabmap:words=77, kind=orb,version=1,samples=9,motion=yes,scored=posterior",
+        MethodContext(exclude_frames=6, seed=4),
     )
     assert isinstance(fabmap, FabMapMethod)
-    assert (fabmap.words.training.words, fabmap.words.training.extractor.kind) == (77, "orb")
+    assert (fabmap.source.training.words, fabmap.source.training.extractor.kind) == (77, "orb")
     assert (fabmap.settings.version, fabmap.settings.samples, fabmap.settings.motion) == (1, 9, True)
-    assert (fabmap.settings.recent, fabmap.settings.seed, fabmap.words.training.seed) == (6, 4, 4)
+    assert (fabmap.settings.recent, fabmap.settings.seed, fabmap.source.training.seed) == (6, 4, 4)
     assert fabmap.scored == "posterior"
     bow = make_method("bow:metric=cosine,radius=0.5,root=no")
     assert isinstance(bow, BagOfWordsMethod)
-    assert (bow.metric, bow.words.training.radius, bow.words.training.extractor.root) == ("cosine", 0.5, False)
-    small = make_method("thumbnails:width=16,normalise=none")
+    assert (bow.metric, bow.source.training.radius, bow.source.training.extractor.root) == ("cosine", 0.5, False)
+    small = make_method("thumbnails:width=16,normalize=none")
     assert isinstance(small, ThumbnailMethod)
-    assert (small.thumbnailer.width, small.thumbnailer.normalise) == (16, "none")
+    assert (small.thumbnailer.width, small.thumbnailer.normalize) == (16, "none")
 
 
 @pytest.mark.parametrize(
@@ -132,7 +148,7 @@ def test_corridor_loop_with_its_two_images_without_features() -> None:
     corridor = shared("data", "corridor_loop", "samples")
     train = sorted(shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy", "rgb").glob("*.jpg"))[::12]
     walk = [corridor / f"{k}.jpg" for k in range(1, 85)]
-    result = make_method("fabmap:words=300,max_features=150", Setting(exclude_frames=10)).score(
+    result = make_method("fabmap:words=300,max_features=150", MethodContext(exclude_frames=10)).score(
         Images(walk, None, train), silent
     )
     assert "2 of 84 images have no feature at all: places without words" in result.notes

@@ -45,8 +45,8 @@ def test_tum_truth_is_the_papers_rule(tum_folder):
     assert data.truth.judged[10, 0]
     assert not data.truth.judged[9, 0]
     assert data.exclude_frames == 9
-    assert "2 m" in data.truth.sentence
-    assert "less than 10 s apart" in data.truth.sentence
+    assert "2 m" in data.truth.description
+    assert "less than 10 s apart" in data.truth.description
     assert data.notes[0] == "frames without a pose, left out: 1"
     assert data.notes[1].startswith("71 of 180 pairs")
 
@@ -145,7 +145,7 @@ def test_folder_with_a_mask_in_natural_order(tmp_path):
     assert [path.stem for path in data.query_images] == [str(i + 1) for i in range(12)]
     assert np.argwhere(data.truth.hard).tolist() == [[11, 0]]
     assert np.argwhere(data.truth.soft).tolist() == [[10, 0], [11, 0]]
-    assert "1 pairs that nearly show the same place are ignored" in data.truth.sentence
+    assert "1 pairs that nearly show the same place are ignored" in data.truth.description
 
 
 def test_folder_masks_on_either_side_of_the_diagonal(tmp_path):

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from loopclosure.evaluate import evaluate, named_method
-from loopclosure.methods.base import MethodResult, Setting
+from loopclosure.methods.base import MethodContext, MethodResult
 from loopclosure.places.datasets import load_traverses, load_tum
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
-from loopclosure.report.figures import best_true_references, decisions
-from loopclosure.report.files import figures_text
+from loopclosure.report.files import measures_text
 from loopclosure.report.page import write_report
+from loopclosure.report.plots import best_true_references, decisions
 
 
 class Says:
@@ -51,7 +51,7 @@ class Tags(HTMLParser):
 def evaluation(two_laps, two_laps_features):
     rng = np.random.default_rng(0)
     methods = [
-        named_method(f"A net & more=features:{two_laps_features}", Setting()),
+        named_method(f"A net & more=features:{two_laps_features}", MethodContext()),
         ("<noise>", Says(rng.normal(size=(40, 40)))),
         ("silent", Says(np.full((40, 40), np.nan))),
     ]
@@ -84,7 +84,7 @@ def test_the_page_stands_alone_and_says_what_it_judges_by(evaluation, folder):
 def test_what_is_named_maliciously_is_text(two_laps, tmp_path):
     evil = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7 * 7 }}{% raw %}$\\frac{"
     data = load_tum(two_laps)
-    data = replace(data, name=evil, notes=[evil], truth=replace(data.truth, sentence=evil))
+    data = replace(data, name=evil, notes=[evil], truth=replace(data.truth, description=evil))
     says = MethodResult(np.zeros((40, 40)), {evil: 1.0}, [evil])
     evaluation = evaluate(data, [(evil, Says(says.scores, says)), (evil.upper(), Says(says.scores))], train=evil)
     page = write_report(evaluation, tmp_path, evil, f"loopclosure evaluate --title {evil}").read_text()
@@ -132,8 +132,8 @@ def test_figures_are_the_same_in_csv_json_and_text(evaluation, folder):
         )
         assert float(cell["value"]) == pytest.approx(expected, abs=1e-6)
         assert "less than 10 s apart excluded" in cell["truth and exclusion"]
-        assert f"{expected:.3f}" in figures_text(evaluation)
-    assert summary["truth_and_exclusion"] == evaluation.data.truth.sentence
+        assert f"{expected:.3f}" in measures_text(evaluation)
+    assert summary["truth_and_exclusion"] == evaluation.data.truth.description
     assert summary["true_pairs"] == evaluation.data.truth.positives
     assert summary["queries_with_a_loop"] == 20
 
@@ -199,7 +199,7 @@ def test_two_traverses_without_positions(tmp_path):
 
 
 def test_large_matrices_are_drawn_without_losing_loops():
-    from loopclosure.report.figures import _greatest_of_blocks
+    from loopclosure.report.plots import _greatest_of_blocks
 
     values = np.zeros((1001, 900))
     values[700, 333] = 1.0

@@ -11,7 +11,7 @@ from loopclosure.evaluate import Evaluation, evaluate
 from loopclosure.methods.base import MethodResult
 from loopclosure.places.datasets import DataSet
 from loopclosure.places.truth import Exclusion, sequence_truth
-from loopclosure.report.figures import curves, matches, matrices
+from loopclosure.report.plots import curves, matches, matrices
 from paths import ROOT
 
 FRAMES = 40

@@ -24,10 +24,10 @@ from loopclosure.evaluate import Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import BEST_MATCH, PrecisionRecall
 
-# Told apart by colour-blind readers too (Okabe and Ito).
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+# Told apart by color-blind readers too (Okabe and Ito).
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 FOUND, FALSE, MISSED = "#1a9641", "#d7191c", "#9e9e9e"
-LINES = ("-", "--", ":", "-.")  # a second round of the colours is dashed, and so on
+LINES = ("-", "--", ":", "-.")  # a second round of the colors is dashed, and so on
 LABEL_WIDTH = 60  # letters of a legend's line that fit below a panel
 LABELS_HEIGHT = 0.5  # inches for the tick labels and the label of the horizontal axis
 NOT_JUDGED = "#ececec"
@@ -149,13 +149,13 @@ def best_true_references(outcome: Outcome, truth: Truth, queries: np.ndarray) ->
     return np.nanargmax(scores, axis=1)
 
 
-def _draw_matrix(axis: Axes, values: np.ndarray, colours: Colormap, low: float, high: float) -> None:
+def _draw_matrix(axis: Axes, values: np.ndarray, colors: Colormap, low: float, high: float) -> None:
     rows, columns = values.shape
-    colours = colours.with_extremes(bad=NOT_JUDGED)
+    colors = colors.with_extremes(bad=NOT_JUDGED)
     shown = _greatest_of_blocks(values, -(-max(rows, columns) // SHOWN_CELLS))
     axis.imshow(
         shown,
-        cmap=colours,
+        cmap=colors,
         vmin=low,
         vmax=max(high, low + 1e-12),
         interpolation="nearest" if max(shown.shape) < 250 else "antialiased",
@@ -177,15 +177,15 @@ def _greatest_of_blocks(values: np.ndarray, step: int) -> np.ndarray:
 
 def _draw_curve(axis: Axes, curve: PrecisionRecall, name: str, number: int) -> None:
     """Draw the steps whose area is the average precision, and a dot where precision leaves 1."""
-    colour = COLOURS[number % len(COLOURS)]
-    line = LINES[number // len(COLOURS) % len(LINES)]
+    color = COLORS[number % len(COLORS)]
+    line = LINES[number // len(COLORS) % len(LINES)]
     recall, precision = np.append(0.0, curve.recall), np.append(curve.precision[:1], curve.precision)
     recall = recall[: len(precision)]  # a method that says nothing has no point
     area = f"{curve.average_precision:.3f}"
     label = textwrap.fill(f"{area}  {name}", LABEL_WIDTH, subsequent_indent=" " * 11)
-    axis.plot(recall, precision, line, color=colour, linewidth=1.3, label=label, drawstyle="steps-pre")
+    axis.plot(recall, precision, line, color=color, linewidth=1.3, label=label, drawstyle="steps-pre")
     if curve.recall_at_full_precision > 0:
-        axis.plot([curve.recall_at_full_precision], [1.0], "o", color=colour, markersize=4, clip_on=False)
+        axis.plot([curve.recall_at_full_precision], [1.0], "o", color=color, markersize=4, clip_on=False)
 
 
 def _legends_below(figure: Figure, axes: Iterable[Axes]) -> None:
@@ -220,11 +220,11 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
         (found, outcome.matches.reference[found], FOUND, 0.9),
         (false, outcome.matches.reference[false], FALSE, 0.9),
     ]
-    for order, (queries, references, colour, width) in enumerate(lines, start=2):
+    for order, (queries, references, color, width) in enumerate(lines, start=2):
         chords = np.stack([place[queries], place[references]], axis=1)
         thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords are one blot
-        axis.add_collection(LineCollection(list(chords), colors=colour, linewidths=width * thin, zorder=order))
-        axis.plot(place[queries, 0], place[queries, 1], ".", color=colour, markersize=2.5, zorder=order)
+        axis.add_collection(LineCollection(list(chords), colors=color, linewidths=width * thin, zorder=order))
+        axis.plot(place[queries, 0], place[queries, 1], ".", color=color, markersize=2.5, zorder=order)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel(f"{'xyz'[across]} [m]")
     axis.set_ylabel(f"{'xyz'[along]} [m]")
@@ -234,7 +234,7 @@ def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
     found, false, missed = decisions(outcome, truth)
     rows, columns = np.nonzero(truth.hard & truth.judged)
     axis.plot(columns, rows, ".", color="#d8d8d8", markersize=3, zorder=1)
-    for order, (queries, references, colour) in enumerate(
+    for order, (queries, references, color) in enumerate(
         [
             (missed, best_true_references(outcome, truth, missed), MISSED),
             (found, outcome.matches.reference[found], FOUND),
@@ -242,23 +242,23 @@ def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
         ],
         start=2,
     ):
-        axis.plot(references, queries, ".", color=colour, markersize=4, zorder=order)
+        axis.plot(references, queries, ".", color=color, markersize=4, zorder=order)
     axis.set_xlim(-1, truth.hard.shape[1])
     axis.set_ylim(truth.hard.shape[0], -1)
     axis.set_xlabel("reference")
 
 
 def _loop_legend(figure: Figure) -> None:
-    colours = ((FOUND, "found"), (FALSE, "false"), (MISSED, "missed"))
-    lines = [Line2D([], [], color=colour, linewidth=2, label=label) for colour, label in colours]
+    colors = ((FOUND, "found"), (FALSE, "false"), (MISSED, "missed"))
+    lines = [Line2D([], [], color=color, linewidth=2, label=label) for color, label in colors]
     figure.legend(handles=lines, loc="outside upper center", ncols=3)
 
 
 def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -> None:
     """Print below the figure what it is judged by, so that it stands by itself."""
-    words = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.sentence}"
+    text = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.description}"
     width = int(figure.get_figwidth() * 22)  # letters of this size that fit into the width
-    figure.supxlabel(textwrap.fill(words, width), fontsize=6.5, color="#777777", parse_math=False)
+    figure.supxlabel(textwrap.fill(text, width), fontsize=6.5, color="#777777", parse_math=False)
 
 
 def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
@@ -275,9 +275,9 @@ def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
     return figure, flat[:panels]
 
 
-def _label_left(axes: list[Axes], words: str) -> None:
+def _label_left(axes: list[Axes], label: str) -> None:
     """Label the vertical axis of the first panel of each row."""
     for axis in axes:
         place = axis.get_subplotspec()
         if place is not None and place.is_first_col():
-            axis.set_ylabel(words)
+            axis.set_ylabel(label)
