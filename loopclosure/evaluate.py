@@ -1,4 +1,4 @@
-"""Any set of methods on one data set: scores, figures in both conventions, times."""
+"""Any set of methods on one data set: scores, measures by both conventions, times."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ RECALL_AT = (1, 5, 10)
 
 @dataclass(frozen=True)
 class Outcome:
-    """One method, judged.
+    """One method on one data set: what it answered, and how good that is.
 
     scores     (Q, R), as the method gave them
-    pairs      the curve over all pairs;  best  that of the best match of each query
+    pairs      the curve over all pairs;  best  the curve of the best match of each query
     matches    the best match of each query
     recall_at  k -> share of the queries with a loop that have one among their best k
-    seconds    stage -> seconds in all
+    seconds    stage -> total seconds
     training_stages  the stages done once, on training images
     """
 
@@ -42,7 +42,7 @@ class Outcome:
 
     @property
     def seconds_on_frames(self) -> float:
-        """Return the seconds in all that grew with the frames, training left out."""
+        """Return the total seconds spent on the frames, without training."""
         return sum(seconds for stage, seconds in self.seconds.items() if stage not in self.training_stages)
 
     @cached_property
@@ -62,7 +62,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All methods on one data set; ``train`` says on which images vocabularies and the like were made."""
+    """All methods on one data set; ``train`` says which images vocabularies and the like were learned from."""
 
     data: DataSet
     outcomes: list[Outcome]
@@ -75,7 +75,7 @@ class Evaluation:
 
 
 def named_method(text: str, context: MethodContext) -> tuple[str, Method]:
-    """Build a method from ``LABEL=METHOD`` or ``METHOD``, and the name it is shown by."""
+    """Build a method from ``LABEL=METHOD`` or ``METHOD``; return the name to show, and the method."""
     label, equals, spec = text.partition("=")
     if not equals or ":" in label:  # the = of a setting, which follows the colon of its method
         method = make_method(text, context)
@@ -90,11 +90,11 @@ def evaluate(
     train: str = "",
     progress: Progress = silent,
 ) -> Evaluation:
-    """Run the methods one after the other on ``data`` and judge each; ``train`` says what the training images are."""
+    """Run the methods on ``data``, one after the other, and judge each; ``train`` describes the training images."""
     names = [name for name, _ in methods]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f'two methods are called "{twice[0]}"; name them, as in --method "first=features:a.npz"')
+        raise InputError(f'two methods are called "{twice[0]}"; give them names, as in --method "first=features:a.npz"')
     outcomes = [judge(name, method, data, train_images, progress) for name, method in methods]
     return Evaluation(data, outcomes, train or f"{len(train_images)} training images")
 
@@ -102,14 +102,14 @@ def evaluate(
 def judge(
     name: str, method: Method, data: DataSet, train_images: Sequence[Path] = (), progress: Progress = silent
 ) -> Outcome:
-    """Run one method and judge what it says."""
+    """Run one method and judge its scores."""
     result = method.score(Images(data.query_images, data.reference_images, list(train_images)), progress)
     judged_scores = JudgedScores(result.scores, data.truth)
     silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
     notes = list(result.notes)
     if silent_pairs:
         judged = int(np.count_nonzero(data.truth.judged))
-        notes.append(f"it says nothing of {silent_pairs} of {judged} judged pairs, which counts as no loop")
+        notes.append(f"no score for {silent_pairs} of {judged} judged pairs, which counts as no loop")
     return Outcome(
         name=name,
         scores=result.scores,

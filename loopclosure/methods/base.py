@@ -1,7 +1,7 @@
-"""What a place-recognition method is to the judge, and the names of the methods on the command line.
+"""The interface of a place-recognition method, and the names of the methods on the command line.
 
-A method gets the images of the queries and of the references and returns one matrix of scores. How it came to them
-(features of a net, words, sequences) is its own affair, so that all of them stand in one table.
+A method gets the images of the queries and of the references and returns one matrix of scores, however it computes them
+(features of a net, words, sequences), so that all methods can be compared in one table.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Images:
     """The images that a method is given.
 
     queries     Q paths
-    references  R paths; None for one sequence that meets its own places again: the queries are the references, and
+    references  R paths; None for one sequence that visits its own places again: the queries are the references, and
                 frame i may match the frames before it
-    train       for vocabularies and the like; may be empty, which a method that needs them refuses with an InputError
+    train       for vocabularies and the like; may be empty: a method that needs them raises InputError
     """
 
     queries: list[Path]
@@ -34,15 +34,15 @@ class Images:
 
     @property
     def tested(self) -> list[Path]:
-        """The queries, then the references where they are other images."""
+        """The queries, then the references if they are other images."""
         return self.queries + (self.references or [])
 
 
 @dataclass
 class MethodResult:
-    """What a method says of every query and every reference.
+    """The answer of a method.
 
-    scores           (Q, R) floats, higher = more alike; NaN where the method gives no score (the upper triangle of an
+    scores           (Q, R) floats, higher = more similar; NaN if the method gives no score (the upper triangle of an
                      online one)
     seconds          stage -> total seconds spent on it, in the order of the work
     notes            sentences for the report: settings, sizes of vocabularies, what was left out
@@ -56,7 +56,7 @@ class MethodResult:
 
 
 class Method(Protocol):
-    """A place-recognition method; a dataclass with its settings as fields serves well."""
+    """A place-recognition method, for example a dataclass with its settings as fields."""
 
     name: str
 
@@ -67,10 +67,11 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class MethodContext:
-    """What a method may have to know of the evaluation it takes part in.
+    """What a method may need to know about the evaluation.
 
-    exclude_frames   in one sequence, |i - j| <= exclude_frames is no candidate (SeqSLAM has to know before it searches)
-    seed             of everything drawn by lot
+    exclude_frames   in one sequence, frames with |i - j| <= exclude_frames are not candidates (SeqSLAM must know this
+                     before it searches)
+    seed             of all random numbers
     """
 
     exclude_frames: int = 0
@@ -108,7 +109,7 @@ def make_method(spec: str, context: MethodContext | None = None) -> Method:
 
 
 def refuse_overlap(train_images: list[Path], test_images: list[Path], model: str | Path = "") -> None:
-    """Raise InputError when an image is trained on and tested: a vocabulary that knows the test flatters itself."""
+    """Raise InputError if an image is used for training and testing, which would give too good a result."""
     trained = {Path(path).resolve() for path in train_images}
     shared = [path for path in test_images if Path(path).resolve() in trained]
     if shared:

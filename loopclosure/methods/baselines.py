@@ -1,7 +1,8 @@
-"""The baselines as methods of the judge: ``fabmap``, ``bow`` and ``thumbnails`` on the command line.
+"""The baselines as methods: ``fabmap``, ``bow`` and ``thumbnails`` on the command line.
 
 Their argument is a comma-separated list of ``setting=value``; the settings are the fields of the classes below and of
-those they name. ``fabmap:model=words.npz,score=posterior`` keeps its vocabulary in a file and reads it the next time.
+the classes of these fields. ``fabmap:model=words.npz,scored=posterior`` writes its vocabulary to a file, and reads it
+the next time.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from loopclosure.words.word_model import TRAINING_STAGES, Training, WordModel, t
 
 @dataclass(frozen=True)
 class WordModelSource:
-    """Where the words of images come from: trained, or read from ``model`` (written there when it does not exist)."""
+    """Where the word model comes from: trained, or read from ``model`` (written there if it does not exist)."""
 
     training: Training = field(default_factory=Training)
     model: str = ""
 
     def learn(self, images: Images, progress: Progress, seconds: dict[str, float]) -> tuple[WordModel, list[str]]:
-        """Return the model and notes on it; refuse one that was trained on a test image."""
+        """Return the model and notes about it; refuse a model that was trained on a test image."""
         path = Path(self.model)
         if self.model and path.exists():
             model = WordModel.load(path)
@@ -53,7 +54,7 @@ class WordModelSource:
 
 @dataclass
 class _WordMethod:
-    """The part that methods on words have in common."""
+    """The common part of methods on visual words."""
 
     source: WordModelSource = field(default_factory=WordModelSource)
 
@@ -65,7 +66,7 @@ class _WordMethod:
         counts = model.count_words(images.tested, progress, seconds)
         empty = int((counts.sum(axis=1) == 0).sum())
         if empty:
-            notes.append(f"{empty} of {len(counts)} images have no feature at all: places without words")
+            notes.append(f"{empty} of {len(counts)} images have no features: places without words")
         size = len(images.queries)
         return model, counts[:size], None if images.references is None else counts[size:], notes
 
@@ -120,7 +121,7 @@ class BagOfWordsMethod(_WordMethod):
 
 @dataclass
 class ThumbnailMethod:
-    """Thumbnails, the mean absolute difference with its sign changed."""
+    """Thumbnails; the score is minus the mean absolute difference."""
 
     thumbnailer: Thumbnailer = field(default_factory=Thumbnailer)
     name: str = "thumbnails"
@@ -136,7 +137,7 @@ class ThumbnailMethod:
         with timed(seconds, "differences"):
             queries, references = np.split(small, [len(images.queries)])
             scores = -differences(queries, queries if images.references is None else references)
-        return MethodResult(scores, seconds, [f"mean absolute difference of grey thumbnails; {self.thumbnailer}"])
+        return MethodResult(scores, seconds, [f"mean absolute difference of gray thumbnails; {self.thumbnailer}"])
 
 
 def fabmap(argument: str, context: MethodContext, inner: Method | None) -> FabMapMethod:
@@ -172,6 +173,6 @@ def thumbnails(argument: str, context: MethodContext, inner: Method | None) -> T
 
 
 def refuse_inner(method: str, inner: Method | None) -> None:
-    """Raise InputError when a method that looks at images is written as refining another."""
+    """Raise InputError if a method that works on images is given another method to refine."""
     if inner is not None:
         raise InputError(f"{method}+{inner.name}: {method} works on images, not on the scores of another method")

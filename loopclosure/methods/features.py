@@ -1,4 +1,4 @@
-"""Descriptors of files as a method of the judge, compared as they are or whitened: ``features`` on the command line."""
+"""Descriptors from files as a method, compared as they are or whitened: ``features`` on the command line."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from loopclosure.methods.base import Images, Method, MethodContext, MethodResult
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
 
-# Where the settings of features:FILES[:METRIC][:SETTINGS] begin; after a comma, whiten= is a setting too and no file.
+# Where the settings of features:FILES[:METRIC][:SETTINGS] begin; after a comma, whiten= begins the settings too.
 SETTINGS_BEGIN = re.compile(r":(?=\w+=)|,(?=whiten=)")
 
 
 @dataclass(frozen=True)
 class WhitenBy:
-    """The settings of a whitening: the file ``whiten`` with descriptors of other images, none where it is empty."""
+    """The settings of a whitening: the file ``whiten`` has descriptors of other images; empty: no whitening."""
 
     whiten: str = ""
     components: int = COMPONENTS
     power: float = 1.0
 
     def learn(self, *tested: tuple[list[Path], np.ndarray]) -> Whitening:
-        """Learn the whitening from every view that the file describes.
+        """Learn the whitening from all views in the file.
 
-        Refuse to learn it from what is ``tested``: N images with the descriptors (N, D) of their first views.
+        Raises InputError if the file has an image that is ``tested``: N images, the descriptors (N, D) of their first
+        views.
         """
         training = read_features(self.whiten)
         views = np.split(training.features, training.views, axis=1)
@@ -44,7 +45,7 @@ class WhitenBy:
 
 @dataclass(frozen=True)
 class FeatureMethod:
-    """Descriptors from files, compared in one metric; one file for queries and references, or one for each."""
+    """Descriptors from files, compared by one metric; one file for queries and references, or one file for each."""
 
     query_file: Path
     reference_file: Path
@@ -53,11 +54,11 @@ class FeatureMethod:
 
     @property
     def name(self) -> str:
-        """The file's name, the metric, whether whitened."""
+        """The file's name, the metric, and whether it is whitened."""
         return f"{self.query_file.stem} ({self.metric}{', whitened' if self.whitening.whiten else ''})"
 
     def score(self, images: Images, progress: Progress) -> MethodResult:
-        """Score as :class:`loopclosure.methods.base.Method` says; the seconds of the net are those the file carries."""
+        """Score as :class:`loopclosure.methods.base.Method` says; the net's seconds are read from the file."""
         query_features = read_features(self.query_file)
         views = query_features.views
         described = [images.queries]
@@ -67,7 +68,7 @@ class FeatureMethod:
             reference_features = query_features if same else read_features(self.reference_file)
             if reference_features.views != views:
                 raise InputError(
-                    f"describes {reference_features.views} view(s) of an image, {self.query_file} {views}; "
+                    f"has {reference_features.views} view(s) of each image, {self.query_file} has {views}; "
                     "give netspec extract the same --zooms",
                     self.reference_file,
                 )
@@ -100,7 +101,7 @@ def features(argument: str, context: MethodContext, inner: Method | None) -> Fea
     FILES is PATH.npz, or QUERIES.npz,REFERENCES.npz.
     """
     if inner is not None:
-        raise InputError("features refines no other method; write features:PATH.npz")
+        raise InputError("features cannot refine another method; write features:PATH.npz")
     described, *settings = SETTINGS_BEGIN.split(argument, maxsplit=1)
     files, colon, metric = described.rpartition(":")
     if not colon or metric.endswith(".npz"):
@@ -108,8 +109,8 @@ def features(argument: str, context: MethodContext, inner: Method | None) -> Fea
     check_metric(metric)
     paths = [Path(name) for name in files.split(",") if name]
     if len(paths) not in (1, 2):
-        raise InputError(f'"features:{argument}": expected features:PATH.npz, or two files with a comma between')
+        raise InputError(f'"features:{argument}": expected features:PATH.npz, or two files separated by a comma')
     (whitening,) = configure("features", "".join(settings), WhitenBy())
     if settings and not whitening.whiten:
-        raise InputError(f'"features:{argument}": its settings are those of a whitening; add whiten=OTHER.npz')
+        raise InputError(f'"features:{argument}": its settings belong to a whitening; add whiten=OTHER.npz')
     return FeatureMethod(paths[0], paths[-1], metric, whitening)

@@ -17,7 +17,7 @@ from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
 
 CAMERAS = ("left", "right", "both", "joined")
-# Ten seconds are what TUM's 30 Hz sequences are commonly judged with; the other sets have no time.
+# Ten seconds are common for TUM's 30 Hz sequences; the other sets have no time.
 TUM_EXCLUSION = Exclusion(seconds=10.0)
 # New College's own mask has no loop nearer than 142 images (71 pairs of left and right).
 FABMAP_EXCLUSION = Exclusion(frames=50)
@@ -30,13 +30,13 @@ class DataSet:
     """Frames and their truth.
 
     query_images         Q paths
-    reference_images     R paths, or None for one sequence that meets its own places again
+    reference_images     R paths, or None for one sequence that visits its own places again
     truth                (Q, R)
-    exclude_frames       no pair of the sequence further apart than this is excluded (SeqSLAM needs frames, not seconds)
-    stamps               (Q,) seconds, where known
-    positions            (Q, 3) metres or (Q, 2), where known: for the map
-    quaternions          (Q, 4) xyzw, where known
-    notes                what a reader of the figures should know: what was left out, what looks odd
+    exclude_frames       least number of frames that covers all excluded pairs (SeqSLAM needs frames, not seconds)
+    stamps               (Q,) seconds, if known
+    positions            (Q, 3) meters or (Q, 2), if known: for the map
+    quaternions          (Q, 4) xyzw, if known
+    notes                what a reader of the results should know: what was left out, what looks odd
     """
 
     name: str
@@ -66,7 +66,7 @@ def load_tum(
     soft_angle_deg: float | None = None,
     max_difference_s: float = MAX_DIFFERENCE_S,
 ) -> DataSet:
-    """Load a TUM RGB-D sequence; truth by the paper's rule from its poses, with wider limits for soft truth if given.
+    """Load a TUM RGB-D sequence; truth by the paper's rule from its poses, with wider limits for soft truth, if given.
 
     Frames without a pose within ``max_difference_s`` are left out before ``selection`` counts.
     """
@@ -103,12 +103,13 @@ def load_fabmap(
     """Load a set in the form of FAB-MAP's New College and City Centre: numbered images of a left and a right camera.
 
     Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
-    the coordinates (``*Coordinates.mat`` or ``.txt``) are looked for in the folder unless given.
+    the coordinates (``*Coordinates.mat`` or ``.txt``) are searched for in the folder unless given.
 
-    camera   "left" or "right": the images of one; "both": all images, and pairs of a left with a right one are not
-             judged (the mask calls some the same place, though the two look to opposite sides); "joined": left and
-             right side by side as one image, written to ``joined_folder``, the same place if any of their views is
-    selection  counts images of one camera, or joined ones, or with "both" single ones
+    camera     "left" or "right": the images of one camera; "both": all images, but pairs of a left and a right image
+               are not judged (the mask calls some the same place, though the cameras look to opposite sides);
+               "joined": left and right side by side as one image, written to ``joined_folder``; two of them are the
+               same place if any two of their views are
+    selection  counts images of one camera, or joined images, or with "both" single images
     """
     folder = Path(folder)
     if camera not in CAMERAS:
@@ -128,10 +129,10 @@ def load_fabmap(
     if camera == "both":
         side = places[:, 0] % 2
         comparable = side[:, None] == side[None, :]
-        notes.append("pairs of a left with a right image are not judged: the two cameras look to opposite sides")
+        notes.append("pairs of a left and a right image are not judged: the two cameras look to opposite sides")
     if camera == "joined":
         if joined_folder is None:
-            raise InputError("joined images have to be written somewhere; name a folder for them")
+            raise InputError("joined images are written to files; give a folder for them")
         query_images = join_images([(images[a], images[b]) for a, b in places], Path(joined_folder))
     else:
         query_images = [images[place[0]] for place in places]
@@ -151,9 +152,9 @@ def load_folder(
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion = FOLDER_EXCLUSION,
 ) -> DataSet:
-    """Load images with a mask of their own: (N, N) of one sequence, or (Q, R) with ``references``, another folder.
+    """Load images and their mask: (N, N) of one sequence, or (Q, R) with ``references``, another folder.
 
-    With references ``selection`` concerns the queries, all references stay, and nothing is excluded.
+    With references, ``selection`` applies to the queries only, and no pair is excluded.
     """
     queries = image_paths(images)
     hard, soft = read_truth_matrix(truth_file)
@@ -188,16 +189,16 @@ def load_traverses(
     soft_tolerance: int | None = None,
     selection: Selection = ALL_FRAMES,
 ) -> DataSet:
-    """Load two traverses of one way whose frames of equal number show the same place (Nordland, corridor style).
+    """Load two traverses of one route whose frames of equal number show the same place, as in Nordland.
 
     ``tolerance``: frames i and j are the same place if |i - j| <= tolerance (counted before ``selection``, which takes
-    the same frames of both); ``soft_tolerance``, wider, for soft truth.
+    the same frames of both); ``soft_tolerance`` is the wider one of soft truth.
     """
     query_images, reference_images = image_paths(queries), image_paths(references)
     if len(query_images) != len(reference_images):
         raise InputError(
             f"{len(query_images)} queries in {queries}, {len(reference_images)} references in {references}; "
-            "expected as many, since frame i of one is frame i of the other"
+            "expected equal numbers, since frame i of one is frame i of the other"
         )
     if tolerance < 0 or (soft_tolerance is not None and soft_tolerance < tolerance):
         raise InputError(f"tolerance {tolerance}, soft tolerance {soft_tolerance}; expected 0 <= tolerance <= soft")
@@ -211,7 +212,7 @@ def load_traverses(
 
 
 def load_place_pairs(folder: str | Path, selection: Selection = ALL_FRAMES) -> DataSet:
-    """Load places photographed twice: a folder with pairs.csv (place_id, query, ref); each query against all of ref."""
+    """Load places photographed twice: a folder with pairs.csv (place_id, query, ref); each query against all refs."""
     folder = Path(folder)
     rows = read_place_pairs(folder / "pairs.csv")
     rows = [rows[i] for i in selection.numbers(len(rows))]
@@ -222,7 +223,7 @@ def load_place_pairs(folder: str | Path, selection: Selection = ALL_FRAMES) -> D
 
 
 def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
-    """Write left and right images side by side as PNG files into ``folder``; those already there are kept."""
+    """Write left and right images side by side as PNG files into ``folder``; existing files are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     joined = []
     for left, right in pairs:
@@ -238,31 +239,31 @@ def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
 
 
 def _fold(path: Path, hard: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Bring a square mask below the diagonal, where frame i stands against the earlier ones; say what was odd."""
+    """Move a square mask below the diagonal, where frame i is compared with earlier ones; note what was odd."""
     if hard.shape[0] != hard.shape[1]:
         raise InputError(f"is {hard.shape[0]} x {hard.shape[1]}; the mask of one sequence is square", path)
     above = int(np.count_nonzero(np.triu(hard, 1)))
     notes = []
     if above and not np.array_equal(hard, hard.T):
-        notes.append(f"{path.name}: {above} entries above the diagonal were taken for loops of the later frame")
+        notes.append(f"{path.name}: {above} entries above the diagonal were taken as loops of the later frame")
     return np.tril(hard | hard.T, -1), np.tril(soft | soft.T, -1), notes
 
 
 def _sides(camera: str, images: int, size: int, path: Path) -> np.ndarray:
     """Return the image numbers of each place: (places, 1), or (places, 2) left and right for joined images."""
     if size != images and not (2 * size == images and camera != "both"):
-        halved = "; does the folder hold one camera's images only?" if size == 2 * images else ""
+        halved = "; does the folder have only one camera's images?" if size == 2 * images else ""
         raise InputError(f"is {size} x {size}, but there are {images} images{halved}", path)
     if camera == "both":
         return np.arange(images)[:, None]
     if images % 2:
-        raise InputError(f"{images} images cannot be pairs of a left and a right one")
+        raise InputError(f"{images} images cannot be pairs of a left and a right image")
     left = np.arange(0, images, 2)
     return {"left": left[:, None], "right": left[:, None] + 1, "joined": np.stack([left, left + 1], axis=1)}[camera]
 
 
 def _any_view(matrix: np.ndarray) -> np.ndarray:
-    """Reduce (2N, 2N) to (N, N): true where any of the four pairs of views is."""
+    """Reduce (2N, 2N) to (N, N): True where any of the four pairs of views is."""
     half = len(matrix) // 2
     return np.any(matrix.reshape(half, 2, half, 2), axis=(1, 3))
 
@@ -282,18 +283,18 @@ def _fabmap_positions(
 
 
 def _only_file(folder: Path, patterns: Sequence[str], needed: str = "") -> Path | None:
-    """Return the first file of the folder that fits a pattern; without one, None, or InputError where it is needed."""
+    """Return the first file of the folder that fits a pattern; without one, None, or InputError if it is needed."""
     for pattern in patterns:
         found = sorted(folder.glob(pattern))
         if found:
             return found[0]
     if needed:
-        raise InputError(f"has no {' or '.join(patterns)}, {needed}; name the file", folder)
+        raise InputError(f"has no {' or '.join(patterns)}, {needed}; give the file", folder)
     return None
 
 
 def _folder_name(source: str | Path) -> str:
-    """Return the name of a folder, with its parent where many sets have one of that name."""
+    """Return the name of a folder, with its parent if many data sets have a folder of that name."""
     path = Path(source).resolve()
     return f"{path.parent.name}/{path.name}" if path.name.lower() in COMMON_NAMES else path.name
 
@@ -306,7 +307,7 @@ def _existing(images: list[Path]) -> list[Path]:
 
 
 def _excluded_frames(exclusion: Exclusion, stamps: np.ndarray) -> int:
-    """Return the least number of frames that covers the exclusion, seconds too."""
+    """Return the least number of frames that covers the exclusion, including its seconds."""
     earliest = np.searchsorted(stamps, stamps - exclusion.seconds, side="right")
     return max(exclusion.frames, int(np.max(np.arange(len(stamps)) - earliest)))
 
@@ -323,7 +324,7 @@ def _selection_text(selection: Selection) -> str:
 
 
 def _checked(data: DataSet, hard: np.ndarray) -> DataSet:
-    """Say how many loops the exclusion takes away, and refuse a set in which nothing is left to find."""
+    """Note how many loops the exclusion removes, and refuse a set with nothing left to find."""
     if data.reference_images is None:
         whole = int(np.count_nonzero(np.tril(hard, -1)))
         lost = whole - data.truth.positives

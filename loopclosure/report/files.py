@@ -1,4 +1,4 @@
-"""The figures of an evaluation as CSV, JSON and text; every file says its convention and what was excluded."""
+"""The results of an evaluation as CSV, JSON and text; every file gives its convention and what was excluded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write_files(evaluation: Evaluation, folder: Path, command: str = "") -> None
 
 
 def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
-    """Return the whole evaluation as what JSON can hold; a figure that is not defined is null."""
+    """Return the whole evaluation as JSON values; an undefined measure is null."""
     data, truth = evaluation.data, evaluation.data.truth
     return {
         "data_set": data.name,
@@ -68,7 +68,7 @@ def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
 
 
 def measures_text(evaluation: Evaluation) -> str:
-    """Return the table of figures for a terminal, with what it was judged by."""
+    """Return the table of measures for a terminal, with the description of the truth."""
     heads = ["method", "AP", "R@P=1", "F1", "AP", "R@P=1", "F1", *(f"R@{k}" for k in RECALL_AT), "ms/frame"]
     rows = []
     for outcome in evaluation.outcomes:
@@ -105,7 +105,7 @@ def _write_times_csv(evaluation: Evaluation, path: Path) -> None:
 
 
 def _write_curves_csv(outcome: Outcome, path: Path) -> None:
-    """Write the points at which recall rises, which is all that average precision sums over."""
+    """Write the points at which recall increases: average precision is a sum over these."""
     rows = [["convention", "threshold", "precision", "recall", "truth and exclusion"]]
     for curve in (outcome.pairs, outcome.best):
         for i in _rises(curve):
@@ -138,7 +138,7 @@ def _write_csv(path: Path, rows: list[list[str]]) -> None:
 
 
 def _slugs(names: list[str]) -> list[str]:
-    """Return a file name for each method, no two alike."""
+    """Return a different file name for each method."""
     slugs: list[str] = []
     for name in names:
         slug = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") or "method"
@@ -153,5 +153,5 @@ def _number(value: float) -> float | None:
 
 
 def share(value: float) -> str:
-    """Print a share in 0..1; a dash where it is not defined."""
+    """Print a share in 0..1; a dash if it is undefined."""
     return "–" if math.isnan(value) else f"{value:.3f}"

@@ -1,7 +1,7 @@
 """The report of an evaluation: one self-contained HTML page, and beside it the same as PNG, CSV and JSON.
 
-Every file says by which convention its figures are and what was excluded. The page is ``report.html.jinja``, whose
-values are escaped, whatever a method, a folder or a note is called.
+Every file gives the convention of its results and what was excluded. The page is made from ``report.html.jinja``,
+which escapes all values: names of methods, folders and notes may have any characters.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class _Pair:
 
 @dataclass(frozen=True)
 class _Kind:
-    """Some pairs of one kind; ``name`` is their class in the page's style."""
+    """Some pairs of one kind; ``name`` is their CSS class."""
 
     name: str
     title: str
@@ -45,12 +45,12 @@ class _Kind:
 
 
 def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", command: str = "") -> Path:
-    """Write report.html and its parts into ``folder`` (made if need be); return the path of the page.
+    """Write report.html and its parts into ``folder`` (made if it does not exist); return the path of the page.
 
     ``figures.csv``, ``times.csv``, ``report.json``; ``precision_recall.png``, ``matrices.png``, ``matches.png`` and,
-    for one sequence with positions, ``map.png``; for each method ``curve_*.csv`` (one row for each recall reached, with
-    the precision there) and ``matches_*.csv``.
-    ``command``, if given, is printed at the end of the page, so that a reader can repeat it.
+    for one sequence with positions, ``map.png``; for each method ``curve_*.csv`` (one row for each recall that is
+    reached, with its precision) and ``matches_*.csv``. ``command``, if given, is printed at the end of the page, so
+    that a reader can repeat it.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
         best_match=BEST_MATCH,
         explanation=EXPLANATION,
         recall_at=RECALL_AT,
-        figures=_measures_rows(evaluation),
+        measures=_measures_rows(evaluation),
         pictures=pictures,
         stages=_stages,
         pairs=[(outcome.name, _kinds_of_pairs(evaluation, outcome)) for outcome in evaluation.outcomes],
@@ -107,7 +107,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
 
 
 def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, bool]]]]:
-    """Return for each method its name and its figures, each with whether it is the best of several methods."""
+    """Return for each method its name and its measures, each with whether it is the best of several methods."""
     rows = [[v for values in o.measures.values() for v in values.values()] for o in evaluation.outcomes]
     best = [max((row[i] for row in rows if not math.isnan(row[i])), default=None) for i in range(len(rows[0]))]
     return [
@@ -117,7 +117,7 @@ def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, 
 
 
 def _stages(outcome: Outcome) -> list[tuple[str, float, bool]]:
-    """Return each stage, its seconds and whether it is done once; and the sum of those that are not."""
+    """Return each stage, its seconds and whether it is done once; then the sum of those done for each frame."""
     stages = [(stage, seconds, stage in outcome.training_stages) for stage, seconds in outcome.seconds.items()]
     return [*stages, ("all but training" if outcome.training_stages else "in all", outcome.seconds_on_frames, False)]
 
@@ -139,17 +139,14 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:
         return [_pair(evaluation, outcome, queries[i], references[i]) for i in _spread(queries, evaluation)]
 
     return [
-        _Kind("found", "surest right", pairs(right, matches.reference[right])),
-        _Kind("false", "surest wrong", pairs(wrong, matches.reference[wrong])),
+        _Kind("found", "right, highest score", pairs(right, matches.reference[right])),
+        _Kind("false", "wrong, highest score", pairs(wrong, matches.reference[wrong])),
         _Kind("missed", "true, lowest score", pairs(loops[lowest], true[lowest])),
     ]
 
 
 def _spread(queries: np.ndarray, evaluation: Evaluation) -> list[int]:
-    """Return the places of the first few queries that are not neighbors of one already taken.
-
-    Five times the same view says little.
-    """
+    """Return the indices of the first few queries, without neighbors of those already taken, which look the same."""
     apart = max(1, len(evaluation.data.query_images) // 30) if evaluation.data.reference_images is None else 1
     taken: list[int] = []
     for i, query in enumerate(queries):

@@ -1,7 +1,7 @@
 """The pictures of the report: matrices, precision-recall curves, maps, matches; matplotlib figures, nothing written.
 
 They are made without pyplot, which would choose a backend for the whole program. Names of methods and data sets are
-drawn as they are: ``parse_math=False``, since a dollar sign in them begins no formula.
+drawn as they are (``parse_math=False``): a dollar sign in them does not begin a formula.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from loopclosure.evaluate import Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import BEST_MATCH, PrecisionRecall
 
-# Told apart by color-blind readers too (Okabe and Ito).
+# Color-blind readers can distinguish these too (Okabe and Ito).
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 FOUND, FALSE, MISSED = "#1a9641", "#d7191c", "#9e9e9e"
 LINES = ("-", "--", ":", "-.")  # a second round of the colors is dashed, and so on
-LABEL_WIDTH = 60  # letters of a legend's line that fit below a panel
+LABEL_WIDTH = 60  # characters of a legend's line that fit below a panel
 LABELS_HEIGHT = 0.5  # inches for the tick labels and the label of the horizontal axis
 NOT_JUDGED = "#ececec"
 SHOWN_CELLS = (
-    700  # a matrix with more rows or columns is drawn by the greatest of each block, or thin loops would vanish
+    700  # of a matrix with more rows or columns the greatest of each block is drawn, or thin loops would vanish
 )
 COLUMNS = 4
 
@@ -49,7 +49,7 @@ STYLE: dict[Any, Any] = {
 
 
 def matrices(evaluation: Evaluation) -> Figure:
-    """Draw the truth and beside it the scores of every method (the paper's figures 5 and 6)."""
+    """Draw the truth and the scores of every method (the paper's Figures 5 and 6)."""
     truth = evaluation.data.truth
     panels = 1 + len(evaluation.outcomes)
     with matplotlib.rc_context(STYLE):
@@ -99,7 +99,7 @@ def curves(evaluation: Evaluation) -> Figure:
 
 
 def matches(evaluation: Evaluation) -> Figure:
-    """Draw for each method, frame against frame, the loops found, false and missed over the truth."""
+    """Draw for each method the found, false and missed loops, frame against frame, over the truth."""
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(evaluation.outcomes), 1.0)
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
@@ -112,12 +112,12 @@ def matches(evaluation: Evaluation) -> Figure:
 
 
 def has_map(evaluation: Evaluation) -> bool:
-    """Tell whether the loops can be drawn on a trajectory: one sequence, with positions."""
+    """Return whether the loops can be drawn on a trajectory: one sequence, with positions."""
     return evaluation.data.positions is not None and evaluation.data.reference_images is None
 
 
 def maps(evaluation: Evaluation) -> Figure:
-    """Draw for each method the loops found, false and missed as chords of the trajectory."""
+    """Draw for each method the found, false and missed loops as chords of the trajectory."""
     positions = evaluation.data.positions
     assert positions is not None
     with matplotlib.rc_context(STYLE):
@@ -131,9 +131,9 @@ def maps(evaluation: Evaluation) -> Figure:
 
 
 def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split the queries at the best F1 of the best match of each query: numbers of found, false and missed ones.
+    """Return the numbers of the queries found, false and missed at the best F1 of their best matches.
 
-    A query with a loop whose match is wrong is both false and missed, and drawn as both.
+    A query with a loop whose match is wrong is both false and missed, and is drawn as both.
     """
     accepted = (outcome.matches.reference >= 0) & (outcome.matches.score >= outcome.best.best_f1_threshold)
     found = accepted & outcome.matches.right
@@ -143,7 +143,7 @@ def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, n
 
 
 def best_true_references(outcome: Outcome, truth: Truth, queries: np.ndarray) -> np.ndarray:
-    """Return for each of these queries, which have a loop, the true reference that scored best."""
+    """Return for each of these queries, which have a loop, the true reference with the best score."""
     scores = np.where(truth.hard[queries] & truth.judged[queries], outcome.scores[queries], np.nan)
     scores = np.where(np.isnan(scores), np.where(truth.hard[queries] & truth.judged[queries], -np.inf, np.nan), scores)
     return np.nanargmax(scores, axis=1)
@@ -176,11 +176,11 @@ def _greatest_of_blocks(values: np.ndarray, step: int) -> np.ndarray:
 
 
 def _draw_curve(axis: Axes, curve: PrecisionRecall, name: str, number: int) -> None:
-    """Draw the steps whose area is the average precision, and a dot where precision leaves 1."""
+    """Draw the steps whose area is the average precision, and a dot where precision falls below 1."""
     color = COLORS[number % len(COLORS)]
     line = LINES[number // len(COLORS) % len(LINES)]
     recall, precision = np.append(0.0, curve.recall), np.append(curve.precision[:1], curve.precision)
-    recall = recall[: len(precision)]  # a method that says nothing has no point
+    recall = recall[: len(precision)]  # a method without scores has no point
     area = f"{curve.average_precision:.3f}"
     label = textwrap.fill(f"{area}  {name}", LABEL_WIDTH, subsequent_indent=" " * 11)
     axis.plot(recall, precision, line, color=color, linewidth=1.3, label=label, drawstyle="steps-pre")
@@ -189,7 +189,7 @@ def _draw_curve(axis: Axes, curve: PrecisionRecall, name: str, number: int) -> N
 
 
 def _legends_below(figure: Figure, axes: Iterable[Axes]) -> None:
-    """Put the legend of each panel below it, and make the figure higher by what the highest legend takes."""
+    """Put the legend of each panel below it, and make the figure higher by the height of the highest legend."""
     heights = []
     for axis in axes:
         below = axis.transAxes + ScaledTranslation(0, -LABELS_HEIGHT, figure.dpi_scale_trans)
@@ -222,7 +222,7 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
     ]
     for order, (queries, references, color, width) in enumerate(lines, start=2):
         chords = np.stack([place[queries], place[references]], axis=1)
-        thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords are one blot
+        thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords would merge
         axis.add_collection(LineCollection(list(chords), colors=color, linewidths=width * thin, zorder=order))
         axis.plot(place[queries, 0], place[queries, 1], ".", color=color, markersize=2.5, zorder=order)
     axis.set_aspect("equal", adjustable="datalim")
@@ -255,9 +255,9 @@ def _loop_legend(figure: Figure) -> None:
 
 
 def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -> None:
-    """Print below the figure what it is judged by, so that it stands by itself."""
+    """Print the description of the truth below the figure, so that it can be used by itself."""
     text = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.description}"
-    width = int(figure.get_figwidth() * 22)  # letters of this size that fit into the width
+    width = int(figure.get_figwidth() * 22)  # characters of this size that fit into the width
     figure.supxlabel(textwrap.fill(text, width), fontsize=6.5, color="#777777", parse_math=False)
 
 
@@ -267,7 +267,7 @@ def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
     columns = -(-panels // rows)
     width = 2.75 if columns > 2 else 3.4
     size = (width * columns, width * ratio * rows + 0.35)
-    layout = ConstrainedLayoutEngine(h_pad=0.07)  # inches: a title stands clear of the panel above
+    layout = ConstrainedLayoutEngine(h_pad=0.07)  # inches between a title and the panel above
     figure = Figure(figsize=size, layout=layout)
     flat = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axis in flat[panels:]:

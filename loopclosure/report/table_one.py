@@ -1,7 +1,7 @@
-"""The table that compares nets on labelled pairs (the paper's Table I), as text, CSV and pictures.
+"""The table that compares nets on labeled pairs (the paper's Table I), as text, CSV and pictures.
 
-A run file (JSON) lists the nets; each entry names the .npz files that hold the two descriptors of every training and
-validation pair, the names of the arrays in them, and the validation losses met during training.
+A run file (JSON) lists the nets. Each entry gives the .npz files with the two descriptors of every training and
+validation pair, the names of the arrays in them, and the validation losses during training.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from loopclosure.errors import InputError
 from loopclosure.report.pair_metrics import PairMetrics, judge_pairs, pair_distances
 
-# Qiu et al., IEEE IV 2018, Table I. The paper says neither the threshold nor the recall.
+# Qiu et al., IEEE IV 2018, Table I. The paper gives neither the threshold nor the recall.
 PAPER = (
     ("Siamese (8)", 0.695),
     ("Siamese (128)", 0.820),
@@ -42,9 +42,9 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Run:
-    """One net, judged: distances (N,) and labels (N,) of its validation pairs, its figures, and what it cost.
+    """The results of one net: distances (N,) and labels (N,) of its validation pairs, metrics and costs.
 
-    ``losses`` are (iteration, validation loss); ``milliseconds`` an image; ``iteration`` of the snapshot judged.
+    ``losses`` are (iteration, validation loss); ``milliseconds`` are per image; ``iteration`` is the judged snapshot's.
     """
 
     name: str
@@ -65,9 +65,9 @@ class Run:
 
 
 def read_runs(path: Path) -> list[Run]:
-    """Read a run file and judge each of its nets: the threshold from the training pairs, the figures of the others.
+    """Read a run file and judge each of its nets: threshold from the training pairs, metrics of the validation pairs.
 
-    Raises InputError where a file or an array is missing.
+    Raises InputError if a file or an array is missing.
     """
     try:
         entries = json.loads(path.read_text())
@@ -110,7 +110,7 @@ def _array(arrays: Any, name: str, path: str) -> np.ndarray:
 
 
 def text_table(runs: Sequence[Run]) -> str:
-    """Return the table as text, with the paper's own beside it."""
+    """Return the table as text, with the paper's precisions below it."""
     rows = [COLUMNS, *(run.cells() for run in runs)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
     lines = [

@@ -1,8 +1,8 @@
-"""Visual words: local features of an image, the vocabulary they are sorted into, and how often each word occurs.
+"""Visual words: local features of an image, the vocabulary that quantizes them, and how often each word occurs.
 
-A descriptor is a unit vector: SIFT (or, with ``root``, RootSIFT: the square roots of the histogram's shares,
-Arandjelovic and Zisserman, CVPR 2012), or the 256 bits of ORB as floats. An image without a single feature has no
-words; it is a place like any other.
+A descriptor is a unit vector of SIFT (or, with ``root``, RootSIFT: the square roots of the histogram's shares,
+Arandjelovic and Zisserman, CVPR 2012), or the 256 bits of ORB as floats. An image without features has no words, and
+can be a place like any other.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def _detector(kind: str, max_features: int, contrast: float) -> Any:
 
 @dataclass(frozen=True)
 class Extractor:
-    """Local features of a grey image.
+    """Local features of a gray image.
 
     kind          "sift" or "orb"
-    max_features  the strongest so many of an image are kept
+    max_features  how many of the strongest are kept per image
     root          RootSIFT instead of SIFT
-    contrast      SIFT's contrast threshold (OpenCV's default); lower finds more in flat images
+    contrast      SIFT's contrast threshold (OpenCV's default); lower finds more in images of low contrast
     """
 
     kind: str = "sift"
@@ -50,11 +50,11 @@ class Extractor:
         if self.kind not in KINDS:
             raise InputError(f'unknown kind of features "{self.kind}"; known: {", ".join(KINDS)}')
         if self.max_features < 1:
-            raise InputError(f"max_features is {self.max_features}; at least one feature an image is needed")
+            raise InputError(f"max_features is {self.max_features}; at least one feature per image is needed")
 
     @property
     def size(self) -> int:
-        """Numbers in a descriptor."""
+        """Length of a descriptor."""
         return KINDS[self.kind]
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ class Extractor:
         _, found = _detector(self.kind, self.max_features, self.contrast).detectAndCompute(gray(image), None)
         if found is None or len(found) == 0:
             return np.zeros((0, self.size), np.float32)
-        found = found[: self.max_features]  # SIFT returns more where the weakest have equal strength
+        found = found[: self.max_features]  # SIFT returns more if the weakest have equal strength
         if self.kind == "orb":
             return np.unpackbits(found, axis=1).astype(np.float32)
         tiny = np.float32(1e-12)
@@ -73,7 +73,7 @@ class Extractor:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """The words: ``centers`` (v, d) float32, the extractor whose descriptors they sort, and how they were ``made``."""
+    """The words: ``centers`` (v, d) float32, the extractor of the descriptors, and how the centers were ``made``."""
 
     centers: np.ndarray
     extractor: Extractor
@@ -120,9 +120,9 @@ def kmeans(descriptors: np.ndarray, words: int, seed: int = 0) -> np.ndarray:
 
 
 def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:
-    """Return the indices of the descriptors (n, d) that found a cluster: first pass of the sequential clustering.
+    """Return the indices of the descriptors (n, d) that start a cluster: first pass of the sequential clustering.
 
-    In their order, each descriptor farther than ``radius`` from all founders before it becomes one.
+    In their order, each descriptor farther than ``radius`` from all founders before it becomes a founder.
     """
     chosen: list[int] = []
     centers = np.empty((0, descriptors.shape[1]), descriptors.dtype)
@@ -130,7 +130,7 @@ def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:
         block = descriptors[start : start + BLOCK_ROWS]
         far = np.flatnonzero(_squared_distance_to_nearest(block, centers) > radius**2)
         fresh: list[int] = []
-        while far.size:  # the first of those left founds a cluster and takes its neighbors with it
+        while far.size:  # the first of those left starts a cluster and removes its neighbors
             fresh.append(int(far[0]))
             gaps = block[far] - block[far[0]]
             far = far[np.einsum("nd,nd->n", gaps, gaps) > radius**2]
@@ -142,8 +142,8 @@ def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:
 def sequential_clusters(descriptors: np.ndarray, radius: float, seed: int | None = 0) -> np.ndarray:
     """Return the centers (k, d) float32 of the modified sequential clustering (openFABMAP's BOWMSCTrainer).
 
-    The founders (see :func:`founders`) gather their nearest descriptors, and the means are the words. The outcome
-    depends on the order, so it is shuffled with ``seed``; None keeps the order given. Useful radii: 0.55 to 0.6 for
+    Each descriptor is assigned to its nearest founder (see :func:`founders`), and the means are the words. The result
+    depends on the order, which is shuffled with ``seed``; None keeps the given order. Useful radii: 0.55 to 0.6 for
     RootSIFT, 0.7 to 0.75 for SIFT, the root of the Hamming distance for ORB.
     """
     if len(descriptors) == 0:

@@ -1,7 +1,7 @@
-"""What FAB-MAP and the bag of words learn beforehand, from images that are not tested, in one file to keep.
+"""What FAB-MAP and the bag of words learn from training images, in one file.
 
-A model file (.npz) holds the vocabulary, the words of the training images (FAB-MAP 2 samples its new place from them;
-the bag of words weighs words by them), the Chow-Liu tree, the extractor's settings and the training images' paths.
+A model file (.npz) has the vocabulary, the words of the training images (FAB-MAP 2 samples its new place from them; the
+bag of words takes its weights from them), the Chow-Liu tree, the extractor's settings and the training images' paths.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
 
 FORMAT = 1
-# The stages of ``train``: done once, whatever the number of tested images.
+# The stages of ``train``: done once, for any number of tested images.
 TRAINING_STAGES = ("training features", "vocabulary", "training words", "tree")
 
 
@@ -79,18 +79,18 @@ class WordModel:
         except OSError as error:
             raise InputError(f"cannot read the word model: {error.strerror or error}", path) from None
         except (KeyError, TypeError, ValueError):
-            raise InputError("not a word model; make one by training", path) from None
+            raise InputError("not a word model; give another name, and a new one is written there", path) from None
 
 
 @dataclass(frozen=True)
 class Training:
     """How a word model is made.
 
-    words            of k-means; 0 clusters by ``radius`` instead
+    words            how many, by k-means; 0: clusters by ``radius`` instead
     radius           of the modified sequential clustering, see :func:`sequential_clusters`
-    max_descriptors  so many of all images' descriptors are clustered, the same number of each image at most
+    max_descriptors  how many descriptors of all images are clustered, with the same limit for each image
     lower_bound      see :func:`learn_tree`
-    seed             of everything drawn by lot
+    seed             of all random numbers
     """
 
     extractor: Extractor = field(default_factory=Extractor)
@@ -109,13 +109,13 @@ def train(
 ) -> WordModel:
     """Learn the words and their tree from images that will not be tested.
 
-    ``seconds`` gets the time of each stage. Without images, or without features in them: InputError.
+    ``seconds`` receives the time of each stage. Raises InputError without images or without features in them.
     """
     training = training or Training()
     seconds = {} if seconds is None else seconds
     paths = [Path(image).resolve() for image in images]
     if not paths:
-        raise InputError("a vocabulary needs training images (of other places than the tested ones), got none")
+        raise InputError("a vocabulary needs training images, of other places than the tested ones; none are given")
     rng = np.random.default_rng(training.seed)
     share = max(1, training.max_descriptors // len(paths))
     found = []

@@ -1,4 +1,4 @@
-"""A made-up round trip that the tests of evaluation, report and detector share."""
+"""A synthetic round trip that the tests of evaluation, report and detector share."""
 
 from pathlib import Path
 
@@ -39,8 +39,8 @@ def two_laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         turn = 2 * np.pi * frame / PLACES
         x, y, z, w = Rotation.from_euler("z", turn).as_quat()
         poses.append(f"{frame}.0 {5 * np.cos(turn):.4f} {5 * np.sin(turn):.4f} 1.0 {x:.6f} {y:.6f} {z:.6f} {w:.6f}")
-    (folder / "rgb.txt").write_text("# made up\n" + "\n".join(names) + "\n")
-    (folder / "groundtruth.txt").write_text("# made up\n" + "\n".join(poses) + "\n")
+    (folder / "rgb.txt").write_text("# synthetic\n" + "\n".join(names) + "\n")
+    (folder / "groundtruth.txt").write_text("# synthetic\n" + "\n".join(poses) + "\n")
     return folder
 
 

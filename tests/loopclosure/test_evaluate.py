@@ -1,4 +1,4 @@
-"""Methods judged on a made-up round trip, and how methods are named."""
+"""Methods judged on a synthetic round trip, and how methods are named."""
 
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def test_silence_is_said_and_costs_recall(two_laps):
     (outcome,) = evaluate(data, [("half", Says(scores))]).outcomes
     assert outcome.pairs.recall[0] == 0.5
     silent = int(np.count_nonzero(data.truth.judged[30:]))
-    assert outcome.notes[-1].startswith(f"it says nothing of {silent} of ")
+    assert outcome.notes[-1].startswith(f"no score for {silent} of ")
 
 
 def test_training_is_not_counted_a_frame(two_laps):

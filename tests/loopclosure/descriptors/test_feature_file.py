@@ -71,7 +71,7 @@ def test_an_array_named_after_its_blob(tmp_path):
         ({"features": ROWS[0]}, r"shape \(2,\)"),
         ({"features": ROWS, "names": np.array(["a"])}, "4 descriptors but 1 names"),
         ({"features": ROWS, "stamps": np.zeros(3)}, "4 descriptors but 3 stamps"),
-        ({"features": ROWS, "zooms": np.ones(3)}, "2 numbers an image, which are not 3 views"),
+        ({"features": ROWS, "zooms": np.ones(3)}, "2 numbers per image, which cannot be 3 views"),
     ],
 )
 def test_odd_files_are_refused(tmp_path, arrays, sentence):

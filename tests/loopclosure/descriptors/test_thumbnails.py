@@ -34,11 +34,11 @@ def test_thumbnails_ignore_brightness_and_contrast_unless_told() -> None:
     brighter = 2 * image + 40
     normalized, plain = Thumbnailer(), Thumbnailer(normalize="none")
     assert normalized(image).shape == (24, 32)
-    np.testing.assert_allclose(normalized(brighter), normalized(image), atol=0.05)  # grey values are whole numbers
+    np.testing.assert_allclose(normalized(brighter), normalized(image), atol=0.05)  # gray values are whole numbers
     assert plain(brighter).mean() == pytest.approx(2 * plain(image).mean() + 40, abs=1)
 
 
-def test_shrinking_averages_and_colour_is_taken_as_grey() -> None:
+def test_shrinking_averages_and_color_is_taken_as_gray() -> None:
     image = np.kron([[0, 255], [255, 0]], np.ones((12, 16))).astype(np.uint8)
     image[::2, ::2] = 128
     shrunk = Thumbnailer(width=2, height=2, normalize="none")
@@ -57,10 +57,10 @@ def test_differences_are_means_over_the_pixels() -> None:
     ("settings", "message"),
     [
         ({"normalize": "both"}, '"both"; known: image, patch, none'),
-        ({"normalize": "patch", "width": 30}, "30x24 pixels do not divide into patches of 8"),
-        ({"width": 0}, "is no image"),
+        ({"normalize": "patch", "width": 30}, "30x24 pixels cannot be divided into patches of 8"),
+        ({"width": 0}, "has no pixels"),
     ],
 )
-def test_thumbnails_that_are_none(settings: dict, message: str) -> None:
+def test_impossible_thumbnails(settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Thumbnailer(**settings)

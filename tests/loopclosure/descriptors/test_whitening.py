@@ -1,4 +1,4 @@
-"""PCA whitening: its algebra, what it is good for, and its way through the commands."""
+"""PCA whitening: its algebra, its benefit, and its use in the commands."""
 
 import csv
 import json
@@ -132,14 +132,14 @@ def test_it_finds_the_pairs_that_common_variation_hides(training, laps):
 @pytest.mark.parametrize(
     ("descriptors", "settings", "sentence"),
     [
-        (np.ones((1, 3)), {}, "other.npz: has 1 descriptors; a whitening is learnt from 2"),
+        (np.ones((1, 3)), {}, "other.npz: has 1 descriptors; a whitening is learned from at least 2"),
         (np.full((5, 3), 0.1), {}, "other.npz: has 5 descriptors that are all the same"),
         (np.array([[1.0], [np.nan]]), {}, "other.npz: has a descriptor with a NaN"),
         (np.eye(3), {"components": 0}, "components is 0; expected 1 or more"),
         (np.eye(3), {"power": 1.5}, "power is 1.5; expected 0"),
     ],
 )
-def test_what_cannot_be_learnt_from(descriptors, settings, sentence):
+def test_what_cannot_be_learned_from(descriptors, settings, sentence):
     with pytest.raises(InputError, match=sentence):
         learn_whitening(descriptors.astype(np.float32), source="other.npz", **settings)
 
@@ -199,7 +199,7 @@ def test_each_view_is_whitened(files, training, laps):
         shares[other] = found(result.scores[PLACES:, :PLACES])
         assert "2 views of 24 dimensions, euclidean" in result.notes
     assert min(shares.values()) >= 0.95
-    with pytest.raises(InputError, match=r"laps.npz: describes 1 view\(s\) of an image, .*views.npz 2"):
+    with pytest.raises(InputError, match=r"laps.npz: has 1 view\(s\) of each image, .*views.npz has 2"):
         make_method(f"features:{files}/views.npz,{files}/laps.npz").score(Images(images, images), silent)
 
 
@@ -225,7 +225,7 @@ def test_detect_finds_loops_through_the_views(two_laps, tmp_path):
         assert [int(row["match_id"]) for row in csv.DictReader(stream)] == list(range(PLACES))
 
 
-def test_tested_images_are_not_learnt_from(files, training, laps):
+def test_tested_images_are_not_learned_from(files, training, laps):
     images = [Path(f"/data/two_laps/rgb/{i}.png") for i in range(len(laps))]
     nearly = laps[5] * np.float32(1.0001)
     np.savez(files / "overlap.npz", features=np.vstack([training, nearly]), names=np.array(["x"] * 400 + ["a/5.png"]))

@@ -1,4 +1,4 @@
-"""Geometric verification on made-up views: a textured wall seen from two sides, and another wall."""
+"""Geometric verification on synthetic views: a textured wall seen from two sides, and another wall."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""The baselines as the judge calls them: one sequence and two traverses, with files and settings."""
+"""The baselines as the evaluation calls them: one sequence and two traverses, with files and settings."""
 
 from pathlib import Path
 
@@ -151,7 +151,7 @@ def test_corridor_loop_with_its_two_images_without_features() -> None:
     result = make_method("fabmap:words=300,max_features=150", MethodContext(exclude_frames=10)).score(
         Images(walk, None, train), silent
     )
-    assert "2 of 84 images have no feature at all: places without words" in result.notes
+    assert "2 of 84 images have no features: places without words" in result.notes
     assert np.isfinite(result.scores[np.tril_indices(84, -1)]).all()
     truth = cv2.imread(str(corridor.parent / "samples_GT.bmp"), cv2.IMREAD_GRAYSCALE) > 0
     allowed = np.tri(84, 84, -11, dtype=bool)

@@ -163,7 +163,7 @@ def two_laps() -> np.ndarray:
     return scores
 
 
-def test_one_sequence_never_matches_its_neighbours() -> None:
+def test_one_sequence_never_matches_its_neighbors() -> None:
     method = SeqSlam(Fixed(two_laps()), exclude_frames=5)
     result = method.score(Images(frames(40)), silent)
     assert not np.isfinite(result.scores[~earlier(40, 5)]).any()
@@ -221,7 +221,7 @@ def test_the_command_line_builds_it() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"directions": "backward"}, 'directions of SeqSLAM: "backward" is none of forward, both'),
+        ({"directions": "backward"}, 'directions of SeqSLAM is "backward"; expected forward or both'),
         ({"anchor": "end"}, "anchor of SeqSLAM"),
         ({"edges": "pad"}, "edges of SeqSLAM"),
         ({"length": 0}, "length >= 1"),

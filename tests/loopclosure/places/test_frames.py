@@ -26,7 +26,7 @@ def test_selection(selection, expected):
     ("selection", "sentence"),
     [
         (Selection(start=10), "no frame is left of 10"),
-        (Selection(start="half"), '"half" is no frame'),
+        (Selection(start="half"), '"half" is not a frame'),
         (Selection(stride=0), "stride of 0"),
         (Selection(limit=0), "limit of 0"),
     ],
@@ -70,7 +70,7 @@ def test_broken_sources(tmp_path):
     with pytest.raises(InputError, match="no such image"):
         read_bgr(tmp_path / "a.png")
     (tmp_path / "a.png").write_text("text")
-    with pytest.raises(InputError, match="is not an image"):
+    with pytest.raises(InputError, match="is not a readable image"):
         read_bgr(tmp_path / "a.png")
 
 

@@ -8,7 +8,7 @@ from loopclosure.words.vocabulary import Extractor, Vocabulary, founders, kmeans
 
 
 def texture(seed: int) -> np.ndarray:
-    """Return a blotchy grey image (120, 160) that has features."""
+    """Return a blotchy gray image (120, 160) that has features."""
     noise = np.random.default_rng(seed).random((120, 160)).astype(np.float32)
     blotches = cv2.GaussianBlur(noise, (0, 0), 2.5)
     return cv2.normalize(blotches, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -49,7 +49,7 @@ def test_a_blank_image_has_no_features_and_no_words(kind: str) -> None:
     np.testing.assert_array_equal(vocabulary.count(blank), [0, 0, 0])
 
 
-def test_no_more_features_than_asked_for_and_colour_is_taken_as_grey() -> None:
+def test_no_more_features_than_asked_for_and_color_is_taken_as_gray() -> None:
     extractor = Extractor(max_features=15)
     assert len(extractor(texture(1))) == 15
     np.testing.assert_array_equal(extractor(cv2.cvtColor(texture(1), cv2.COLOR_GRAY2BGR)), extractor(texture(1)))
@@ -58,12 +58,12 @@ def test_no_more_features_than_asked_for_and_colour_is_taken_as_grey() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"), [({"kind": "surf"}, '"surf"; known: sift, orb'), ({"max_features": 0}, "is 0")]
 )
-def test_extractors_that_are_none(settings: dict, message: str) -> None:
+def test_impossible_extractors(settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Extractor(**settings)
 
 
-def test_nearest_centre_across_blocks() -> None:
+def test_nearest_center_across_blocks() -> None:
     descriptors, centers = unit_vectors(9000, seed=1), unit_vectors(30, seed=2) * 0.7
     np.testing.assert_array_equal(nearest_centers(descriptors, centers), np.argmin(cdist(descriptors, centers), axis=1))
 

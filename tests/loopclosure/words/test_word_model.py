@@ -11,7 +11,7 @@ from loopclosure.words.word_model import Training, WordModel, train
 
 
 def write_textures(folder: Path, count: int, first_seed: int = 0) -> list[Path]:
-    """Write grey images with features, the last one blank."""
+    """Write gray images with features, the last one blank."""
     folder.mkdir(exist_ok=True)
     paths = []
     for i in range(count):
@@ -77,7 +77,7 @@ def test_orb_words_keep_their_extractor(tmp_path: Path, training_images: list[Pa
     assert WordModel.load(tmp_path / "orb.npz").vocabulary.extractor == extractor
 
 
-def test_files_that_are_no_model(tmp_path: Path) -> None:
+def test_files_without_a_model(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none.npz: cannot read the word model: No such file"):
         WordModel.load(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("words")
