@@ -189,7 +189,7 @@ def test_the_camera_is_carried_upright(sequence: PosedSequence) -> None:
         ({"frames": 1}, "frames must be 2"),
         ({"width": 8}, "width must be 32"),
         ({"laps": 0}, "laps must be 1"),
-        ({"seed": -1}, "seed is 0 or more"),
+        ({"seed": -1}, "seed must be 0 or more"),
     ],
 )
 def test_numbers_that_make_no_walk_are_refused(tmp_path: Path, change: dict[str, int], words: str) -> None:
