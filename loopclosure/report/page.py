@@ -119,7 +119,10 @@ def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, 
 def _stages(outcome: Outcome) -> list[tuple[str, float, bool]]:
     """Return each stage, its seconds and whether it is done once; then the sum of those done for each frame."""
     stages = [(stage, seconds, stage in outcome.training_stages) for stage, seconds in outcome.seconds.items()]
-    return [*stages, ("all but training" if outcome.training_stages else "in all", outcome.seconds_on_frames, False)]
+    return [
+        *stages,
+        ("total without training" if outcome.training_stages else "total", outcome.seconds_on_frames, False),
+    ]
 
 
 def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:

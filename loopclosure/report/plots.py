@@ -28,6 +28,7 @@ from loopclosure.precision_recall import BEST_MATCH, PrecisionRecall
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 FOUND, FALSE, MISSED = "#1a9641", "#d7191c", "#9e9e9e"
 LINES = ("-", "--", ":", "-.")  # a second round of the colors is dashed, and so on
+TITLE_WIDTH = 38  # characters that fit above a panel of a grid
 LABEL_WIDTH = 60  # characters of a legend's line that fit below a panel
 LABELS_HEIGHT = 0.5  # inches for the tick labels and the label of the horizontal axis
 NOT_JUDGED = "#ececec"
@@ -64,7 +65,7 @@ def matrices(evaluation: Evaluation) -> Figure:
             some = scores[np.isfinite(scores)]
             low, high = np.percentile(some, [1, 99.5]) if len(some) else (0.0, 1.0)
             _draw_matrix(axis, scores, matplotlib.colormaps["viridis"], float(low), float(high))
-            axis.set_title(outcome.name, parse_math=False)
+            _name_panel(axis, outcome)
         references = "earlier frame" if evaluation.data.reference_images is None else "reference"
         for axis in axes:
             axis.set_xlabel(references)
@@ -104,7 +105,7 @@ def matches(evaluation: Evaluation) -> Figure:
         figure, axes = _grid(len(evaluation.outcomes), 1.0)
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_matches(axis, outcome, evaluation.data.truth)
-            axis.set_title(outcome.name, parse_math=False)
+            _name_panel(axis, outcome)
         _label_left(axes, "query")
         _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
@@ -124,7 +125,7 @@ def maps(evaluation: Evaluation) -> Figure:
         figure, axes = _grid(len(evaluation.outcomes), 1.0)
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_map(axis, outcome, evaluation.data.truth, positions)
-            axis.set_title(outcome.name, parse_math=False)
+            _name_panel(axis, outcome)
         _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
         return figure
@@ -273,6 +274,10 @@ def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
     for axis in flat[panels:]:
         axis.remove()
     return figure, flat[:panels]
+
+
+def _name_panel(axis: Axes, outcome: Outcome) -> None:
+    axis.set_title(textwrap.fill(outcome.name, TITLE_WIDTH), parse_math=False)
 
 
 def _label_left(axes: list[Axes], label: str) -> None:
