@@ -14,7 +14,7 @@ from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import datum_to_array, times
 from netspec.data.mean import read_mean
-from netspec.data.random_words import words
+from netspec.data.random_words import words_at
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import TRAIN
 
@@ -67,13 +67,13 @@ class Transformer:
             raise self._error(message, "mean_value")
         return (channels, self.crop_size, self.crop_size) if self.crop_size else shape
 
-    def __call__(self, images: Sequence[np.ndarray], first: int) -> np.ndarray:
+    def __call__(self, images: Sequence[np.ndarray], positions: range) -> np.ndarray:
         """Return the images, uint8 or float32 (C, H, W), as one batch: float32 (N, C, H', W').
 
-        ``first`` is the number of the first image in the sequence of all records read, which the draws follow.
+        ``positions`` are the images' numbers in the sequence of all records read, which the draws follow.
         """
         batch = np.empty((len(images), *self.output_shape(images[0].shape)), np.float32)
-        draws = words(self._seed, self._stream, first, len(images)).tolist()
+        draws = words_at(self._seed, self._stream, positions).tolist()
         for image, out, (mirror, h_off, w_off, _) in zip(images, batch, draws, strict=True):
             self._transform(image, out, mirror, h_off, w_off)
         if self.scale != 1:

@@ -18,7 +18,7 @@ import numpy as np
 from netspec import log
 from netspec.data.datum import decode_pixels, planar
 from netspec.data.mean import read_mean
-from netspec.data.random_words import words
+from netspec.data.random_words import words_at
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
 
@@ -101,7 +101,16 @@ class WindowSource:
     As in Caffe, ``transform_param.scale`` plays no part, and what lies outside of the image is 0 after the mean.
     """
 
-    def __init__(self, param: Any, transform: Any, at: Callable[..., Where], seed: int, stream: str) -> None:
+    def __init__(
+        self,
+        param: Any,
+        transform: Any,
+        at: Callable[..., Where],
+        seed: int,
+        stream: str,
+        rank: int = 0,
+        ranks: int = 1,
+    ) -> None:
         self._crop: int = transform.crop_size
         self._mirror: bool = transform.mirror
         self._pad: int = param.context_pad
@@ -116,7 +125,8 @@ class WindowSource:
                 raise SpecError(f'"{param.source}" has no {name} windows, of which each batch needs some', where)
         self._mean = _mean(transform, self._crop, at)
         self._seed, self._stream, self._where = seed, stream, where
-        self.cursor = Cursor(len(self._file.foreground) + len(self._file.background), param.batch_size)
+        count = len(self._file.foreground) + len(self._file.background)
+        self.cursor = Cursor(count, param.batch_size, rank=rank, ranks=ranks)
         self._bytes = lru_cache(maxsize=None if param.cache_images else 0)(lambda path: Path(path).read_bytes())
 
     @property
@@ -138,8 +148,7 @@ class WindowSource:
         return [f"{self._file.images[w.image]}:{w.x1},{w.y1},{w.x2},{w.y2}" for w, _ in self._draw(iteration)]
 
     def _draw(self, iteration: int) -> list[tuple[Window, bool]]:
-        size = self.cursor.batch_size
-        draws = words(self._seed, self._stream, iteration * size, size).tolist()
+        draws = words_at(self._seed, self._stream, self.cursor.positions(iteration)).tolist()
         return [
             (kind[index % len(kind)], self._mirror and mirror % 2 == 1)
             for kind, (index, mirror, *_) in zip(self._kinds, draws, strict=True)

@@ -51,13 +51,15 @@ class Context:
     ``at(*path)`` is the place in the prototxt of a field of this layer. ``device`` is where blobs are made; on
     ``meta`` they have shapes and no values. Where ``open_data`` is false, a layer that reads files must not: its tops'
     shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``. Of ``ranks`` nets
-    that train side by side the layer's net is number ``rank``. ``exact`` says which sums are to be Caffe's to the last
-    bit (netspec/exact); with ``accumulate_in_place``, layers that sum up their parameters' gradients themselves add
-    them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
+    that train side by side the layer's net is number ``rank``. ``random`` is this net's own; from ``data_seed``, which
+    is the same for all ranks, follow the draws of the layers that read records. ``exact`` says which sums are to be
+    Caffe's to the last bit (netspec/exact); with ``accumulate_in_place``, layers that sum up their parameters'
+    gradients themselves add them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
     """
 
     phase: int = TEST
     random: Random = field(default_factory=lambda: Random(0))
+    data_seed: int = 0
     at: Callable[..., Where] = _nowhere
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     open_data: bool = True

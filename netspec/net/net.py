@@ -98,6 +98,7 @@ class Net(torch.nn.Module):
             context = Context(
                 phase=self.phase,
                 random=self.random,
+                data_seed=self.random.seed if options.data_seed is None else options.data_seed,
                 at=at,
                 device=options.device,
                 open_data=options.open_data,

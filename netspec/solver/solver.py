@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from netspec import log
+from netspec.data.random_words import derived
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.net.build import build_net
@@ -156,14 +157,15 @@ class Solver:
         train, *tests = nets.solver_nets(param, node)
         site, sentence = _CREATING[train.origin.split()[0]]
         log.info(site, sentence.format(train.origin))
-        self.net = self._build(train, 0, self._device, 0, 1 + len(others))
+        ranks = 1 + len(others)
+        self.net = self._build(train, "rank 0", self._device, 0, ranks)
         with log.silent():  # Caffe tells of the root only
-            replicas = [self._build(train, k, other, k, 1 + len(others)) for k, other in enumerate(others, 1)]
-        self._replicas = Replicas(self.net, replicas)
+            replicas = [self._build(train, f"rank {k}", other, k, ranks) for k, other in enumerate(others, 1)]
+        self.replicas = Replicas(self.net, replicas)
         self.test_nets: list[Net] = []
         for i, test in enumerate(tests):
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
-            self.test_nets.append(self._build(test, 1 + i, self._device))
+            self.test_nets.append(self._build(test, test.label, self._device))
         log.info("solver.cpp:57", "Solver scaffolding done.")
         self.history = [
             torch.zeros_like(learnable.parameter.detach())
@@ -171,13 +173,15 @@ class Solver:
             for learnable in self.net.learnable
         ]
 
-    def _build(
-        self, described: nets.SolverNet, offset: int, device: torch.device, rank: int = 0, ranks: int = 1
-    ) -> Net:
-        """Build a net; ``offset`` keeps the random draws of a solver's nets apart."""
+    def _build(self, described: nets.SolverNet, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> Net:
+        """Build a net and load the weights to start from.
+
+        Each ``role`` has random draws of its own, but for the records: those that train side by side share their order.
+        """
         options = BuildOptions(
             device,
-            self._seed + offset,
+            seed=self._seed if role == "rank 0" else derived(self._seed, role),
+            data_seed=self._seed if ranks > 1 else None,
             allow_python=self._allow_python,
             rank=rank,
             ranks=ranks,
@@ -224,7 +228,7 @@ class Solver:
     def step(self, iterations: int) -> None:
         """Run some iterations. The window of the averaged loss begins anew."""
         self.stopped = False
-        self._replicas.begin()
+        self.replicas.begin()
         self._losses.clear()
         self._displayed = (self.clock(), self.iteration)
         for _ in range(iterations):
@@ -253,7 +257,7 @@ class Solver:
         """Sum the gradients of iter_size passes; return the mean of their losses, and the outputs of the last."""
         for learnable in self.net.learnable:
             learnable.parameter.grad = None
-        self._replicas.clear()
+        self.replicas.clear()
         total = np.float32(0)
         outputs: dict[str, torch.Tensor] = {}
         for _ in range(self.param.iter_size):
@@ -261,9 +265,9 @@ class Solver:
                 loss, outputs = self.net.forward_loss()
                 if loss.requires_grad:
                     loss.backward()
-            self._replicas.backward()
+            self.replicas.backward()
             total += np.float32(loss.item())
-        self._replicas.reduce()
+        self.replicas.reduce()
         return float(total / np.float32(self.param.iter_size)), outputs
 
     def _debugged(self, net: Net, wanted: bool = True) -> AbstractContextManager[None]:
@@ -293,7 +297,7 @@ class Solver:
         rates = [rate * item.lr_mult for item in learnable]
         self._rule.compute(self.param, diffs, rates, self.history, self.iteration)
         update.subtract(weights, diffs)
-        self._replicas.update()
+        self.replicas.update()
 
     def _advance_rate(self) -> float:
         step = next_step(self.param, self.iteration, self.current_step)
@@ -394,13 +398,13 @@ class Solver:
         self.current_step = state.current_step
         for net in (self.net, *self.test_nets):
             net.restart_data()
-        self._replicas.restart_data()
+        self.replicas.restart_data()
 
     def close(self) -> None:
         """Let go of the files and threads of all nets."""
         for net in (self.net, *self.test_nets):
             net.close()
-        self._replicas.close()
+        self.replicas.close()
 
 
 def _log_scores(site: str, phase: str, scores: Scores, weights: dict[str, float]) -> None:

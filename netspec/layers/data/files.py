@@ -134,8 +134,8 @@ class ReadingLayer(Layer):
 
     def transformer(self) -> Transformer:
         """Return the transformer of this layer's ``transform_param``."""
-        seed = self.context.random.seed
-        return Transformer(self.param.transform_param, self.phase, self.context.at, seed, self.stream)
+        context = self.context
+        return Transformer(self.param.transform_param, self.phase, context.at, context.data_seed, self.stream)
 
     def positive(self, value: int, *path: str) -> int:
         """Return ``value``, or refuse it."""
@@ -151,7 +151,7 @@ class ReadingLayer(Layer):
 
     def skip(self, rand_skip: int, count: int, *path: str) -> int:
         """Draw how many records to pass over at the start."""
-        skip = draw_skip(rand_skip, self.context.random.seed, self.stream)
+        skip = draw_skip(rand_skip, self.context.data_seed, self.stream)
         if rand_skip:
             log.info("image_data_layer.cpp:70", f"Skipping first {skip} data points.")
         if skip >= count:
@@ -247,7 +247,8 @@ class ImageData(ReadingLayer):
             log.info("image_data_layer.cpp:53", "Shuffling data")
         log.info("image_data_layer.cpp:63", f"A total of {len(images)} images.")
         skip = self.skip(p.rand_skip, len(images), "image_data_param", "rand_skip")
-        cursor = Cursor(len(images), self.batch_size, skip, p.shuffle, self.context.random.seed, self.stream)
+        seed, rank, ranks = self.context.data_seed, self.context.rank, self.context.ranks
+        cursor = Cursor(len(images), self.batch_size, skip, p.shuffle, seed, self.stream, rank, ranks)
         size = (p.new_height, p.new_width) if p.new_height else None
         source = ImageListSource(images, p.root_folder, p.is_color, size, cursor, self.transformer())
         self.log_size(source, "image_data_layer.cpp:90")
@@ -283,11 +284,8 @@ class HDF5Data(ReadingLayer):
         p = self.param.hdf5_data_param
         name = self.named(p.source, "hdf5_data_param", "source")
         at = self.context.at("hdf5_data_param", "source")
-        context = self.context
-        seed = context.random.seed - context.rank  # all ranks share one order
-        return Hdf5Source(
-            name, self.param.top, self.batch_size, p.shuffle, seed, self.stream, at, context.rank, context.ranks
-        )
+        seed, rank, ranks = self.context.data_seed, self.context.rank, self.context.ranks
+        return Hdf5Source(name, self.param.top, self.batch_size, p.shuffle, seed, self.stream, at, rank, ranks)
 
     def shapes_without_data(self) -> list[Shape]:
         """Return the shapes given by the caller; the prototxt says nothing of them."""
@@ -327,11 +325,10 @@ class WindowData(ReadingLayer):
         """Read the window file."""
         from netspec.data.windows import WindowSource
 
-        p = self.param
+        p, context = self.param, self.context
         self.named(p.window_data_param.source, "window_data_param", "source")
-        return WindowSource(
-            p.window_data_param, p.transform_param, self.context.at, self.context.random.seed, self.stream
-        )
+        seed, rank, ranks = context.data_seed, context.rank, context.ranks
+        return WindowSource(p.window_data_param, p.transform_param, context.at, seed, self.stream, rank, ranks)
 
     def known_shape(self) -> Shape:
         """Return the shape; the prototxt says all of it."""
