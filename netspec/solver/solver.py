@@ -32,9 +32,9 @@ from netspec.solver.checks import check_settings, check_writable
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
+from netspec.solver.scores import Scores, Tally, as_scores, score_lines
 from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
 
-Scores = dict[str, list[float]]
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
     "net_param": ("solver.cpp:97", "Creating training net specified in {}."),
@@ -312,8 +312,7 @@ class Solver:
         pace = f"{log.number(speed)} iter/s, {log.number(now - then)}s/{self.param.display} iters"
         log.info("solver.cpp:239", f"Iteration {self.iteration} ({pace}), loss = {log.number(self.loss)}")
         self._displayed = (now, self.iteration)
-        scores = {name: blob.detach().reshape(-1).tolist() for name, blob in outputs.items()}
-        _log_scores("solver.cpp:258", "Train", scores, self.net.output_loss_weights)
+        _log_scores("solver.cpp:258", "Train", as_scores(outputs), self.net.output_loss_weights)
 
     # Testing
 
@@ -329,8 +328,7 @@ class Solver:
         log.info("solver.cpp:347", f"Iteration {self.iteration}, Testing net (#{i})")
         net, batches = self.test_nets[i], self.param.test_iter[i]
         net.share_weights_with(self.net)
-        sums: Scores = {}
-        total = 0.0
+        tally = Tally()
         for _ in range(batches):
             while request := self.action():
                 if request == "snapshot":
@@ -340,14 +338,10 @@ class Solver:
                 log.info("solver.cpp:396", "Test interrupted.")
                 return
             with self._debugged(net):
-                loss, outputs = net.forward_loss()
-            total += loss.item()
-            for name, blob in outputs.items():
-                scores = blob.reshape(-1).tolist()
-                sums[name] = [a + b for a, b in zip(sums[name], scores, strict=True)] if name in sums else scores
+                tally.add(*net.forward_loss())
         if self.param.test_compute_loss and batches:
-            log.info("solver.cpp:401", f"Test loss: {log.number(total / batches)}")
-        self.scores[i] = {name: [value / batches for value in values] for name, values in sums.items()}
+            log.info("solver.cpp:401", f"Test loss: {log.number(tally.loss)}")
+        self.scores[i] = tally.scores
         _log_scores("solver.cpp:414", "Test", self.scores[i], net.output_loss_weights)
         self.on_test(i)
 
@@ -408,13 +402,8 @@ class Solver:
 
 
 def _log_scores(site: str, phase: str, scores: Scores, weights: dict[str, float]) -> None:
-    number = 0
-    for name, values in scores.items():
-        weight = weights[name]
-        for value in values:
-            ending = f" (* {log.number(weight)} = {log.number(weight * value)} loss)" if weight else ""
-            log.info(site, f"    {phase} net output #{number}: {name} = {log.number(value)}{ending}")
-            number += 1
+    for i, line in enumerate(score_lines(scores, weights)):
+        log.info(site, f"    {phase} net output #{i}: {line}")
 
 
 def _same_shape(mine: tuple[int, ...], theirs: tuple[int, ...]) -> bool:
