@@ -11,7 +11,7 @@ import torch
 
 from netspec.check.lint import missing_data, net_advice, solver_advice
 from netspec.errors import SpecError, Where, did_you_mean
-from netspec.graph.filter import with_state
+from netspec.graph.filter import with_state, with_train_state
 from netspec.layers.base import Shape
 from netspec.net.build import build_net
 from netspec.net.net import Net
@@ -97,7 +97,7 @@ def _check_solver(
     path: str | Path, level: int, stages: Iterable[str], shapes: Mapping[str, Shape], allow_python: bool
 ) -> list[Checked]:
     from netspec.solver.checks import check_settings
-    from netspec.solver.nets import solver_nets, with_train_state
+    from netspec.solver.nets import solver_nets
 
     solver, node = parse_solver(path)
     faults: list[SpecError] = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto.schema import NetParameter
@@ -11,8 +10,8 @@ from netspec.proto.source_map import SourceMap
 
 
 def prune(
-    net: Any, source: SourceMap, wanted: Sequence[str], given: Mapping[str, Sequence[int]]
-) -> tuple[Any, SourceMap]:
+    net: NetParameter, source: SourceMap, wanted: Sequence[str], given: Mapping[str, Sequence[int]]
+) -> tuple[NetParameter, SourceMap]:
     """Return the filtered net with only the layers that ``wanted`` blobs need.
 
     The layer that first writes a blob of ``given`` (name -> shape) is replaced by an Input layer of that shape; layers

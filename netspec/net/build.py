@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -50,7 +49,7 @@ def load_net(
     return built
 
 
-def build_net(net: Any, source: SourceMap, options: BuildOptions | None = None) -> Net:
+def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
     """Filter by the net's own ``state``, insert splits, plan, and build."""
     options = options or BuildOptions()
     filtered, source = filter_net(net, source, options.report)

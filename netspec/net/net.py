@@ -136,7 +136,7 @@ class Net(torch.nn.Module):
             self._finish(list(layers.values()))
         return torch.nn.ModuleList(layers.values())
 
-    def _log_wiring(self, node: Any) -> None:
+    def _log_wiring(self, node: Node) -> None:
         log.info("net.cpp:86", f"Creating Layer {node.name}")
         for v in node.bottoms:
             log.info("net.cpp:408", f"{node.name} <- {self.plan.blobs[v]}")
@@ -321,7 +321,7 @@ class Net(torch.nn.Module):
             layer.close()
 
 
-def _tops(plan: Plan, node: Any) -> list[str]:
+def _tops(plan: Plan, node: Node) -> list[str]:
     return [plan.blobs[v] for v in node.tops]
 
 

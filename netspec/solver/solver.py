@@ -20,6 +20,7 @@ from netspec import log
 from netspec.data.random_words import derived
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
+from netspec.graph.filter import with_train_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
@@ -65,7 +66,7 @@ def load_solver(
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
     param, node = parse_solver(path)
     if level is not None or stages:
-        param = nets.with_train_state(param, level, stages)
+        param = with_train_state(param, level, stages)
     if weights is not None:
         param.ClearField("weights")
         param.weights.extend([str(weights)] if isinstance(weights, (str, Path)) else map(str, weights))
