@@ -10,6 +10,7 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 from netspec.errors import SpecError
+from netspec.proto.dialect.folders import FOLDERS
 
 if TYPE_CHECKING:
     from netspec.dialects import use_dialect
@@ -31,6 +32,7 @@ _HOMES = {
 __all__ = ["Net", "Solver", "SpecError", "load_net", "load_solver", "load_weights", "save_weights", "use_dialect"]
 
 
+FOLDERS.append((f"{__path__[0]}/dialects", "netspec.dialects"))  # told here: an error names them, whatever is imported
 __path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the names they had before
 
 

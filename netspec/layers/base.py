@@ -2,6 +2,10 @@
 
 A layer is complete when its constructor returns: its learnable blobs exist and are filled, and ``top_shapes`` says,
 by integer arithmetic alone, what ``forward`` will return.
+
+A new layer, a dialect's too, needs ``setup`` (where it has anything to read or learn), ``reshape`` and ``forward``.
+``construct``, and ``ReadingLayer.open``, exist only so that a line of the log stands where Caffe's does: Caffe opens a
+database in a layer's constructor, before it logs the layer's bottoms and tops, and reads its first record after that.
 """
 
 from __future__ import annotations
