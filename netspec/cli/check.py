@@ -32,7 +32,7 @@ def add_to(commands: Commands) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.check.check import check_file
-    from netspec.check.table import as_json, table
+    from netspec.net.table import as_json, table
 
     shapes = dict(arguments.shape)
     checked = check_file(

@@ -25,9 +25,10 @@ from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
 from netspec.net.options import BuildOptions
+from netspec.net.table import table
 from netspec.proto.dialect.files import announce_known
 from netspec.proto.dialect.registry import advice_for_type
-from netspec.proto.schema import NetParameter
+from netspec.proto.schema import PHASE_NAMES, NetParameter
 
 Array = np.ndarray | torch.Tensor
 
@@ -195,6 +196,10 @@ class Net(torch.nn.Module):
         log.info("net.cpp:257", "Network initialization done.")
         for line in unused_fields(self.plan, layers):
             log.warning("net.cpp:257", line)
+
+    def __repr__(self) -> str:
+        """Return the net as a table of its layers."""
+        return f"{self.name or 'a net without a name'}, phase {PHASE_NAMES[self.phase]}\n{table(self)}"
 
     # Running
 

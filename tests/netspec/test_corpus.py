@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from netspec.check.check import check_file, is_solver
-from netspec.check.table import as_json
+from netspec.net.table import as_json
 from netspec.proto.text import parse_net, parse_solver
 from paths import SHARED
 
