@@ -20,14 +20,12 @@ from netspec.errors import SpecError, Where, did_you_mean
 from netspec.exact.sums import RowSums
 from netspec.exact.switch import applies
 from netspec.graph.plan import Node, Param, Plan, plan_backward
-from netspec.layers import layer_class, layer_types
+from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
 from netspec.net.options import BuildOptions
 from netspec.net.table import table
-from netspec.proto.dialect.files import announce_known
-from netspec.proto.dialect.registry import advice_for_type
 from netspec.proto.schema import PHASE_NAMES, NetParameter
 
 Array = np.ndarray | torch.Tensor
@@ -92,7 +90,7 @@ class Net(torch.nn.Module):
             log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
             cls = layer_class(node.type)
             if cls is None:
-                options.report(SpecError(_unknown_type(node.type), at("type")))
+                options.report(SpecError(unknown_type(node.type), at("type")))
                 continue
             if any(v not in shapes for v in node.bottoms):
                 continue  # for a fault upstream, which was reported
@@ -357,10 +355,3 @@ def _loss_weights(layer: Layer) -> list[float]:
             raise layer.error(message, "loss_weight")
         return given
     return [1.0 if layer.is_loss and j == 0 else 0.0 for j in range(layer.num_tops)]
-
-
-def _unknown_type(name: str) -> str:
-    announce_known()
-    fork = advice_for_type(name)
-    advice = f"; {fork}" if fork else did_you_mean(name, layer_types()) or "; `netspec layers` lists the known ones"
-    return f'unknown layer type "{name}"{advice}'
