@@ -5,7 +5,7 @@ Caffe: src/caffe/data_transformer.cpp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,19 @@ from netspec.data.mean import read_mean
 from netspec.data.random_words import words_at
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import TRAIN
+
+
+def contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
+    """Yield a SpecError for each two settings of a transform_param that exclude each other."""
+    if param.force_color and param.force_gray:
+        yield SpecError("force_color and force_gray exclude each other", at("transform_param", "force_gray"))
+    yield from mean_contradictions(param, at)
+
+
+def mean_contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
+    """Yield a SpecError where a transform_param has two kinds of mean."""
+    if param.HasField("mean_file") and param.mean_value:
+        yield SpecError("mean_file and mean_value exclude each other", at("transform_param", "mean_value"))
 
 
 class Transformer:
@@ -34,11 +47,9 @@ class Transformer:
         self.crop_size: int = param.crop_size
         self.mirror: bool = param.mirror
         self.scale = np.float32(param.scale)
-        if param.force_color and param.force_gray:
-            raise self._error("force_color and force_gray exclude each other", "force_gray")
+        for fault in contradictions(param, at):
+            raise fault
         self.color: bool | None = True if param.force_color else False if param.force_gray else None
-        if param.HasField("mean_file") and param.mean_value:
-            raise self._error("mean_file and mean_value exclude each other", "mean_value")
         self.mean_values = np.array(param.mean_value, np.float32)
         self._mean_file = param.mean_file
         self._mean = read_mean(param.mean_file, at("transform_param", "mean_file")) if param.mean_file else None

@@ -59,5 +59,5 @@ def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None
     built = Net(make_plan(split, source, options.report), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
     if written.layer:  # weights in the prototxt itself
-        copy_weights(built, written, source.file)
+        copy_weights(built, written, source.file, options.report)
     return built

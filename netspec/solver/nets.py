@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from netspec.data.random_words import derived
 from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
 from netspec.graph.filter import in_state
@@ -15,6 +16,7 @@ from netspec.proto.schema import NetParameter, NetState, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import parse_net
 
+TRAIN_NET = "train net"
 TRAIN_FIELDS = ("net", "net_param", "train_net", "train_net_param")
 _GENERIC = ("net_param", "net")  # they serve for training and, as often as test_iter says, for testing
 _Found = tuple[str, NetParameter, SourceMap]
@@ -30,13 +32,17 @@ class SolverNet:
     source: SourceMap
 
 
+def seed_of(seed: int, label: str) -> int:
+    """Return the seed of one of a solver's nets: no two draw alike, and the training net has the solver's own."""
+    return seed if label == TRAIN_NET else derived(seed, label)
+
+
 def solver_nets(param: SolverParameter, node: Place, report: Report = raise_fault) -> list[SolverNet]:
     """Return the training net and the test nets; a file is read once, however many nets it holds.
 
     The test nets are in Caffe's order: each test_net_param, each test_net, then the general net for every further
-    test_iter.
-    ``report`` gets a SpecError for all that the solver does not say clearly and for each file that cannot be read; the
-    nets concerned are left out.
+    test_iter. ``report`` gets a SpecError for all that the solver does not say clearly and for each file that cannot be
+    read; the nets concerned are left out.
     """
     read = _Reader(param, node, report)
     described = []
@@ -50,7 +56,7 @@ def solver_nets(param: SolverParameter, node: Place, report: Report = raise_faul
     if len(found) == 1 and found[0]:
         origin, net, source = found[0]
         stated = in_state(net, NetState(phase="TRAIN"), net.state, param.train_state)
-        described.append(SolverNet("train net", origin, stated, source))
+        described.append(SolverNet(TRAIN_NET, origin, stated, source))
     for i, test in enumerate(_test_nets(param, node, read, report)):
         if test:
             origin, net, source = test
@@ -64,7 +70,8 @@ def _test_nets(param: SolverParameter, node: Place, read: _Reader, report: Repor
     found = [read(name, i) for name in ("test_net_param", "test_net") for i in range(len(getattr(param, name)))]
     general = next((name for name in _GENERIC if param.HasField(name)), None)
     missing = len(param.test_iter) - len(found)
-    if missing < 0 or (missing > 0 and general is None):
+    a_net_is_named = any(param.HasField(name) for name in TRAIN_FIELDS)  # else that is the fault
+    if missing < 0 or (missing > 0 and general is None and a_net_is_named):
         expected = f"{len(found)}, one for each test_net and test_net_param" + (" (or more)" if general else "")
         report(SpecError(f"found {len(param.test_iter)} test_iter, expected {expected}", node.find("test_iter")))
     if general is not None:

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.data.random_words import derived
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
@@ -29,7 +28,7 @@ from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
-from netspec.solver.checks import check_settings, check_writable
+from netspec.solver.checks import check_prefix, check_settings
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
@@ -134,7 +133,7 @@ class Solver:
         log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
         check_settings(param, node)
         if param.snapshot:
-            check_writable(param, node)
+            check_prefix(param, node)
         self.param = param
         self.node = node
         self.action = action or (lambda: None)
@@ -148,7 +147,9 @@ class Solver:
         self.stopped = False
         self._losses: deque[float] = deque(maxlen=param.average_loss)
         self._displayed = (clock(), 0)
-        self._rule = update.find_rule(param, node)
+        rule = update.find_rule(param.type)
+        assert rule is not None, "check_settings refuses unknown types"
+        self._rule = rule
         self._device = device or choose_device(param, node)
         self._allow_python = allow_python
         self._exact = exact
@@ -159,7 +160,7 @@ class Solver:
         site, sentence = _CREATING[train.origin.split()[0]]
         log.info(site, sentence.format(train.origin))
         ranks = 1 + len(others)
-        self.net = self._build(train, "rank 0", self._device, 0, ranks)
+        self.net = self._build(train, train.label, self._device, 0, ranks)
         with log.silent():  # Caffe tells of the root only
             replicas = [self._build(train, f"rank {k}", other, k, ranks) for k, other in enumerate(others, 1)]
         self.replicas = Replicas(self.net, replicas)
@@ -181,7 +182,7 @@ class Solver:
         """
         options = BuildOptions(
             device,
-            seed=self._seed if role == "rank 0" else derived(self._seed, role),
+            seed=nets.seed_of(self._seed, role),
             data_seed=self._seed if ranks > 1 else None,
             allow_python=self._allow_python,
             rank=rank,
@@ -211,7 +212,7 @@ class Solver:
         log.info("solver.cpp:289", f"Solving {self.net.name}")
         log.info("solver.cpp:290", f"Learning Rate Policy: {self.param.lr_policy}")
         if self.param.snapshot_after_train:
-            check_writable(self.param, self.node)
+            check_prefix(self.param, self.node)
         self.step(self.param.max_iter - self.iteration)
         if self.param.snapshot_after_train and not self._is_due(self.param.snapshot):
             self.snapshot()
@@ -227,7 +228,13 @@ class Solver:
         log.info("solver.cpp:332", "Optimization Done.")
 
     def step(self, iterations: int) -> None:
-        """Run some iterations. The window of the averaged loss begins anew."""
+        """Run some iterations. The window of the averaged loss begins anew.
+
+        Raises SpecError where a net has inputs, which nobody would fill.
+        """
+        for net in (self.net, *self.test_nets):
+            for fault in net.missing_inputs():
+                raise fault
         self.stopped = False
         self.replicas.begin()
         self._losses.clear()
