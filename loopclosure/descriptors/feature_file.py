@@ -1,4 +1,4 @@
-"""Descriptors that another program computed: the features.npz of ``netspec extract --images``."""
+"""Descriptors that another program computed: the features.npz of ``netspec extract --images`` (docs/features.md)."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def add_to(commands: Commands) -> None:
 def _extract(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from netspec.features.image_list import read_image_list
+    from netspec.features.image_list import list_images
     from netspec.features.images import extract_images, image_net
     from netspec.features.records import extract_records, with_sources
     from netspec.graph.filter import with_state
@@ -74,7 +74,7 @@ def _extract(arguments: argparse.Namespace) -> None:
         (blob,) = arguments.blob
         if arguments.shape and arguments.shape[0] != arguments.input:
             raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
-        images = read_image_list(Path(arguments.images))
+        images = list_images(arguments.images)
         given = arguments.shape[1] if arguments.shape else None
         net, scaling = image_net(arguments.model, blob, arguments.input, given, chosen, arguments.exact)
         load_weights(net, arguments.weights)

@@ -149,9 +149,9 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
-        (["--images", "nowhere"], "nowhere: cannot read the image list: "),
-        (["--images", "list.txt"], "list.txt:2:1: image 'b.png' is missing in ."),
-        (["--images", "empty"], "empty: no image files in this folder"),
+        (["--images", "nowhere"], "nowhere: cannot be read: No such file or directory; expected a folder of images"),
+        (["--images", "list.txt"], 'list.txt:2:1: no such image "b.png" in .'),
+        (["--images", "empty"], "empty: holds no image; expected files that end in .png, "),
         (
             ["--images", "walk/rgb", "--input", "dat"],
             f'{NET}: no blob "dat" in this net; did you mean "data"? it has: ',
