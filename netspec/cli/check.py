@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import sys
 
 from netspec.cli.arguments import add_python, add_state, shape, stages
@@ -14,8 +13,9 @@ from netspec.proto.schema import PHASES
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add("check", _check, "build a net, or a solver's nets, and report every fault; nothing is written")
-    p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
+    p = commands.add(
+        "check", _check, "build a net, or a solver's nets, and report every fault; nothing is written", True
+    )
     p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
     add_state(p, phase="TEST")
     p.add_argument(

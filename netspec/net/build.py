@@ -52,7 +52,11 @@ def load_net(
 def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
     """Filter by the net's own ``state``, insert splits, plan, and build."""
     options = options or BuildOptions()
-    filtered, source = filter_net(net, source, options.report)
+    return build_filtered(*filter_net(net, source, options.report), options)
+
+
+def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
+    """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
         log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source, options.report)

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.errors import SpecError, Where, did_you_mean
+from netspec.errors import SpecError, Where
 from netspec.exact.sums import RowSums
 from netspec.exact.switch import applies
-from netspec.graph import Report, raise_fault
+from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
@@ -274,9 +274,7 @@ class Net(torch.nn.Module):
         if self.keep == "all":
             return set(current.values())
         names = [self.keep] if isinstance(self.keep, str) else list(self.keep)
-        for name in names:
-            if name not in current:
-                raise ValueError(f"no blob {name!r} in this net{did_you_mean(name, list(current))}")
+        check_blobs(names, current, self.plan.source.file)
         return set(self.plan.outputs.values()) | {current[name] for name in names}
 
     # Parameters and data

@@ -34,6 +34,13 @@ def test_check_prints_a_table(run: Run) -> None:
     assert rows["total"].split() == ["total", "5,756", "0.20", "1,340,416"]
 
 
+def test_check_shows_caffes_log_when_asked(run: Run) -> None:
+    quiet, loud = (run("check", NET, *PAIR_SHAPE, *words) for words in ([], ["-v"]))
+    assert quiet.err == ""
+    assert "Network initialization done." in loud.messages
+    assert loud.out == quiet.out
+
+
 def test_check_builds_all_nets_of_a_solver(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "snapshot_after_train: false", "")
     result = run("check", solver, *PAIR_SHAPE, "--json")
