@@ -8,10 +8,10 @@ import torch
 
 from netspec.log import info, number
 from netspec.net.net import Net
-from netspec.solver.scores import Scores, Tally, score_lines
+from netspec.solver.tally import Outputs, Tally, score_lines
 
 
-def test_net(net: Net, iterations: int) -> Scores:
+def test_net(net: Net, iterations: int) -> Outputs:
     """Run ``iterations`` batches; log each batch's outputs and their means, and return the means by output blob."""
     info("caffe.cpp:281", f"Running for {iterations} iterations.")
     tally = Tally()

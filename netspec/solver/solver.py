@@ -32,8 +32,8 @@ from netspec.solver.checks import check_prefix, check_settings
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
-from netspec.solver.scores import Scores, Tally, as_scores, score_lines
 from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
+from netspec.solver.tally import Outputs, Tally, as_scores, score_lines
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
@@ -143,7 +143,7 @@ class Solver:
         self.on_snapshot: Callable[[str], object] = lambda model: None
         self.iteration = 0
         self.current_step = 0
-        self.scores: list[Scores] = []
+        self.scores: list[Outputs] = []
         self.stopped = False
         self._losses: deque[float] = deque(maxlen=param.average_loss)
         self._displayed = (clock(), 0)
@@ -409,7 +409,7 @@ class Solver:
         self.replicas.close()
 
 
-def _log_scores(site: str, phase: str, scores: Scores, weights: dict[str, float]) -> None:
+def _log_scores(site: str, phase: str, scores: Outputs, weights: dict[str, float]) -> None:
     for i, line in enumerate(score_lines(scores, weights)):
         log.info(site, f"    {phase} net output #{i}: {line}")
 

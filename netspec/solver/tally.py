@@ -11,7 +11,7 @@ import torch
 
 from netspec.log import number
 
-Scores = dict[str, list[float]]
+Outputs = dict[str, list[float]]
 
 
 class Tally:
@@ -20,9 +20,9 @@ class Tally:
     def __init__(self) -> None:
         self.batches = 0
         self._loss = 0.0
-        self._sums: Scores = {}
+        self._sums: Outputs = {}
 
-    def add(self, loss: torch.Tensor, outputs: Mapping[str, torch.Tensor]) -> Scores:
+    def add(self, loss: torch.Tensor, outputs: Mapping[str, torch.Tensor]) -> Outputs:
         """Add what ``Net.forward_loss`` returned for a batch; return the batch's own scores."""
         self.batches += 1
         self._loss += loss.item()
@@ -38,17 +38,17 @@ class Tally:
         return self._loss / self.batches
 
     @property
-    def scores(self) -> Scores:
+    def scores(self) -> Outputs:
         """The mean of each element of each output blob."""
         return {name: [value / self.batches for value in values] for name, values in self._sums.items()}
 
 
-def as_scores(outputs: Mapping[str, torch.Tensor]) -> Scores:
+def as_scores(outputs: Mapping[str, torch.Tensor]) -> Outputs:
     """Return the elements of each output blob, in order."""
     return {name: blob.detach().reshape(-1).tolist() for name, blob in outputs.items()}
 
 
-def score_lines(scores: Scores, weights: Mapping[str, float]) -> Iterator[str]:
+def score_lines(scores: Outputs, weights: Mapping[str, float]) -> Iterator[str]:
     """Yield ``name = value`` of each element, with its part of the loss where its output has a loss weight."""
     for name, values in scores.items():
         weight = weights[name]
