@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import IMAGE_SUFFIXES
+from loopclosure.places.image_list import IMAGE_ENDINGS
 
 
 def read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]]], list[str]]:
@@ -20,7 +20,7 @@ def read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]]
         raise InputError(f"cannot be read ({reason}); expected a CSV table with a header line", path) from error
     if not rows:
         raise InputError("has no row below its header line", path)
-    columns = [name for name, text in rows[0][1].items() if str(text).lower().endswith(IMAGE_SUFFIXES)]
+    columns = [name for name, text in rows[0][1].items() if str(text).lower().endswith(IMAGE_ENDINGS)]
     if len(columns) != images:
         raise InputError(
             f"has {len(columns)} column{'s'[len(columns) == 1 :]} of image names ({', '.join(columns) or 'none'}); "

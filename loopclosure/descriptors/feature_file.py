@@ -1,13 +1,4 @@
-"""Descriptors that another program computed: the features.npz of ``netspec extract --images``.
-
-Its arrays, of which only the first is required:
-features           (N, D) or more axes; or one array of another name, that of a blob
-names              (N,) the images' names
-stamps             (N,) seconds
-seconds_per_image  () the net's time per image
-zooms              (views,) the views of each image, whose descriptors follow one another in a row
-keys, seconds_per_record, parameters   of databases and nets; not used here
-"""
+"""Descriptors that another program computed: the features.npz of ``netspec extract --images`` (docs/features.md)."""
 
 from __future__ import annotations
 

@@ -22,13 +22,13 @@ from loopclosure.places.frames import (
     ALL_FRAMES,
     VIDEO_SUFFIXES,
     Selection,
-    image_paths,
     read_bgr,
     video_frames,
     video_length,
 )
+from loopclosure.places.image_list import list_images
 from loopclosure.places.same_place import same_place
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Poses, associate, read_groundtruth, read_rgb_list
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Poses, associate, read_groundtruth
 from loopclosure.progress import Progress, silent
 
 
@@ -78,12 +78,12 @@ def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Rec
             raise InputError("does not say how many frames it has; save its frames as images", source)
         numbers = selection.numbers(count)
         return Recording(source, [f"frame {number}" for number in numbers], None, numbers)
-    images = image_paths(source)
+    listed = list_images(source)
+    images = listed.paths
     taken = selection.numbers(len(images))
     stamps = poses = None
-    if (source / "rgb.txt").is_file():
-        frames = read_rgb_list(source / "rgb.txt")
-        stamps = np.array([frames[i].stamp for i in taken])
+    if listed.stamps is not None:
+        stamps = listed.stamps[taken]
         if (source / "groundtruth.txt").is_file():
             trajectory = read_groundtruth(source / "groundtruth.txt")
             nearest = associate(stamps, trajectory, MAX_DIFFERENCE_S)

@@ -11,11 +11,9 @@ import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import read_rgb_list
+from loopclosure.places.image_list import list_images
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
-STAMP = re.compile(r"\d+(\.\d+)?\s+")
 
 
 @dataclass(frozen=True)
@@ -58,49 +56,9 @@ def _frame_number(position: int | str, count: int) -> int:
     return round(float(match[1]) / 100 * count)
 
 
-def natural_order(path: Path) -> list[str | int]:
-    """Sort key by which 2.jpg comes before 10.jpg."""
-    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
-
-
 def image_paths(source: str | Path) -> list[Path]:
-    """List the images of a source, in order.
-
-    A TUM RGB-D sequence (a folder with rgb.txt) gives the images listed there, in order of time. Any other folder gives
-    its image files in natural order (2.jpg before 10.jpg), or those of its subfolder rgb or images if it has none. A
-    text file gives the paths in it, one per line, relative to its folder; a stamp may precede a path, and # begins a
-    comment.
-    """
-    source = Path(source)
-    if source.is_dir():
-        if (source / "rgb.txt").is_file():
-            return [source / frame.path for frame in read_rgb_list(source / "rgb.txt")]
-        for folder in (source, *(source / name for name in ("rgb", "images", "Images"))):
-            images = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES] if folder.is_dir() else []
-            if images:
-                return sorted(images, key=natural_order)
-        raise InputError(f"holds no image; expected files ending in {', '.join(IMAGE_SUFFIXES)}", source)
-    if source.suffix.lower() in IMAGE_SUFFIXES + VIDEO_SUFFIXES:
-        raise InputError("is a single file; expected a folder of images or a list of them", source)
-    try:
-        lines = source.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            "cannot be read; expected a folder of images, or a text file that lists them", source
-        ) from error
-    images = []
-    for number, line in enumerate(lines, start=1):
-        name = line.partition("#")[0].strip()
-        if name:
-            path = source.parent / name
-            if not path.is_file() and STAMP.match(name):
-                path = source.parent / STAMP.sub("", name)
-            if not path.is_file():
-                raise InputError(f'no such image "{name}" (looked in {source.parent})', source, number, 1)
-            images.append(path)
-    if not images:
-        raise InputError("lists no image", source)
-    return images
+    """Return the images of a folder or of a list, in order (the rule: docs/images.md); InputError if there are none."""
+    return list(list_images(source).paths)
 
 
 def read_bgr(path: str | Path) -> np.ndarray:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -50,15 +49,19 @@ def load_net(
     return built
 
 
-def build_net(net: Any, source: SourceMap, options: BuildOptions | None = None) -> Net:
+def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
     """Filter by the net's own ``state``, insert splits, plan, and build."""
     options = options or BuildOptions()
-    filtered, source = filter_net(net, source, options.report)
+    return build_filtered(*filter_net(net, source, options.report), options)
+
+
+def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
+    """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
         log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source, options.report)
     built = Net(make_plan(split, source, options.report), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
     if written.layer:  # weights in the prototxt itself
-        copy_weights(built, written, source.file)
+        copy_weights(built, written, source.file, options.report)
     return built

@@ -65,7 +65,7 @@ def test_broken_sources(tmp_path):
         image_paths(tmp_path / "list.txt")
     with pytest.raises(InputError, match="cannot be read"):
         image_paths(tmp_path / "absent.txt")
-    with pytest.raises(InputError, match="single file"):
+    with pytest.raises(InputError, match="single image"):
         image_paths(tmp_path / "a.png")
     with pytest.raises(InputError, match="no such image"):
         read_bgr(tmp_path / "a.png")
