@@ -13,6 +13,8 @@ import pytest
 
 from paths import GOLDEN, ROOT
 
+pytestmark = pytest.mark.slow
+
 PACKAGES = ("lmdb_build", "loopclosure", "netspec")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
 

@@ -65,7 +65,8 @@ def test_every_command_is_one_that_its_parser_takes(where: str) -> None:
         try:
             parse(words)
         except SystemExit as end:
-            assert not end.code, shlex.join(words)  # --help ends with 0
+            if end.code:  # --help ends with 0
+                pytest.fail(shlex.join(words))
 
 
 @pytest.mark.parametrize(

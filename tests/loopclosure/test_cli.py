@@ -74,6 +74,7 @@ def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
     assert "vocabulary" not in summary["methods"][0]["milliseconds_a_frame"]
 
 
+@pytest.mark.slow
 def test_the_door(two_laps, two_laps_features, tmp_path):
     done = subprocess.run(
         [

@@ -55,6 +55,7 @@ def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence:
     assert picture.shape == (SMALL.height, SMALL.width, 3)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_house(folder: Path, tmp_path: Path) -> None:
     short = replace(SMALL, frames=4, laps=1)
     for name, walk in (("a", short), ("b", short), ("c", replace(short, seed=8))):

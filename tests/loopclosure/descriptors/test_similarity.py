@@ -80,6 +80,7 @@ def test_equal_scores_come_in_the_order_of_the_references(columns, monkeypatch):
     np.testing.assert_array_equal(top_k(same, same, k=3).indices, np.tile([0, 1, 2], (9, 1)))
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_blocks(monkeypatch):
     """20,000 frames: the whole matrix would be 1.6 GB of float32."""
     import tracemalloc

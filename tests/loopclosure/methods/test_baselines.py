@@ -144,6 +144,7 @@ def test_arguments_that_make_no_sense(spec: str, message: str) -> None:
         make_method(spec)
 
 
+@pytest.mark.slow
 def test_corridor_loop_with_its_two_images_without_features() -> None:
     corridor = shared("data", "corridor_loop", "samples")
     train = sorted(shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy", "rgb").glob("*.jpg"))[::12]

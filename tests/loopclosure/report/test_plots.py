@@ -73,6 +73,7 @@ def test_a_dollar_sign_in_a_name_is_no_formula():
     assert [label.split()[1] for label in labels] == [r"$\nonsense{$", "_hidden"]
 
 
+@pytest.mark.slow
 def test_the_callers_backend_is_untouched(two_laps, tmp_path):
     code = f"""
 import sys, matplotlib
