@@ -21,7 +21,7 @@ from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights
-from netspec.proto.schema import TEST, NetParameter, SolverParameter
+from netspec.proto.schema import TEST, NetParameter, PhaseValue, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.checks import check_prefix, check_settings
@@ -51,7 +51,7 @@ class _Manner:
 
 def check_file(
     path: str | Path,
-    phase: int = TEST,
+    phase: PhaseValue = TEST,
     level: int = 0,
     stages: Sequence[str] = (),
     shapes: Mapping[str, Shape] | None = None,

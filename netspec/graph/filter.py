@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from netspec import log
 from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
-from netspec.proto.schema import LayerParameter, NetParameter, NetState, NetStateRule, SolverParameter
+from netspec.proto.schema import LayerParameter, NetParameter, NetState, NetStateRule, PhaseValue, SolverParameter
 from netspec.proto.source_map import SourceMap
 
 
@@ -21,7 +21,9 @@ def in_state(net: NetParameter, *states: NetState) -> NetParameter:
     return stated
 
 
-def with_state(net: NetParameter, phase: int, level: int | None = None, stages: Iterable[str] = ()) -> NetParameter:
+def with_state(
+    net: NetParameter, phase: PhaseValue, level: int | None = None, stages: Iterable[str] = ()
+) -> NetParameter:
     """Return a copy of the net whose state has this phase, this level (unless None) and these stages added."""
     return in_state(net, net.state, NetState(phase=phase, level=level, stage=stages))
 

@@ -19,7 +19,7 @@ from netspec.graph.splits import insert_splits
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.weights import copy_weights, load_weights
-from netspec.proto.schema import PHASES, NetParameter
+from netspec.proto.schema import PHASES, NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 
@@ -41,7 +41,7 @@ def load_net(
     Raises SpecError for every fault of the files.
     """
     net, source = parse_net(path)
-    number = PHASES[phase] if isinstance(phase, str) else phase
+    number = PHASES[phase] if isinstance(phase, str) else PhaseValue(phase)
     options = BuildOptions(torch.device(device), seed, allow_python=allow_python, exact=exact)
     built = build_net(with_state(net, number, level, stages), source, options)
     if weights is not None:

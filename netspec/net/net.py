@@ -60,7 +60,7 @@ class Net(torch.nn.Module):
         self.param = NetParameter()
         self.param.CopyFrom(plan.net)
         self.name: str = plan.net.name
-        self.phase: int = plan.net.state.phase
+        self.phase = plan.net.state.phase
         self.device = options.device
         self._exact = options.exact
         self.keep: str | Iterable[str] = ()

@@ -12,7 +12,7 @@ from netspec.data.random_words import derived
 from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
 from netspec.graph.filter import in_state
-from netspec.proto.schema import NetParameter, NetState, SolverParameter
+from netspec.proto.schema import TEST, TRAIN, NetParameter, NetState, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import parse_net
 
@@ -55,13 +55,13 @@ def solver_nets(param: SolverParameter, node: Place, report: Report = raise_faul
     found = [read(name) for name in names]
     if len(found) == 1 and found[0]:
         origin, net, source = found[0]
-        stated = in_state(net, NetState(phase="TRAIN"), net.state, param.train_state)
+        stated = in_state(net, NetState(phase=TRAIN), net.state, param.train_state)
         described.append(SolverNet(TRAIN_NET, origin, stated, source))
     for i, test in enumerate(_test_nets(param, node, read, report)):
         if test:
             origin, net, source = test
             own = param.test_state[i : i + 1]
-            stated = in_state(net, NetState(phase="TEST"), net.state, *own)
+            stated = in_state(net, NetState(phase=TEST), net.state, *own)
             described.append(SolverNet(f"test net #{i}", origin, stated, source))
     return described
 
