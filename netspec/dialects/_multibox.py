@@ -139,6 +139,7 @@ class MultiBoxLoss(Layer):
 
     bottoms = (4, 4)
     is_loss = True
+    not_exported = "it is a training loss; which boxes count depends on their values"
     label_bottoms = frozenset({2, 3})
 
     def setup(self) -> None:

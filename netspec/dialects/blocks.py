@@ -5,15 +5,19 @@ Where two forks have different layers of one name (BN, Upsample), the fields tha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.layers import Layer, register
 from netspec.layers.activation import Activation
-from netspec.layers.base import Shape
+from netspec.layers.base import Affine, Shape, rounded
+from netspec.layers.normalization import onnx_centered, torch_batch_norm
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.convolution import Convolution
 from netspec.proto.schema import TRAIN, value
 
@@ -94,6 +98,22 @@ class Axpy(Layer):
         """Return the sums."""
         return torch.addcmul(y, a.reshape(*a.shape[:2], *(1,) * (x.dim() - 2)), x)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        a, x, y = bottoms
+        missing = list(range(len(self.bottom_shapes[0]), len(self.bottom_shapes[1])))
+        if missing:
+            a = graph.node("Unsqueeze", a, graph.constant(missing))
+        return graph.node("Add", graph.node("Mul", a, x), y)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        a, x, y = bottoms
+        missing = len(self.bottom_shapes[1]) - len(self.bottom_shapes[0])
+        if missing:
+            a = code.call(f"{{a}}[..., {', '.join(['None'] * missing)}]", a=a)
+        return code.call("{a} * {x} + {y}", a=a, x=x, y=y)
+
 
 @register("ReLU6", "relu6_param")
 class ReLU6(Activation):
@@ -117,6 +137,19 @@ class ReLU6(Activation):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * self.slope).where(bottom < 6, 0)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.slope == 0:
+            return graph.node("Clip", *bottoms, graph.constant(0.0), graph.constant(6.0))
+        leaky = graph.node("LeakyRelu", *bottoms, alpha=self.slope)
+        return graph.node("Min", leaky, graph.constant(6.0))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.slope == 0:
+            return code.call("F.relu6({x})", x=bottoms[0])
+        return code.call("F.leaky_relu({x}, {slope}).clamp(max=6)", x=bottoms[0], slope=self.slope)
 
 
 @register("DepthwiseConvolution", "convolution_param")
@@ -188,6 +221,16 @@ class ShuffleChannel(Layer):
         """Return the shuffled channels."""
         return data.unflatten(1, (self.group, -1)).transpose(1, 2).flatten(1, 2)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        channels = self.bottom_shapes[0][1]
+        dealt = graph.reshape(bottoms[0], [0, self.group, channels // self.group, -1])
+        return graph.reshape_to_top(graph.node("Transpose", dealt, perm=[0, 2, 1, 3]))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("F.channel_shuffle({x}, {groups})", x=bottoms[0], groups=self.group)
+
 
 @register("Interp", "interp_param")
 class Interp(Layer):
@@ -246,6 +289,39 @@ class Interp(Layer):
         cut = [param.pad_beg, param.pad_end] * 2
         inner = F.pad(data, cut) if any(cut) else data
         return F.interpolate(inner, self.top_shapes[0][2:], mode="bilinear", align_corners=True)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        param, (data, *like) = value(self.param, "interp_param"), bottoms
+        if param.pad_beg or param.pad_end:
+            start, end = graph.constant([-param.pad_beg] * 2), graph.constant([param.pad_end or 2**62] * 2)
+            data = graph.node("Slice", data, start, end, graph.constant([2, 3]))
+        if like:
+            size = graph.shape_of(like[0], 2, 4)
+        elif param.HasField("height"):
+            size = graph.constant([param.height, param.width])
+        else:
+            one, zoom = graph.constant([1, 1]), graph.constant([param.zoom_factor] * 2)
+            last = graph.node("Sub", graph.shape_of(data, 2, 4), one)
+            steps = graph.node("Mul", graph.node("Div", last, graph.constant([param.shrink_factor] * 2)), zoom)
+            size = graph.node("Add", steps, one)
+        sizes = graph.node("Concat", graph.shape_of(data, 0, 2), size, axis=0)
+        grid = {"mode": "linear", "coordinate_transformation_mode": "align_corners"}
+        return graph.node("Resize", data, "", "", sizes, **grid)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        param, (x, *like) = value(self.param, "interp_param"), bottoms
+        cut = (param.pad_beg, param.pad_end) * 2
+        if any(cut):
+            x = code.call("F.pad({x}, {cut})", x=x, cut=cut)
+        template = 'F.interpolate({x}, size={size}, mode="bilinear", align_corners=True)'
+        if like:
+            return code.call(template.replace("{size}", "{y}.shape[2:]"), x=x, y=like[0])
+        if None not in code.sizes(0)[2:] or param.HasField("height"):
+            return code.call(template, x=x, size=tuple(self.top_shapes[0][2:]))
+        size = "[(n - 1) // {shrink} * {zoom} + 1 for n in {x}.shape[2:]]"
+        return code.call(template.replace("{size}", size), x=x, shrink=param.shrink_factor, zoom=param.zoom_factor)
 
 
 class _Unpool(torch.autograd.Function):
@@ -325,6 +401,38 @@ class Upsample(Layer):
         top: torch.Tensor = _Unpool.apply(data.flatten(2), index.flatten(2), height * width)
         return top.reshape(self.top_shapes[0])
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if len(bottoms) == 1:
+            scales = graph.constant([1.0, 1.0, float(self.scale_h), float(self.scale_w)])
+            grid = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+            return graph.node("Resize", *bottoms, "", scales, **grid)
+        for axis in (2, 3):
+            graph.size(0, axis, "its mask counts the pixels of the enlarged map")
+        values = graph.reshape(bottoms[0], [0, 0, -1])
+        mask = graph.cast(graph.reshape(bottoms[1], [0, 0, -1]), "int64")
+        pixels = graph.constant([math.prod(self.top_shapes[0][2:])])
+        shape = graph.node("Concat", graph.shape_of(bottoms[0], 0, 2), pixels, axis=0)
+        empty = graph.node("Expand", graph.constant(0.0), shape)
+        return graph.reshape_to_top(graph.node("ScatterElements", empty, mask, values, axis=2))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        scale = (self.scale_h, self.scale_w)
+        if len(bottoms) == 1:
+            factor = self.scale_h if self.scale_h == self.scale_w else scale
+            return code.call("F.interpolate({x}, scale_factor={factor})", x=bottoms[0], factor=factor)
+        if None in code.sizes(0)[2:] and value(self.param, "upsample_param").HasField("upsample_h") is False:
+            cut = (value(self.param, "upsample_param").pad_out_h, value(self.param, "upsample_param").pad_out_w)
+            sides = [f"{{x}}.shape[{2 + k}] * {scale[k]}{' - 1' if cut[k] else ''}" for k in (0, 1)]
+            return code.call(
+                f"{code.function(unpool)}({{x}}, {{mask}}, ({', '.join(sides)}))", x=bottoms[0], mask=bottoms[1]
+            )
+        size = tuple(self.top_shapes[0][2:])
+        return code.call(
+            f"{code.function(unpool)}({{x}}, {{mask}}, {{size}})", x=bottoms[0], mask=bottoms[1], size=size
+        )
+
 
 @register("BN", "bn_param")
 class BN(Layer):
@@ -394,3 +502,57 @@ class BN(Layer):
         with torch.no_grad():
             for i, batch in ((2, mean), (3, variance)):
                 self.blob(i).mul_(momentum).add_(batch.reshape(self.blob_shapes[i]), alpha=1 - momentum)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
+        slope, bias = graph.blob(0, shape), graph.blob(1, shape)
+        if not self.by_batch and not self.moving:
+            return graph.node("Add", graph.node("Mul", *bottoms, slope), bias)
+        if not self.by_batch:
+            blobs = [graph.blob(i, (self.channels,)) for i in range(4)]
+            return graph.node("BatchNormalization", *bottoms, *blobs, epsilon=self.eps)
+        centered, variance = onnx_centered(graph, bottoms[0], len(self.bottom_shapes[0]))
+        length = graph.node("Sqrt", graph.node("Add", variance, graph.constant(self.eps)))
+        return graph.node("Add", graph.node("Mul", graph.node("Div", centered, length), slope), bias)
+
+    @override
+    def as_affine(self) -> Affine | None:
+        if self.by_batch:
+            return None
+        slope, bias = (self.blob_in_double(i).reshape(-1) for i in (0, 1))
+        if not self.moving:
+            return slope, bias
+        mean, variance = (self.blob_in_double(i).reshape(-1) for i in (2, 3))
+        scale = slope * (variance + self.eps).rsqrt()
+        return scale, bias - mean * scale
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        axes = len(self.bottom_shapes[0])
+        weight, bias = (self.blob(i).reshape(-1) for i in (0, 1))
+        shape = (self.channels, *(1,) * (axes - 2))
+        if self.by_batch:
+            template = "F.batch_norm({x}, None, None, training=True, eps={eps}) * {y} + {z}"
+            return code.call(
+                template,
+                x=bottoms[0],
+                eps=rounded(self.eps),
+                y=code.parameter(0, shape, "slope"),
+                z=code.parameter(1, shape, "bias"),
+            )
+        if not self.moving:
+            return code.call(
+                "{x} * {y} + {z}", x=bottoms[0], y=code.parameter(0, shape, "slope"), z=code.parameter(1, shape, "bias")
+            )
+        mean, variance = (self.blob(i).reshape(-1) for i in (2, 3))
+        state = {"weight": weight, "bias": bias, "running_mean": mean, "running_var": variance}
+        state["num_batches_tracked"] = torch.zeros((), dtype=torch.long)
+        norm = torch_batch_norm(code, axes, state, self.channels, rounded(self.eps))
+        return code.call("{norm}({x})", norm=norm, x=bottoms[0])
+
+
+def unpool(x, mask, size):
+    """Bring each value to the pixel of a larger map that the mask names; the others are 0."""
+    empty = x.new_zeros(*x.shape[:2], size[0] * size[1])
+    return empty.scatter(2, mask.flatten(2).long(), x.flatten(2)).unflatten(2, size)

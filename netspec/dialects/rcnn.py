@@ -10,11 +10,13 @@ from functools import reduce
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.layers import Layer, common, register
-from netspec.layers.base import Shape
-from netspec.layers.loss.base import Loss
-from netspec.proto.schema import value
+from netspec.layers.base import Shape, rounded
+from netspec.layers.loss.base import BATCH_SIZE, Loss, onnx_normalized_sum
+from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.proto.schema import TRAIN, value
 
 DECLARATIONS = """
 message ROIPoolingParameter {
@@ -54,6 +56,26 @@ class Dropout(common.Dropout):
         """Return the values that are kept, scaled in the one phase or the other."""
         top = super().forward(data)
         return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        top = super().to_onnx(graph, *bottoms)
+        if value(self.param.dropout_param, "scale_train"):
+            return top
+        return graph.node("Mul", *bottoms, graph.constant(1 - self.ratio))
+
+    @property
+    @override
+    def passes_on(self) -> bool:
+        return super().passes_on and bool(value(self.param.dropout_param, "scale_train"))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if value(self.param.dropout_param, "scale_train"):
+            return super().to_torch(code, *bottoms)
+        if self.phase == TRAIN:
+            raise self.refusal("PyTorch", "torch's dropout scales in training, this one in testing")
+        return code.call("{x} * {kept}", x=bottoms[0], kept=1 - self.ratio)
 
 
 class _RegionPooling(Layer):
@@ -138,6 +160,15 @@ class ROIPooling(_RegionPooling):
         ends = torch.stack([steps[:, :-1].floor(), steps[:, 1:].ceil()], dim=2) + first[:, None, None]
         return ends.clamp(0, size).long()
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        regions = graph.reshape(bottoms[1], [-1, 5])
+        return graph.node("MaxRoiPool", bottoms[0], regions, pooled_shape=self.bins, spatial_scale=self.scale)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        raise self.refusal("PyTorch", "PyTorch has no pooling of regions; torchvision's roi_pool is near to it")
+
 
 Table = tuple[torch.Tensor, torch.Tensor]  # values and the pixels that they come from
 
@@ -196,6 +227,8 @@ class PSROIPooling(_RegionPooling):
     top[0]     (R, output_dim, g, g)
     Fork: daijifeng001/caffe-rfcn, src/caffe/layers/psroi_pooling_layer.cpp
     """
+
+    not_exported = "there is no position-sensitive pooling of regions"
 
     def setup(self) -> None:
         """Check the sizes."""
@@ -283,3 +316,41 @@ class SmoothL1Loss(Loss):
             difference = difference * inside
         losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=self.knee)
         return (losses if outside is None else losses * outside).sum() / len(predictions)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        predictions, *others = bottoms
+        shape = graph.shape_of(predictions)
+        aligned = [
+            bottom if self.bottom_shapes[i] == self.bottom_shapes[0] else graph.node("Reshape", bottom, shape)
+            for i, bottom in enumerate(others, 1)
+        ]
+        difference = graph.node("Sub", predictions, aligned[0])
+        if len(aligned) > 1:
+            difference = graph.node("Mul", difference, aligned[1])
+        length = graph.node("Abs", difference)
+        knee = graph.constant(self.knee)
+        square = graph.node("Mul", graph.node("Mul", difference, difference), graph.constant(0.5 / self.knee))
+        linear = graph.node("Sub", length, graph.constant(0.5 * self.knee))
+        losses = graph.node("Where", graph.node("Less", length, knee), square, linear)
+        if len(aligned) > 2:
+            losses = graph.node("Mul", losses, aligned[2])
+        return onnx_normalized_sum(graph, losses, "", BATCH_SIZE)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if len(set(self.bottom_shapes)) > 1:
+            raise self.refusal("PyTorch", "it is exported for bottoms of one shape")
+        knee = rounded(self.knee)
+        if len(bottoms) == 2:
+            template = 'F.smooth_l1_loss({x}, {y}, beta={knee}, reduction="sum") / {x}.shape[0]'
+            return code.call(template, x=bottoms[0], y=bottoms[1], knee=knee)
+        template = f"{code.function(weighted_smooth_l1_loss)}({', '.join(bottoms)}, beta={{knee}})"
+        return code.call(template, knee=knee)
+
+
+def weighted_smooth_l1_loss(predictions, targets, inside, outside=1.0, beta=1.0):
+    """Return the smooth L1 loss of weighted differences, weighted and summed up, / N."""
+    x, y = inside * predictions, inside * targets
+    losses = F.smooth_l1_loss(x, y, beta=beta, reduction="none")
+    return (outside * losses).sum() / predictions.shape[0]

@@ -5,16 +5,19 @@ Caffe: the neuron layers, include/caffe/layers/neuron_layer.hpp
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 
 
 class Activation(Layer):
@@ -41,6 +44,21 @@ class Rounded(Activation):
         raise NotImplementedError
 
 
+def scaled_and_shifted(graph: OnnxGraph, value: str, scale: float, shift: float) -> str:
+    """Return scale value + shift as nodes, without those that change nothing."""
+    if scale != 1:
+        value = graph.node("Mul", value, graph.constant(float(scale)))
+    return graph.node("Add", value, graph.constant(float(shift))) if shift else value
+
+
+def torch_scaled_and_shifted(code: TorchCode, value: str, scale: float, shift: float) -> str:
+    """Return the expression of scale value + shift, without what changes nothing."""
+    template = ("{scale} * {x}" if scale != 1 else "{x}") + (
+        " + {shift}" if shift > 0 else " - {shift}" if shift else ""
+    )
+    return code.call(template, x=value, scale=float(scale), shift=abs(float(shift)))
+
+
 @register("ReLU", "relu_param")
 class ReLU(Activation):
     """max(x, 0) + negative_slope min(x, 0); the gradient at 0 is the negative side's.
@@ -62,6 +80,16 @@ class ReLU(Activation):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * self.slope)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("LeakyRelu", *bottoms, alpha=self.slope) if self.slope else graph.node("Relu", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.slope:
+            return code.call("F.leaky_relu({x}, {slope})", x=bottoms[0], slope=self.slope)
+        return code.call("F.relu({x})", x=bottoms[0])
 
 
 @register("PReLU", "prelu_param")
@@ -88,6 +116,18 @@ class PReLU(Activation):
         if self.is_exact(x):
             return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.context.accumulate_in_place).reshape(x.shape)
         return F.prelu(x, slopes.reshape(-1))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        slopes = math.prod(self.blob_shapes[0])
+        spatial = len(self.bottom_shapes[0]) - 2
+        return graph.node("PRelu", *bottoms, graph.blob(0, (slopes, *(1,) * (spatial if self.blob_shapes[0] else 0))))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        slopes = self.blob(0).reshape(-1)
+        slope = code.module("nn.PReLU({channels})", {"weight": slopes}, channels=len(slopes))
+        return code.call("{slope}({x})", slope=slope, x=bottoms[0])
 
 
 @register("ELU", "elu_param")
@@ -117,6 +157,16 @@ class ELU(Rounded):
         """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Elu", *bottoms, alpha=self.alpha)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.alpha == 1:
+            return code.call("F.elu({x})", x=bottoms[0])
+        return code.call("F.elu({x}, alpha={alpha})", x=bottoms[0], alpha=self.alpha)
+
 
 @register("Sigmoid", "sigmoid_param")
 class Sigmoid(Rounded):
@@ -140,6 +190,14 @@ class Sigmoid(Rounded):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         """See :meth:`Layer.caffes_gradient`."""
         return (diff * top * (1 - top.double())).to(diff.dtype)  # 1. is a double to C, and so are its results
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Sigmoid", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.sigmoid({x})", x=bottoms[0])
 
 
 @register("TanH", "tanh_param")
@@ -165,6 +223,14 @@ class TanH(Rounded):
         """See :meth:`Layer.caffes_gradient`."""
         return tanh_gradient(bottom, top, diff)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Tanh", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.tanh({x})", x=bottoms[0])
+
 
 @register("AbsVal")
 class AbsVal(Activation):
@@ -178,6 +244,14 @@ class AbsVal(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the absolute values."""
         return x.abs()
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Abs", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.abs({x})", x=bottoms[0])
 
 
 @register("Power", "power_param")
@@ -230,6 +304,20 @@ class Power(Rounded):
         at_zero = slope * bottom.pow(self.power - 1)
         return diff * torch.where(bottom == 0, at_zero, top / bottom * self.power)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.power * self.scale == 0:
+            return graph.node("Expand", graph.constant(self.shift**self.power), graph.shape_of(bottoms[0]))
+        value = scaled_and_shifted(graph, bottoms[0], self.scale, self.shift)
+        return value if self.power == 1 else graph.node("Pow", value, graph.constant(self.power))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.power * self.scale == 0:
+            return code.call("torch.full_like({x}, {value})", x=bottoms[0], value=self.shift**self.power)
+        value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
+        return value if self.power == 1 else code.call("torch.pow({x}, {power})", x=value, power=self.power)
+
 
 def _log(base: float) -> float:
     """Return the logarithm of a base, a float as Caffe's."""
@@ -273,6 +361,14 @@ class Exp(Rounded):
         """See :meth:`Layer.caffes_gradient`."""
         return diff * top * self.scale
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Exp", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.exp({x})", x=torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift))
+
 
 @register("Log", "log_param")
 class Log(Rounded):
@@ -310,6 +406,16 @@ class Log(Rounded):
         """See :meth:`Layer.caffes_gradient`."""
         return diff * (libm.power(bottom * self.scale + self.shift, -1) * self.slope)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        logarithm = graph.node("Log", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
+        return scaled_and_shifted(graph, logarithm, self.base_scale, 0)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
+        return torch_scaled_and_shifted(code, code.call("torch.log({x})", x=value), self.base_scale, 0)
+
 
 @register("BNLL")
 class BNLL(Rounded):
@@ -335,6 +441,14 @@ class BNLL(Rounded):
         growth = libm.exp(bottom.clamp(max=50))
         return (diff * growth / (growth.double() + 1)).to(diff.dtype)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Softplus", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("F.softplus({x})", x=bottoms[0])
+
 
 @register("Threshold", "threshold_param")
 class Threshold(Activation):
@@ -352,6 +466,14 @@ class Threshold(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return zeros and ones."""
         return (x > self.threshold).to(x.dtype)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.cast(graph.node("Greater", *bottoms, graph.constant(self.threshold)), "float32")
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.gt({x}, {threshold}).to({x}.dtype)", x=bottoms[0], threshold=self.threshold)
 
 
 @register("Clip", "clip_param")
@@ -382,6 +504,15 @@ class Clip(Activation):
         """See :meth:`Layer.caffes_gradient`."""
         return diff * ((bottom >= self.low) & (bottom <= self.high))
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Clip", *bottoms, graph.constant(self.low), graph.constant(max(self.low, self.high)))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        high = max(self.low, self.high)
+        return code.call("torch.clamp({x}, {low}, {high})", x=bottoms[0], low=self.low, high=high)
+
 
 @register("Swish", "swish_param")
 class Swish(Rounded):
@@ -410,3 +541,14 @@ class Swish(Rounded):
         """See :meth:`Layer.caffes_gradient`."""
         inner, gate = self.beta * top, libm.sigmoid(self.beta * bottom)
         return (diff * (inner + gate * (1 - inner.double()))).to(diff.dtype)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        gate = graph.node("Sigmoid", scaled_and_shifted(graph, bottoms[0], self.beta, 0))
+        return graph.node("Mul", *bottoms, gate)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.beta == 1:
+            return code.call("F.silu({x})", x=bottoms[0])
+        return code.call("{x} * torch.sigmoid({beta} * {x})", x=bottoms[0], beta=self.beta)

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 
 import torch
 from torch.nn import functional as F
+from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
 from netspec.exact.products import ChosenRows, VectorProducts
-from netspec.layers.base import Layer, Shape
+from netspec.layers.base import Absorbed, Layer, Shape, copy_of
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TRAIN
 
 
@@ -63,6 +65,42 @@ class InnerProduct(Layer):
         """Return values out times values in."""
         return math.prod(self.top_shapes[0]) * self.inputs
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        vectors = bottoms[0]
+        if (self.axis, len(self.bottom_shapes[0])) != (1, 2):
+            vectors = graph.node("Flatten", vectors, axis=self.axis)
+        bias = [graph.blob(1)] if len(self.blobs) > 1 else []
+        transposed = int(not self.param.inner_product_param.transpose)
+        top = graph.node("Gemm", vectors, graph.blob(0), *bias, transB=transposed)
+        return top if self.axis == 1 else graph.reshape_to_top(top)
+
+    @property
+    @override
+    def absorbs(self) -> bool:
+        return self.axis == 1
+
+    @override
+    def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+        param = copy_of(self.param)
+        param.inner_product_param.bias_term = True
+        outputs = param.inner_product_param.num_output
+        bias = self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros(outputs, dtype=torch.double)
+        factors = scale.expand(outputs)
+        factors = factors if param.inner_product_param.transpose else factors[:, None]
+        return Absorbed(param, (self.blob_in_double(0) * factors, scale * bias + shift))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        weight = self.blob(0).t() if self.param.inner_product_param.transpose else self.blob(0)
+        state = {"weight": weight, **({"bias": self.blob(1)} if len(self.blobs) > 1 else {})}
+        bias = "" if len(self.blobs) > 1 else ", bias=False"
+        template = f"nn.Linear({{in_channels}}, {{out_channels}}{bias})"
+        linear = code.module(template, state, in_channels=self.inputs, out_channels=weight.shape[0])
+        flat = len(self.bottom_shapes[0]) == self.axis + 1
+        vectors = bottoms[0] if flat else code.call(f"{{x}}.flatten({self.axis or ''})", x=bottoms[0])
+        return code.call("{linear}({x})", linear=linear, x=vectors)
+
 
 @register("Dropout", "dropout_param")
 class Dropout(Layer):
@@ -90,6 +128,23 @@ class Dropout(Layer):
             return data
         kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
         return data * kept.mul_(1 / (1 - self.ratio))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.phase == TRAIN:
+            raise self.refusal("ONNX", "it draws random numbers in the training phase")
+        return graph.node("Identity", *bottoms)
+
+    @property
+    @override
+    def passes_on(self) -> bool:
+        return self.phase != TRAIN
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.phase != TRAIN:
+            return bottoms[0]
+        return code.call("F.dropout({x}, {ratio}, self.training)", x=bottoms[0], ratio=self.ratio)
 
 
 @register("Embed", "embed_param")
@@ -132,3 +187,16 @@ class Embed(Layer):
             return tops.reshape(self.top_shapes[0])
         top = F.embedding(index, weight)
         return top if bias is None else top + bias
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        top = graph.node("Gather", graph.blob(0), graph.cast(bottoms[0], "int64"), axis=0)
+        return graph.node("Add", top, graph.blob(1)) if len(self.blobs) > 1 else top
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        rows, width = self.blob_shapes[0]
+        template = "nn.Embedding({rows}, {out_channels})"
+        table = code.module(template, {"weight": self.blob(0)}, rows=rows, out_channels=width)
+        top = code.call("{table}({x}.long())", table=table, x=bottoms[0])
+        return code.call("{x} + {bias}", x=top, bias=code.parameter(1)) if len(self.blobs) > 1 else top

@@ -42,6 +42,7 @@ class ReadingLayer(Layer):
 
     bottoms = (0, 0)
     tops = (2, 2)
+    reads_data = True
     group: ClassVar[str]  # the field with the layer's own settings
 
     def open(self) -> Source | None:
@@ -382,6 +383,7 @@ class HDF5Output(Layer):
 
     bottoms = (2, 2)
     tops = (0, 0)
+    not_exported = "it writes a file"
 
     def setup(self) -> None:
         """Create the file, so that one that cannot be written stops the run before it begins."""

@@ -7,12 +7,14 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec import log
 from netspec.errors import SpecError
 from netspec.layers import fillers
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import FillerParameter
 
 T = TypeVar("T")
@@ -55,6 +57,14 @@ class Input(Layer):
         """Return zeros, which is what Caffe's blobs hold until the caller fills them."""
         return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        return [graph.input(i) for i in range(self.num_tops)]
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        return [code.input(i) for i in range(self.num_tops)]
+
 
 @register("DummyData", "dummy_data_param")
 class DummyData(Layer):
@@ -66,6 +76,7 @@ class DummyData(Layer):
 
     bottoms = (0, 0)
     tops = (1, None)
+    not_exported = "its values are random"
     OLD_AXES = ("num", "channels", "height", "width")
 
     def setup(self) -> None:
@@ -116,6 +127,21 @@ class DummyData(Layer):
             raise self.error(message, "dummy_data_param", field)
         return values * self.num_tops if len(values) == 1 else values
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        return [graph.node("Identity", graph.constant(values)) for values in self._fixed("ONNX")]
+
+    def _fixed(self, target: str) -> list[torch.Tensor]:
+        """Return the tops, which must be constant."""
+        fixed = [blob for blob in self._constants if blob is not None]
+        if len(fixed) < self.num_tops:
+            raise self.refusal(target)
+        return fixed
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        return [code.buffer(values) for values in self._fixed("PyTorch")]
+
 
 @register("MemoryData", "memory_data_param", "transform_param")
 class MemoryData(Layer):
@@ -128,6 +154,7 @@ class MemoryData(Layer):
 
     bottoms = (0, 0)
     tops = (2, 2)
+    reads_data = True
 
     def setup(self) -> None:
         """Read the shape."""

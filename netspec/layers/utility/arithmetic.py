@@ -7,12 +7,14 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
 from netspec.exact.sums import Product, RowMagnitudes, RowSquares, RowSums
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 
 
 @register("Eltwise", "eltwise_param")
@@ -74,6 +76,33 @@ class Eltwise(Layer):
             top = top + x if self.operation == self.SUM else top * x
         return top
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.operation == self.SUM:
+            scaled = zip(bottoms, self.coeff, strict=True)
+            bottoms = tuple(x if c == 1 else graph.node("Mul", x, graph.constant(c)) for x, c in scaled)
+        op = {self.SUM: "Add", self.PROD: "Mul", self.MAX: "Max"}[self.operation]
+        top, *others = bottoms
+        for bottom in others:
+            top = graph.node(op, top, bottom)
+        return top
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.operation == self.MAX:
+            top, *others = bottoms
+            for bottom in others:
+                top = code.call("torch.maximum({x}, {y})", x=top, y=bottom)
+            return top
+        if self.operation == self.PROD:
+            return " * ".join(bottoms)
+        top = ""
+        for bottom, coeff in zip(bottoms, self.coeff, strict=True):
+            sign = " - " if coeff < 0 else " + "
+            term = bottom if abs(coeff) == 1 else code.call("{coeff} * {x}", coeff=abs(coeff), x=bottom)
+            top = f"{top}{sign}{term}" if top else term if coeff > 0 else f"-{term}"
+        return top
+
 
 @register("Reduction", "reduction_param")
 class Reduction(Layer):
@@ -111,6 +140,28 @@ class Reduction(Layer):
         else:
             sums = RowSquares.apply(rows) if operation == self.SUMSQ else RowSums.apply(rows, 1.0)
         return sums.reshape(self.top_shapes[0])
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        p, (data,) = self.param.reduction_param, bottoms
+        if p.operation == self.ASUM:
+            data = graph.node("Abs", data)
+        elif p.operation == self.SUMSQ:
+            data = graph.node("Mul", data, data)
+        axes = graph.constant(list(range(self.axis, len(self.bottom_shapes[0]))))
+        op = "ReduceMean" if p.operation == self.MEAN else "ReduceSum"
+        top = graph.node(op, data, axes, keepdims=0)
+        return top if p.coeff == 1 else graph.node("Mul", top, graph.constant(p.coeff))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        p = self.param.reduction_param
+        form = {self.ASUM: "{x}.abs()", self.SUMSQ: "{x}.square()"}.get(p.operation, "{x}")
+        axes = list(range(self.axis, len(self.bottom_shapes[0])))
+        over = f"dim={axes[0] if len(axes) == 1 else tuple(axes)}" if self.axis else ""
+        operation = "mean" if p.operation == self.MEAN else "sum"
+        times = "" if p.coeff == 1 else "{coeff} * "
+        return code.call(f"{times}{form}.{operation}({over})", x=bottoms[0], coeff=p.coeff)
 
 
 @register("ArgMax", "argmax_param")
@@ -152,6 +203,39 @@ class ArgMax(Layer):
         top = torch.stack([indices, values], 1) if p.out_max_val else indices
         return top.reshape(self.top_shapes[0])
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
+        p, (data,) = self.param.argmax_param, bottoms
+        axis = 1 if self.axis is None else self.axis
+        if self.axis is None:
+            data = graph.node("Flatten", data, axis=1)
+        # Of equal values TopK takes the smaller index first; in the reversed axis that is the larger one.
+        backwards = (graph.constant([-1]), graph.constant([-(2**62)]), graph.constant([axis]), graph.constant([-1]))
+        reverse = graph.node("Slice", data, *backwards)
+        values, order = graph.nodes("TopK", reverse, graph.constant([p.top_k]), outputs=2, axis=axis)
+        last = graph.node("Sub", graph.shape_of(data, axis, axis + 1), graph.constant([1]))
+        indices = graph.cast(graph.node("Sub", last, order), "float32")
+        if self.axis is not None:
+            return values if p.out_max_val else indices
+        columns = [indices, values] if p.out_max_val else [indices]
+        one = graph.constant([1])
+        top = graph.node("Concat", *(graph.node("Unsqueeze", column, one) for column in columns), axis=1)
+        ones = len(self.top_shapes[0]) - 3
+        return graph.node("Unsqueeze", top, graph.constant(list(range(3, 3 + ones)))) if ones > 0 else top
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        p, (x,) = self.param.argmax_param, bottoms
+        axis = 1 if self.axis is None else self.axis
+        if self.axis is None and len(self.bottom_shapes[0]) > 2:
+            x = code.call("{x}.flatten(1)", x=x)
+        found = code.call(f"{code.function(arg_max)}({{x}}, dim={axis}, top_k={{top_k}})", x=x, top_k=p.top_k)
+        if self.axis is not None:
+            return f"{found}[{1 if p.out_max_val else 0}]"
+        top = f"torch.stack({found}, 1)" if p.out_max_val else f"{found}[0][:, None]"
+        ones = max(0, len(self.top_shapes[0]) - 3)
+        return f"{top}[{', '.join(['...'] + ['None'] * ones)}]" if ones else top
+
 
 @register("Softmax", "softmax_param")
 class Softmax(Layer):
@@ -185,6 +269,14 @@ class Softmax(Layer):
             return softmax_gradient(self._by_class(top), self._by_class(diff)).reshape(top.shape)
         return (diff - (diff * top).sum(self.axis, keepdim=True)) * top
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Softmax", *bottoms, axis=self.axis)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("F.softmax({x}, dim={axis})", x=bottoms[0], axis=self.axis)
+
 
 @register("Silence")
 class Silence(Layer):
@@ -204,6 +296,14 @@ class Silence(Layer):
 
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return nothing."""
+        return ()
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        return ()
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return ()
 
 
@@ -231,3 +331,18 @@ class Parameter(Layer):
         """Return the blob."""
         blob = self.blob(0)
         return blob.view_as(blob)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Identity", graph.blob(0))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        return (code.parameter(0),)
+
+
+def arg_max(x, dim, top_k):
+    """Return the indices, as numbers of x's type, and the values of the largest; of equal ones the last comes first."""
+    values, order = torch.sort(x.flip(dim), dim=dim, descending=True, stable=True)
+    indices = (x.shape[dim] - 1 - order).to(x.dtype)
+    return indices.narrow(dim, 0, top_k), values.narrow(dim, 0, top_k)

@@ -46,6 +46,7 @@ class Python(Layer):
     Caffe: include/caffe/layers/python_layer.hpp
     """
 
+    not_exported = "it runs Python code of its own"
     bottoms = (0, None)
     tops = (0, None)
 

@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from netspec.exact.sums import Copies, Tiles
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 
 
 def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
@@ -45,6 +47,14 @@ class Flatten(Layer):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the bottom in its new shape."""
         return x.reshape(self.top_shapes[0])
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.reshape_to_top(bottoms[0])
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.reshape_to_top(bottoms[0])
 
 
 @register("Reshape", "reshape_param")
@@ -95,6 +105,14 @@ class Reshape(Layer):
         """Return the bottom in its new shape."""
         return x.reshape(self.top_shapes[0])
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.reshape_to_top(bottoms[0])
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.reshape_to_top(bottoms[0])
+
 
 @register("Concat", "concat_param")
 class Concat(Layer):
@@ -121,6 +139,16 @@ class Concat(Layer):
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         """Return the joined bottoms."""
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Concat", *bottoms, axis=self.axis)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if len(bottoms) == 1:
+            return bottoms[0]
+        return code.call(f"torch.cat([{', '.join(bottoms)}], dim={{axis}})", axis=self.axis)
 
 
 @register("Slice", "slice_param")
@@ -159,6 +187,32 @@ class Slice(Layer):
         """Return the parts."""
         return x.split(self.sizes, self.axis)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        if self.num_tops == 1:
+            return [graph.node("Identity", *bottoms)]
+        points = list(self.param.slice_param.slice_point)
+        if graph.sizes(0)[self.axis] is not None:
+            return graph.nodes("Split", *bottoms, graph.constant(self.sizes), outputs=self.num_tops, axis=self.axis)
+        if not points:
+            return graph.nodes("Split", *bottoms, outputs=self.num_tops, axis=self.axis, num_outputs=self.num_tops)
+        axis = graph.constant([self.axis])
+        return [
+            graph.node("Slice", *bottoms, graph.constant([start]), graph.constant([end]), axis)
+            for start, end in zip([0, *points], [*points, 2**62], strict=True)
+        ]
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+        if self.num_tops == 1:
+            return bottoms
+        if len(set(self.sizes)) == 1 and not self.param.slice_param.slice_point:
+            return code.call("{x}.chunk({count}, dim={axis})", x=bottoms[0], count=self.num_tops, axis=self.axis)
+        if code.sizes(0)[self.axis] is not None:
+            return code.call("{x}.split({sizes}, dim={axis})", x=bottoms[0], sizes=list(self.sizes), axis=self.axis)
+        points = list(self.param.slice_param.slice_point)
+        return code.call("{x}.tensor_split({points}, dim={axis})", x=bottoms[0], points=points, axis=self.axis)
+
 
 @register("Split")
 class Split(Layer):
@@ -180,6 +234,19 @@ class Split(Layer):
         if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        return bottoms * self.num_tops
+
+    @property
+    @override
+    def passes_on(self) -> bool:
+        return True
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        return bottoms * self.num_tops
 
 
 @register("Tile", "tile_param")
@@ -206,6 +273,14 @@ class Tile(Layer):
             values = x.reshape(math.prod(x.shape[: self.axis]), -1)
             return Tiles.apply(values, self.repeats[self.axis]).reshape(self.top_shapes[0])
         return x.repeat(self.repeats)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Tile", *bottoms, graph.constant(self.repeats))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("{x}.repeat({repeats})", x=bottoms[0], repeats=tuple(self.repeats))
 
 
 @register("BatchReindex")
@@ -236,6 +311,14 @@ class BatchReindex(Layer):
             raise self.error(f"found index {int(wrong[0])}, expected 0 to {x.shape[0] - 1}", "bottom", 1)
         return x.index_select(0, chosen)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Gather", bottoms[0], graph.cast(bottoms[1], "int64"), axis=0)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("{x}[{index}.long()]", x=bottoms[0], index=bottoms[1])
+
 
 @register("Filter")
 class Filter(Layer):
@@ -249,6 +332,7 @@ class Filter(Layer):
 
     bottoms = (2, None)
     tops = (1, None)
+    counted_axis = 0
 
     def setup(self) -> None:
         """Refuse another number of tops than of filtered bottoms."""
@@ -273,3 +357,15 @@ class Filter(Layer):
         *data, selector = bottoms
         kept = selector.reshape(-1).nonzero().squeeze(1)
         return tuple(x.index_select(0, kept) for x in data)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        *data, selector = bottoms
+        dropped = graph.node("Equal", graph.reshape(selector, [-1]), graph.constant(0.0))
+        kept = graph.node("Squeeze", graph.node("NonZero", graph.node("Not", dropped)), graph.constant([0]))
+        return [graph.node("Gather", x, kept, axis=0) for x in data]
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        *data, selector = bottoms
+        return [code.call("{x}[{selector}.flatten() != 0]", x=x, selector=selector) for x in data]
