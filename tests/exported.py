@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import netspec
+from golden_cases import set_parameters
 from netspec.export.shapes import NetShapes
 from netspec.net.net import Net
 
@@ -25,10 +26,7 @@ def golden_net(case: Path) -> tuple[Net, dict[str, np.ndarray]]:
     """Return the net of a golden case, with its weights, and its inputs."""
     golden = np.load(case / "golden.npz")
     net = netspec.load_net(case / "net.prototxt", phase=json.loads(str(golden["meta"]))["phase"])
-    for key in golden.files:
-        if key.startswith("param_init/"):
-            _, layer, index = key.split("/")
-            net.params[layer][int(index)].data.copy_(torch.from_numpy(golden[key]))
+    set_parameters(net, golden, "param_init/")
     return net, {name: golden[f"in/{name}"] for name in net.inputs}
 
 
