@@ -86,16 +86,16 @@ class Axpy(Layer):
 
     bottoms = (3, 3)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of x."""
         a, x, y = bottom_shapes
         if len(a) < 2 or a[:2] != x[:2] or any(size != 1 for size in a[2:]) or x != y:
             message = f"found shapes {a}, {x} and {y}, expected (N, C, 1, 1) and twice (N, C, ...)"
             raise self.error(message, "bottom")
         return [x]
 
+    @override
     def forward(self, a: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        """Return the sums."""
         return torch.addcmul(y, a.reshape(*a.shape[:2], *(1,) * (x.dim() - 2)), x)
 
     @override
@@ -126,16 +126,16 @@ class ReLU6(Activation):
 
     gradient_reads = frozenset({"bottom"})
 
+    @override
     def setup(self) -> None:
-        """Read the slope of the negative side."""
         self.slope: float = value(self.param, "relu6_param").negative_slope
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the rectified bottom."""
         return torch.where(x >= 6, 6, F.leaky_relu(x, self.slope) if self.slope else F.relu(x))
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * self.slope).where(bottom < 6, 0)
 
     @override
@@ -163,6 +163,7 @@ class DepthwiseConvolution(Convolution):
     Fork: yonghenglh6/DepthwiseConvolution
     """
 
+    @override
     def setup(self) -> None:
         """Set up as Convolution; refuse filters over more than one channel."""
         super().setup()
@@ -186,8 +187,8 @@ class ConvolutionDepthwise(Convolution):
     tops = (1, 1)
     ignores = frozenset({"convolution_param.group"})
 
+    @override
     def setup(self) -> None:
-        """Read the geometry, add the filters and the bias."""
         self.read_geometry()
         if self.spatial_axes != 2:
             raise self.error(f"found a bottom of shape {self.bottom_shapes[0]}, expected (N, C, H, W)", "bottom")
@@ -209,16 +210,16 @@ class ShuffleChannel(Layer):
     Fork: farmingyard/ShuffleNet, shuffle_channel_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         shape, self.group = bottom_shapes[0], value(self.param, "shuffle_channel_param").group
         if len(shape) < 2 or self.group < 1 or shape[1] % self.group:
             message = f"found a bottom of shape {shape}, expected channels that are a multiple of group, {self.group}"
             raise self.error(message, "shuffle_channel_param", "group")
         return [shape]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the shuffled channels."""
         return data.unflatten(1, (self.group, -1)).transpose(1, 2).flatten(1, 2)
 
     @override
@@ -248,8 +249,8 @@ class Interp(Layer):
     bottoms = (1, 2)
     label_bottoms = frozenset({1})
 
+    @override
     def setup(self) -> None:
-        """Check that the new size is given in one way."""
         param: Any = value(self.param, "interp_param")
         factors = [name for name in ("shrink_factor", "zoom_factor") if param.HasField(name)]
         explicit = [name for name in ("height", "width") if param.HasField(name)]
@@ -266,8 +267,8 @@ class Interp(Layer):
                 message = f"{name} must be 0, or negative to cut off pixels, found {getattr(param, name)}"
                 raise self.error(message, "interp_param", name)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of the resized maps."""
         param, shape = value(self.param, "interp_param"), bottom_shapes[0]
         if any(len(each) != 4 for each in bottom_shapes):
             raise self.error(f"found bottoms of shapes {bottom_shapes}, expected 4 axes (N, C, H, W)", "bottom")
@@ -283,8 +284,8 @@ class Interp(Layer):
             size = tuple(length + (length - 1) * (param.zoom_factor - 1) for length in shrunk)
         return [(*shape[:2], *size)]
 
+    @override
     def forward(self, data: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-        """Return the resized maps."""
         param = value(self.param, "interp_param")
         cut = [param.pad_beg, param.pad_end] * 2
         inner = F.pad(data, cut) if any(cut) else data
@@ -358,8 +359,8 @@ class Upsample(Layer):
     bottoms = (1, 2)
     label_bottoms = frozenset({1})
 
+    @override
     def setup(self) -> None:
-        """Check that the new size is given in one way."""
         param = value(self.param, "upsample_param")
         given = {field.name for field, _ in param.ListFields()}
         masked = len(self.bottom_shapes) == 2
@@ -376,8 +377,8 @@ class Upsample(Layer):
             if getattr(param, name) and along != 2:
                 raise self.error(f"{name} needs a scale of 2, found {along}", "upsample_param", name)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of the enlarged maps."""
         param, shape = value(self.param, "upsample_param"), bottom_shapes[0]
         if len(shape) != 4 or any(other != shape for other in bottom_shapes):
             message = f"found bottoms of shapes {bottom_shapes}, expected (N, C, H, W), and the mask's the same"
@@ -389,6 +390,7 @@ class Upsample(Layer):
             raise self.error(f"the top would have no pixel, {size[0]} x {size[1]}", "upsample_param")
         return [(*shape[:2], *size)]
 
+    @override
     def forward(self, data: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Return the enlarged maps; raise SpecError for a mask of another size."""
         if mask is None:
@@ -452,8 +454,8 @@ class BN(Layer):
     Fork: hszhao/PSPNet and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add slopes, biases and moving averages."""
         param, shape = value(self.param, "bn_param"), self.bottom_shapes[0]
         if not 2 <= len(shape) <= 4:
             raise self.error(f"found a bottom of shape {shape}, expected (N, C, H, W), 2 to 4 axes", "bottom")
@@ -476,6 +478,7 @@ class BN(Layer):
             self.add_blob(size, value=float(param.frozen))
             self.not_learned = frozenset(range(4) if param.frozen else (2, 3))
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape; its channels must stay as many."""
         shape = bottom_shapes[0]
@@ -483,6 +486,7 @@ class BN(Layer):
             raise self.error(f"bottom of shape {shape} has not the {self.channels} channels seen first", "bottom")
         return [shape]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalised values; in training also move the averages."""
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (0, 1))

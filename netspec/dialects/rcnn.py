@@ -52,8 +52,8 @@ class Dropout(common.Dropout):
     Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/dropout_layer.cpp
     """
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the values that are kept, scaled in the one phase or the other."""
         top = super().forward(data)
         return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)
 
@@ -120,8 +120,8 @@ class ROIPooling(_RegionPooling):
     Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/roi_pooling_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Check the number of bins."""
         param = value(self.param, "roi_pooling_param")
         for name in ("pooled_h", "pooled_w"):
             if getattr(param, name) < 1:
@@ -129,12 +129,12 @@ class ROIPooling(_RegionPooling):
         self.bins = (param.pooled_h, param.pooled_w)
         self.scale: float = param.spatial_scale
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of all regions' bins."""
         return [(self.check_regions(bottom_shapes), bottom_shapes[0][1], *self.bins)]
 
+    @override
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
-        """Return the maxima."""
         images, channels, height, width = maps.shape
         with torch.no_grad():
             regions = regions.reshape(-1, 5)
@@ -230,14 +230,15 @@ class PSROIPooling(_RegionPooling):
 
     not_exported = "there is no position-sensitive pooling of regions"
 
+    @override
     def setup(self) -> None:
-        """Check the sizes."""
         param = value(self.param, "psroi_pooling_param")
         for name in ("output_dim", "group_size"):
             if getattr(param, name) < 1:
                 raise self.error(f"{name} must be given and be at least 1", "psroi_pooling_param", name)
         self.channels, self.bins, self.scale = param.output_dim, param.group_size, param.spatial_scale
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of all regions' bins; the map must have a channel for each."""
         regions = self.check_regions(bottom_shapes)
@@ -247,8 +248,8 @@ class PSROIPooling(_RegionPooling):
             raise self.error(message, "bottom", 0)
         return [(regions, self.channels, self.bins, self.bins)]
 
+    @override
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
-        """Return the means."""
         with torch.no_grad():
             regions = regions.reshape(-1, 5)
             image = self.images_of(regions, maps.shape[0])
@@ -292,13 +293,14 @@ class SmoothL1Loss(Loss):
     bottoms = (2, 4)
     label_bottoms = frozenset({2, 3})
 
+    @override
     def setup(self) -> None:
-        """Read sigma."""
         sigma = value(self.param, "smooth_l1_loss_param").sigma
         if sigma <= 0:
             raise self.error(f"sigma must be above 0, found {sigma:g}", "smooth_l1_loss_param", "sigma")
         self.knee = 1 / (sigma * sigma)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the scalar top's shape; the bottoms must be of one shape, but for ones at its end."""
         full = [(*shape, 1, 1, 1)[: max(4, len(shape))] for shape in bottom_shapes]
@@ -308,8 +310,8 @@ class SmoothL1Loss(Loss):
                 raise self.error(message, "bottom", i)
         return super().reshape(bottom_shapes)
 
+    @override
     def forward(self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         inside, outside = (*(weight.detach().reshape_as(predictions) for weight in weights), None, None)[:2]
         difference = predictions - targets.reshape_as(predictions)
         if inside is not None:

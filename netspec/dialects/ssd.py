@@ -146,8 +146,8 @@ class Permute(Layer):
     Fork: src/caffe/layers/permute_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the order."""
         given = list(value(self.param, "permute_param").order)
         axes = len(self.bottom_shapes[0])
         for i, axis in enumerate(given):
@@ -156,15 +156,15 @@ class Permute(Layer):
                 raise self.error(message, "permute_param", "order", i)
         self.order = given + [axis for axis in range(axes) if axis not in given]
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the permuted shape."""
         if len(bottom_shapes[0]) != len(self.order):
             message = f"found a bottom of shape {bottom_shapes[0]}, expected {len(self.order)} axes as before"
             raise self.error(message, "bottom")
         return [tuple(bottom_shapes[0][axis] for axis in self.order)]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the permuted bottom."""
         return data.permute(self.order).contiguous()
 
     @override
@@ -188,14 +188,15 @@ class Normalize(Layer):
     Fork: src/caffe/layers/normalize_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the scales."""
         param, shape = value(self.param, "norm_param"), self.bottom_shapes[0]
         if len(shape) < 2:
             raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
         filler = param.scale_filler if param.HasField("scale_filler") else None
         self.add_blob(() if param.channel_shared else shape[1:2], filler, value=1.0)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape; there must be a scale for each channel."""
         shape = bottom_shapes[0]
@@ -203,8 +204,8 @@ class Normalize(Layer):
             raise self.error(f"bottom of shape {shape} does not have the {self.blob_shapes[0][0]} channels", "bottom")
         return [shape]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the normalised values, scaled."""
         param = value(self.param, "norm_param")
         axes = tuple(range(1, data.dim())) if param.across_spatial else (1,)
         length = (data.square().sum(axes, keepdim=True) + param.eps).sqrt()
@@ -246,8 +247,8 @@ class PriorBox(Layer):
     bottoms = (1, 2)
     label_bottoms = frozenset({0, 1})
 
+    @override
     def setup(self) -> None:
-        """Read sizes, ratios, variances, image and step."""
         param = value(self.param, "prior_box_param")
         if not param.min_size or min(param.min_size) < 1:
             raise self.error("min_size must be given and be at least 1", "prior_box_param", "min_size")
@@ -294,6 +295,7 @@ class PriorBox(Layer):
             raise self.error(message, "prior_box_param", given[0])
         return getattr(param, given[0]), getattr(param, given[-1])
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of the boxes; lay them."""
         if any(len(shape) != 4 for shape in bottom_shapes):
@@ -313,8 +315,8 @@ class PriorBox(Layer):
         self.boxes = np.stack([boxes.reshape(-1), np.tile(self.variances, boxes.size // 4)])[None]
         return [self.boxes.shape]
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
-        """Return the boxes and their variances."""
         return torch.from_numpy(self.boxes).to(bottoms[0])
 
     @override
@@ -391,8 +393,8 @@ class DetectionOutput(Layer):
         for name in ("save_output_param", "visualize", "visualize_threshold", "save_file")
     )
 
+    @override
     def setup(self) -> None:
-        """Check the number of classes and what suppression needs."""
         param = value(self.param, "detection_output_param")
         if param.num_classes < 1:
             raise self.error("num_classes must be given", "detection_output_param", "num_classes")
@@ -403,14 +405,15 @@ class DetectionOutput(Layer):
             raise self.error("eta must be above 0, at most 1", "detection_output_param", "nms_param", "eta")
         self.kinds = 1 if param.share_location else param.num_classes
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of one detection; the predictions must suit the priors."""
         param = value(self.param, "detection_output_param")
         self.priors = check_predictions(self, bottom_shapes, self.kinds, param.num_classes)
         return [(1, 1, 1, 7)]
 
+    @override
     def forward(self, loc: torch.Tensor, conf: torch.Tensor, prior: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-        """Return the detections."""
         param = value(self.param, "detection_output_param")
         priors, variances = as_array(prior).reshape(2, self.priors, 4)
         codes = as_array(loc).reshape(-1, self.priors, self.kinds, 4)

@@ -23,16 +23,16 @@ from netspec.layers.targets import OnnxGraph, TorchCode
 class Activation(Layer):
     """Base of the layers whose top has its bottom's shape."""
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         return bottom_shapes
 
 
 class Rounded(Activation):
     """Base of the activations that torch's functions round otherwise than the C library's, which Caffe calls."""
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom."""
         return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
@@ -68,17 +68,17 @@ class ReLU(Activation):
     Caffe: src/caffe/layers/relu_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the slope of the negative side."""
         self.slope: float = self.param.relu_param.negative_slope
         self.gradient_reads = frozenset({"sign" if self.slope >= 0 else "bottom"})  # the top's sign is the bottom's
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the rectified bottom."""
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * self.slope)
 
     @override
@@ -102,16 +102,16 @@ class PReLU(Activation):
     Caffe: src/caffe/layers/prelu_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the slopes."""
         p = self.param.prelu_param
         shape = self.bottom_shapes[0]
         if len(shape) < 2:
             raise self.error(f"bottom has shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
         self.add_blob(() if p.channel_shared else shape[1:2], p.filler if p.HasField("filler") else None, 0.25)
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the rectified bottom."""
         slopes = self.blob(0)
         if self.is_exact(x):
             return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.context.accumulate_in_place).reshape(x.shape)
@@ -139,22 +139,22 @@ class ELU(Rounded):
     Caffe: src/caffe/layers/elu_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the scale of the negative side."""
         self.alpha: float = self.param.elu_param.alpha
         self.gradient_reads = frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         # exp(x) - 1 as Caffe computes it, not the more exact expm1.
         return torch.where(x > 0, x, self.alpha * (torch.exp(x.clamp(max=0)) - 1))
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return torch.where(x > 0, x, self.alpha * (libm.exp(x.clamp(max=0)) - 1))
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
 
     @override
@@ -179,16 +179,16 @@ class Sigmoid(Rounded):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return torch.sigmoid(x)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return libm.sigmoid(x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return (diff * top * (1 - top.double())).to(diff.dtype)  # 1. is a double to C, and so are its results
 
     @override
@@ -211,16 +211,16 @@ class TanH(Rounded):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return torch.tanh(x)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return libm.tanh(x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return tanh_gradient(bottom, top, diff)
 
     @override
@@ -241,8 +241,8 @@ class AbsVal(Activation):
     Caffe: src/caffe/layers/absval_layer.cpp
     """
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the absolute values."""
         return x.abs()
 
     @override
@@ -267,22 +267,22 @@ class Power(Rounded):
 
     gradient_reads = frozenset({"bottom", "top"})
 
+    @override
     def setup(self) -> None:
-        """Read power, scale and shift."""
         p = self.param.power_param
         self.power: float = p.power
         self.scale: float = p.scale
         self.shift: float = p.shift
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         if self.power * self.scale == 0:
             return torch.full_like(x, self.shift).pow(self.power)
         inner = self._inner(x)
         return inner if self.power == 1 else inner.pow(self.power)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         inner = torch.full_like(x, self.shift) if self.power * self.scale == 0 else self._inner(x)
         return inner.clone() if self.power == 1 else libm.power(inner, self.power)
 
@@ -291,8 +291,8 @@ class Power(Rounded):
             x = x * self.scale
         return x + self.shift if self.shift != 0 else x
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         slope = self.power * self.scale
         if slope == 0 or self.power == 1:
             return diff * slope
@@ -335,6 +335,7 @@ class Exp(Rounded):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def setup(self) -> None:
         """Read scale, shift and the base, which must be positive or -1."""
         p = self.param.exp_param
@@ -344,12 +345,12 @@ class Exp(Rounded):
         self.scale = log_base * p.scale
         self.shift = log_base * p.shift
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return torch.exp(x * self.scale + self.shift)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         p = self.param.exp_param
         if p.shift == 0:
             return libm.exp(x * self.scale)
@@ -357,8 +358,8 @@ class Exp(Rounded):
         # Caffe makes 0 * infinity of what a large shift would bring back to a number.
         return libm.exp(x * self.scale) * factor if factor.isfinite() else self.as_torch(x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return diff * top * self.scale
 
     @override
@@ -381,6 +382,7 @@ class Log(Rounded):
 
     gradient_reads = frozenset({"bottom"})
 
+    @override
     def setup(self) -> None:
         """Read scale, shift and the base, which must be -1, or positive and not 1."""
         p = self.param.log_param
@@ -394,16 +396,16 @@ class Log(Rounded):
         self.scale: float = p.scale
         self.shift: float = p.shift
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return torch.log(x * self.scale + self.shift) * self.base_scale
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return libm.log(x * self.scale + self.shift) * self.base_scale
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return diff * (libm.power(bottom * self.scale + self.shift, -1) * self.slope)
 
     @override
@@ -428,16 +430,16 @@ class BNLL(Rounded):
 
     gradient_reads = frozenset({"bottom"})
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return F.softplus(x, threshold=50)  # above it the result is x, in double precision too
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return (x.clamp(min=0) + libm.log(1 + libm.exp(-x.abs()).double())).to(x.dtype)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         growth = libm.exp(bottom.clamp(max=50))
         return (diff * growth / (growth.double() + 1)).to(diff.dtype)
 
@@ -459,12 +461,12 @@ class Threshold(Activation):
     Caffe: src/caffe/layers/threshold_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the threshold."""
         self.threshold: float = self.param.threshold_param.threshold
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return zeros and ones."""
         return (x > self.threshold).to(x.dtype)
 
     @override
@@ -487,8 +489,8 @@ class Clip(Activation):
 
     gradient_reads = frozenset({"bottom"})
 
+    @override
     def setup(self) -> None:
-        """Read min and max, both required."""
         p = self.param.clip_param
         for name in ("min", "max"):
             if not p.HasField(name):
@@ -496,12 +498,12 @@ class Clip(Activation):
         self.low: float = p.min
         self.high: float = p.max
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the clipped bottom."""
         return x.clamp(max=self.high).clamp(min=self.low)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return diff * ((bottom >= self.low) & (bottom <= self.high))
 
     @override
@@ -525,20 +527,20 @@ class Swish(Rounded):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def setup(self) -> None:
-        """Read the sigmoid's scale."""
         self.beta: float = self.param.swish_param.beta
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return x * torch.sigmoid(self.beta * x)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return x * libm.sigmoid(self.beta * x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         inner, gate = self.beta * top, libm.sigmoid(self.beta * bottom)
         return (diff * (inner + gate * (1 - inner.double()))).to(diff.dtype)
 

@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
@@ -157,8 +158,8 @@ class Layer(torch.nn.Module):
         """Return the shapes of the tops for bottoms of these shapes; may keep geometry on ``self``."""
         raise NotImplementedError
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
-        """Return the tops."""
         raise NotImplementedError
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:

@@ -28,8 +28,8 @@ class InnerProduct(Layer):
     Caffe: src/caffe/layers/inner_product_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the weights and the bias."""
         param = self.param.inner_product_param
         if param.num_output < 1:
             raise self.error("num_output must be at least 1", "inner_product_param", "num_output")
@@ -42,6 +42,7 @@ class InnerProduct(Layer):
     def _axis(self, shape: Shape) -> int:
         return self.canonical_axis(self.param.inner_product_param.axis, shape, "inner_product_param", "axis")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the axes before ``axis`` and num_output; refuse vectors of another length than the weights'."""
         shape = bottom_shapes[0]
@@ -52,8 +53,8 @@ class InnerProduct(Layer):
             raise self.error(message, "bottom")
         return [(*shape[: self.axis], self.param.inner_product_param.num_output)]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the products."""
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed = self.param.inner_product_param.transpose
         if self.is_exact(data, small=weight.numel() <= SMALL_PRODUCT):
@@ -61,8 +62,8 @@ class InnerProduct(Layer):
             return VectorProducts.apply(vectors, weight, bias, transposed, in_place).reshape(self.top_shapes[0])
         return F.linear(data.flatten(self.axis), weight.t() if transposed else weight, bias)
 
+    @override
     def multiply_adds(self) -> int:
-        """Return values out times values in."""
         return math.prod(self.top_shapes[0]) * self.inputs
 
     @override
@@ -111,17 +112,18 @@ class Dropout(Layer):
     Caffe: src/caffe/layers/dropout_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the ratio."""
         self.ratio: float = self.param.dropout_param.dropout_ratio
         if not 0 <= self.ratio < 1:
             message = f"dropout_ratio must be at least 0 and less than 1, found {self.ratio:g}"
             raise self.error(message, "dropout_param", "dropout_ratio")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         return bottom_shapes
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the values that are kept, scaled; in the test phase the bottom itself."""
         if self.phase != TRAIN:
@@ -160,8 +162,8 @@ class Embed(Layer):
 
     label_bottoms = frozenset({0})
 
+    @override
     def setup(self) -> None:
-        """Add the rows and the bias."""
         param = self.param.embed_param
         for name in ("num_output", "input_dim"):
             if getattr(param, name) < 1:
@@ -170,10 +172,11 @@ class Embed(Layer):
         if param.bias_term:
             self.add_blob((param.num_output,), param.bias_filler)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape and num_output."""
         return [(*bottom_shapes[0], self.param.embed_param.num_output)]
 
+    @override
     def forward(self, indices: torch.Tensor) -> torch.Tensor:
         """Return the rows; raise SpecError for an index that is none."""
         rows, index = self.param.embed_param.input_dim, indices.long()

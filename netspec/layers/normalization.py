@@ -40,6 +40,7 @@ class BatchNorm(Layer):
 
     default_param_lr = 0.0
 
+    @override
     def setup(self) -> None:
         """Add the sums, all zero; refuse a ``param`` that would have them learned."""
         param = self.param.batch_norm_param
@@ -56,6 +57,7 @@ class BatchNorm(Layer):
         for shape in ((self.channels,), (self.channels,), (1,)):
             self.add_blob(shape)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape; its channels must stay as many."""
         shape = bottom_shapes[0]
@@ -63,6 +65,7 @@ class BatchNorm(Layer):
             raise self.error(f"bottom of shape {shape} has not the {self.channels} channels seen first", "bottom")
         return [shape]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalised values; in training also add the batch's statistics to the sums."""
         return self._by_past(data) if self.use_global_stats else self._by_batch(data)
@@ -268,8 +271,8 @@ class Scale(_Affine):
     Caffe: src/caffe/layers/scale_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the factors, 1 unless a filler is given, and the bias."""
         param = self.param.scale_param
         shape = self.bottom_shapes[1] if len(self.bottom_shapes) > 1 else self.learned_shape(param, "scale_param")
         if len(self.bottom_shapes) == 1:
@@ -277,13 +280,13 @@ class Scale(_Affine):
         if param.bias_term:
             self.add_blob(shape, param.bias_filler)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the first bottom's shape."""
         self.axis = self.locate(bottom_shapes, self.param.scale_param, "scale_param")
         return [bottom_shapes[0]]
 
+    @override
     def forward(self, data: torch.Tensor, factors: torch.Tensor | None = None) -> torch.Tensor:
-        """Return the products, and the bias added."""
         scale = self.blob(0) if factors is None else factors
         bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
         by_channel = self.axis == 1 and scale.dim() == 1
@@ -350,19 +353,19 @@ class Bias(_Affine):
     Caffe: src/caffe/layers/bias_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the bias, 0 unless a filler says otherwise."""
         param = self.param.bias_param
         if len(self.bottom_shapes) == 1:
             self.add_blob(self.learned_shape(param, "bias_param"), param.filler)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the first bottom's shape."""
         self.axis = self.locate(bottom_shapes, self.param.bias_param, "bias_param")
         return [bottom_shapes[0]]
 
+    @override
     def forward(self, data: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-        """Return the sums."""
         operand = self.blob(0) if bias is None else bias
         if self.is_exact(data):
             return self.apply_exactly(data, None, operand, self.axis)
@@ -396,22 +399,22 @@ class LRN(Layer):
     Caffe: src/caffe/layers/lrn_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Refuse an even local_size."""
         if self.param.lrn_param.local_size % 2 == 0:
             message = f"local_size must be odd, found {self.param.lrn_param.local_size}"
             raise self.error(message, "lrn_param", "local_size")
         if self.param.lrn_param.norm_region != ACROSS_CHANNELS:
             self.ignores = frozenset({"lrn_param.k"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         if len(bottom_shapes[0]) != 4:
             raise self.error(f"LRN needs a bottom of 4 axes (N, C, H, W), found shape {bottom_shapes[0]}", "bottom")
         return bottom_shapes
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the normalised values."""
         param = self.param.lrn_param
         size, reach = param.local_size, param.local_size // 2
         if self.is_exact(data):
@@ -466,15 +469,15 @@ class MVN(Layer):
     Caffe: src/caffe/layers/mvn_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape, filled up to four axes."""
         shape = bottom_shapes[0]
         if len(shape) > 4:
             raise self.error(f"MVN takes up to 4 axes (N, C, H, W), found shape {shape}", "bottom")
         return [(*shape, *(1,) * (4 - len(shape)))]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the normalised maps."""
         param, shape = self.param.mvn_param, self.top_shapes[0]
         outer = 1 if param.across_channels else 2
         maps = data.reshape(math.prod(shape[:outer]), math.prod(shape[outer:]))

@@ -84,6 +84,7 @@ class Recurrent(Layer):
     blob_names: ClassVar[tuple[str, ...]]
     gates: ClassVar[int] = 1  # how many numbers a hidden unit takes in
 
+    @override
     def setup(self) -> None:
         """Add the blobs that take x, x_static and h in; subclasses append theirs."""
         p = self.param.recurrent_param
@@ -111,8 +112,8 @@ class Recurrent(Layer):
         self.add_blob((rows, self.hidden), p.weight_filler)
         self.state: tuple[torch.Tensor, ...] = ()
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         x, cont = bottom_shapes[:2]
         steps, streams = x[:2]
         if tuple(cont) != (steps, streams):
@@ -128,6 +129,7 @@ class Recurrent(Layer):
                 raise self.error(message, "bottom", i)
         return [(steps, streams, self.hidden), *[state] * (self.num_tops - 1)]
 
+    @override
     def forward(self, x: torch.Tensor, cont: torch.Tensor, *others: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the output of every time step and, where exposed, the last state."""
         steps, streams = x.shape[:2]
@@ -149,6 +151,7 @@ class Recurrent(Layer):
         self.state = last
         return (torch.stack(outputs),)
 
+    @override
     def multiply_adds(self) -> int:
         """Return the weights of every matrix, times the time steps (x_static's: once) and the streams."""
         steps, streams = self.bottom_shapes[0][:2]
@@ -254,13 +257,14 @@ class RNN(Recurrent):
     tops = (1, 2)
     state_names = ("h",)
 
+    @override
     def setup(self) -> None:
-        """Add the blobs."""
         super().setup()
         p = self.param.recurrent_param
         self.add_blob((self.hidden, self.hidden), p.weight_filler)
         self.add_blob((self.hidden,), p.bias_filler)
 
+    @override
     def step(
         self, inputs: tuple[torch.Tensor, ...], keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
@@ -325,6 +329,7 @@ class LSTM(Recurrent):
     state_names = ("h", "c")
     gates = 4
 
+    @override
     def step(
         self, inputs: tuple[torch.Tensor, ...], keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
@@ -360,8 +365,8 @@ class LSTMUnit(Layer):
     tops = (2, 2)
     label_bottoms = frozenset({2})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         cell, gates, cont = bottom_shapes
         if len(cell) != 3 or cell[0] != 1:
             raise self.error(f"found a cell of shape {cell}, expected (1, streams, units)", "bottom", 0)
@@ -372,8 +377,8 @@ class LSTMUnit(Layer):
             raise self.error(f"found cont of shape {cont}, expected {(1, streams)}", "bottom", 2)
         return [cell, cell]
 
+    @override
     def forward(self, cell: torch.Tensor, gates: torch.Tensor, cont: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the next cell and hidden state."""
         return _lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2), self.is_exact(gates))
 
     @override

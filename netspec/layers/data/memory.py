@@ -32,8 +32,8 @@ class Input(Layer):
     tops = (1, None)
     is_input = True
 
+    @override
     def setup(self) -> None:
-        """Read the shapes."""
         shapes: list[Shape] = [tuple(shape.dim) for shape in self.param.input_param.shape]
         given = self.context.given_shapes
         if not shapes and all(top in given for top in self.param.top):
@@ -43,18 +43,18 @@ class Input(Layer):
         shapes = shapes * self.num_tops if len(shapes) == 1 else shapes
         self.shapes = [given.get(top, shape) for top, shape in zip(self.param.top, shapes, strict=True)]
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shapes."""
         return self.shapes
 
+    @override
     def missing_input(self) -> SpecError:
-        """A solver calls its nets without inputs."""
         blobs = " and ".join(f'"{top}"' for top in self.param.top)
         advice = "a layer that reads data (Data, ImageData, HDF5Data, ...) must make them"
         return self.error(f"nothing fills {blobs} while a solver runs; {advice}")
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return zeros, which is what Caffe's blobs hold until the caller fills them."""
         return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
 
     @override
@@ -79,8 +79,8 @@ class DummyData(Layer):
     not_exported = "its values are random"
     OLD_AXES = ("num", "channels", "height", "width")
 
+    @override
     def setup(self) -> None:
-        """Read the shapes and fillers, and fill the blobs that stay as they are."""
         self.shapes = [self.possible(shape) for shape in self._read_shapes()]
         given = list(self.param.dummy_data_param.data_filler)
         self._fillers = self._one_a_top(given or [FillerParameter()], "data_filler")
@@ -98,12 +98,12 @@ class DummyData(Layer):
             except ValueError as fault:
                 yield self.error(str(fault), "dummy_data_param", "data_filler", i)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shapes."""
         return self.shapes
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the constant blobs, and the others filled anew."""
         generator = self.context.random.on("cpu")
         return tuple(self._fill(i, generator) if kept is None else kept for i, kept in enumerate(self._constants))
 
@@ -156,8 +156,8 @@ class MemoryData(Layer):
     tops = (2, 2)
     reads_data = True
 
+    @override
     def setup(self) -> None:
-        """Read the shape."""
         p = self.param.memory_data_param
         self.shape: Shape = (p.batch_size, p.channels, p.height, p.width)
         if min(self.shape) <= 0:
@@ -166,8 +166,8 @@ class MemoryData(Layer):
         self._arrays: tuple[torch.Tensor, torch.Tensor] | None = None
         self._next = 0
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shapes."""
         return self.shape, self.shape[:1]
 
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
@@ -183,17 +183,17 @@ class MemoryData(Layer):
         self._arrays = torch.from_numpy(data), torch.from_numpy(labels)
         self._next = 0
 
+    @override
     def missing_input(self) -> SpecError | None:
-        """Images and labels come from the program."""
         message = "has no data yet; call set_input_arrays(data, labels) on it first"
         return self.error(message) if self._arrays is None else None
 
+    @override
     def restart(self) -> None:
-        """Return to the first image."""
         self._next = 0
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the next batch."""
         if fault := self.missing_input():
             raise fault
         assert self._arrays is not None

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from netspec.exact.sums import SumInOrder
 from netspec.layers.base import Layer, Shape
@@ -25,8 +26,8 @@ class Loss(Layer):
     is_loss = True
     label_bottoms = frozenset({1})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         data, label = bottom_shapes[:2]
         if data[:1] != label[:1]:
             raise self.error(f"found bottoms of shapes {data} and {label}, expected the same number of items", "bottom")
@@ -37,13 +38,13 @@ class Floor(torch.autograd.Function):
     """max(x, floor) whose gradient also passes below the floor, as in Caffe's losses."""
 
     @staticmethod
+    @override
     def forward(ctx: Any, x: torch.Tensor, floor: float) -> torch.Tensor:
-        """Return the floored values."""
         return x.clamp(min=floor)
 
     @staticmethod
+    @override
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Return the gradient as it came."""
         return grads[0], None
 
 

@@ -67,6 +67,7 @@ class _NegativeLogOfSoftmax(torch.autograd.Function):
     """-log p of the labels' classes, p being the softmax; the logarithm is of no less than FLT_MIN."""
 
     @staticmethod
+    @override
     def forward(ctx: Any, scores: torch.Tensor, label: torch.Tensor, exact: bool) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the losses (outer, inner) and p, for scores (outer, classes, inner) and labels (outer, inner)."""
         p = softmax(scores) if exact else F.softmax(scores, 1)
@@ -76,6 +77,7 @@ class _NegativeLogOfSoftmax(torch.autograd.Function):
         return -(libm.log(chosen) if exact else chosen.log()), p
 
     @staticmethod
+    @override
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
         """Return (p - 1 at the label's class) times the losses' gradient."""
         p, label = ctx.saved_tensors
@@ -98,15 +100,17 @@ class SoftmaxWithLoss(SoftmaxLoss):
     Caffe: src/caffe/layers/softmax_loss_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
         """Read the ignored label and the normalisation (default VALID)."""
         self.ignore_label = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, VALID)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         return self.reshape_tops(bottom_shapes, self.param.softmax_param.axis, "softmax_param", "axis")
 
+    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
@@ -159,6 +163,7 @@ class InfogainLoss(SoftmaxLoss):
     not_exported = "PyTorch has no loss with a matrix of weights"
     label_bottoms = frozenset({1, 2})
 
+    @override
     def setup(self) -> None:
         """Read the ignored label, the normalisation (default VALID) and, without a third bottom, the matrix."""
         loss_param, source = self.param.loss_param, self.param.infogain_loss_param.source
@@ -185,8 +190,8 @@ class InfogainLoss(SoftmaxLoss):
             raise self.error(message, "infogain_loss_param", "source") from None
         return torch.tensor(values, device=self.context.device)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         axis = self.param.infogain_loss_param.axis
         shapes = self.reshape_tops(bottom_shapes, axis, "infogain_loss_param", "axis")
         if len(bottom_shapes) == 3:
@@ -200,6 +205,7 @@ class InfogainLoss(SoftmaxLoss):
             message = f"found an infogain matrix of shape {shape}, expected {self.classes} x {self.classes} numbers"
             raise self.error(message, *path)
 
+    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor, *given: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
@@ -247,15 +253,15 @@ class MultinomialLogisticLoss(Loss, Classified):
     Caffe: src/caffe/layers/multinomial_logistic_loss_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         data, labels = bottom_shapes
         self.reshape_scores([(data[0], math.prod(data[1:])), labels], 1)
         return shapes
 
+    @override
     def forward(self, probabilities: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         p, label = self.scores_and_labels(probabilities, labels)
         self.valid(label, None)
         chosen = Floor.apply(p.gather(1, label.unsqueeze(1)), LOG_THRESHOLD)
@@ -288,15 +294,15 @@ class HingeLoss(Loss, Classified):
 
     L2 = 2  # caffe.proto: enum HingeLossParameter.Norm
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         data, labels = bottom_shapes
         self.reshape_scores([(data[0], math.prod(data[1:])), labels], 1)
         return shapes
 
+    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         x, label = self.scores_and_labels(scores, labels)
         self.valid(label, None)
         sign = torch.ones_like(x).scatter(1, label.unsqueeze(1), -1)
@@ -335,21 +341,21 @@ class SigmoidCrossEntropyLoss(Loss):
     Caffe: src/caffe/layers/sigmoid_cross_entropy_loss_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the ignored label and the normalisation."""
         self.ignore_label = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, BATCH_SIZE)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         data, target = bottom_shapes
         if math.prod(data) != math.prod(target):
             raise self.error(f"found bottoms of shapes {data} and {target}, expected the same count", "bottom")
         return shapes
 
+    @override
     def forward(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         targets = targets.detach().reshape(x.shape)
         valid = None if self.ignore_label is None else targets.long() != self.ignore_label
         exact = self.is_exact(x)
@@ -401,16 +407,16 @@ class EuclideanLoss(Loss):
 
     label_bottoms = frozenset()
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         a, b = bottom_shapes
         if math.prod(a[1:]) != math.prod(b[1:]):
             raise self.error(f"found bottoms of shapes {a} and {b}, expected as many numbers an item", "bottom")
         return shapes
 
+    @override
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         difference = a - b.reshape(a.shape)
         exact = self.is_exact(difference)
         squares = RowSquares.apply(difference.reshape(1, -1))[0] if exact else difference.square().sum()
@@ -475,8 +481,8 @@ class ContrastiveLoss(Loss):
     bottoms = (3, 3)
     label_bottoms = frozenset({2})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         a, b, label = bottom_shapes
         for i, shape in enumerate((a, b)):
@@ -488,8 +494,8 @@ class ContrastiveLoss(Loss):
             raise self.error(f"found labels of shape {label}, expected one a pair: ({a[0]},)", "bottom", 2)
         return shapes
 
+    @override
     def forward(self, a: torch.Tensor, b: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         p = self.param.contrastive_loss_param
         similar = label.reshape(-1).long() != 0
         exact = self.is_exact(a, small=True)
@@ -533,13 +539,13 @@ class Accuracy(Classified):
     bottoms = (2, 2)
     tops = (1, 2)
 
+    @override
     def setup(self) -> None:
-        """Read top_k and the ignored label."""
         self.top_k: int = self.param.accuracy_param.top_k
         self.ignore_label = ignore_label(self.param.accuracy_param)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         self.reshape_scores(bottom_shapes, self.param.accuracy_param.axis, "accuracy_param", "axis")
         if self.top_k > self.classes:
             raise self.error(
@@ -548,6 +554,7 @@ class Accuracy(Classified):
         return [(), (self.classes,)][: self.num_tops]
 
     @torch.no_grad()
+    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the accuracy and, where there is a second top, that of each class."""
         x, label = self.scores_and_labels(scores, labels)

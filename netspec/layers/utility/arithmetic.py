@@ -33,8 +33,8 @@ class Eltwise(Layer):
     PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
     bottoms = (2, None)
 
+    @override
     def setup(self) -> None:
-        """Read the operation and its coefficients."""
         p = self.param.eltwise_param
         self.operation: int = p.operation
         self.coeff: list[float] = list(p.coeff) or [1.0] * len(self.bottom_shapes)
@@ -46,16 +46,16 @@ class Eltwise(Layer):
         if self.operation == self.MAX:
             self.ignores = frozenset({"eltwise_param.coeff"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottoms' shape."""
         for i, shape in enumerate(bottom_shapes):
             if shape != bottom_shapes[0]:
                 message = f"found bottoms of shapes {bottom_shapes[0]} and {shape}, expected equal ones"
                 raise self.error(message, "bottom", i)
         return bottom_shapes[:1]
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
-        """Return the sum, product or maximum."""
         exact = self.is_exact(bottoms[0])
         if exact and self.operation == self.PROD:
             return Product.apply(self.param.eltwise_param.stable_prod_grad, *bottoms)
@@ -115,16 +115,16 @@ class Reduction(Layer):
 
     SUM, ASUM, SUMSQ, MEAN = 1, 2, 3, 4  # caffe.proto: enum ReductionParameter.ReductionOp
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.reduction_param, bottom_shapes[0]
         self.axis = self.canonical_axis(p.axis, shape, "reduction_param", "axis")
         count = math.prod(shape[self.axis :])
         self.coeff: float = p.coeff / count if p.operation == self.MEAN else p.coeff
         return [shape[: self.axis]]
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the reduced bottom."""
         operation = self.param.reduction_param.operation
         if self.is_exact(x):
             return self._reduce_exactly(x.reshape(math.prod(self.top_shapes[0]), -1), operation) * self.coeff
@@ -176,8 +176,8 @@ class ArgMax(Layer):
     Caffe: src/caffe/layers/argmax_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.argmax_param, bottom_shapes[0]
         self.axis = self.canonical_axis(p.axis, shape, "argmax_param", "axis") if p.HasField("axis") else None
         size = math.prod(shape[1:]) if self.axis is None else shape[self.axis]
@@ -188,8 +188,8 @@ class ArgMax(Layer):
         return [(shape[0], 1 + p.out_max_val, p.top_k, *(1 for _ in shape[3:]))]
 
     @torch.no_grad()
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return indices, values, or both."""
         p = self.param.argmax_param
         axis = 1 if self.axis is None else self.axis
         if self.axis is None:
@@ -248,13 +248,13 @@ class Softmax(Layer):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         self.axis = self.canonical_axis(self.param.softmax_param.axis, bottom_shapes[0], "softmax_param", "axis")
         return bottom_shapes
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the probabilities."""
         if self.is_exact(x):
             return Pointwise.apply(x, lambda x: softmax(self._by_class(x)).reshape(x.shape), self.caffes_gradient)
         return F.softmax(x, self.axis)
@@ -263,8 +263,8 @@ class Softmax(Layer):
         """Return x as (outer, classes, inner)."""
         return x.reshape(math.prod(x.shape[: self.axis]), x.shape[self.axis], -1)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         if self.is_exact(top):
             return softmax_gradient(self._by_class(top), self._by_class(diff)).reshape(top.shape)
         return (diff - (diff * top).sum(self.axis, keepdim=True)) * top
@@ -290,12 +290,12 @@ class Silence(Layer):
     bottoms = (1, None)
     tops = (0, 0)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return no shape."""
         return []
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return nothing."""
         return ()
 
     @override
@@ -319,16 +319,16 @@ class Parameter(Layer):
 
     bottoms = (0, 0)
 
+    @override
     def setup(self) -> None:
-        """Add the blob."""
         self.add_blob(tuple(self.param.parameter_param.shape.dim))
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the blob's shape."""
         return self.blob_shapes
 
+    @override
     def forward(self) -> torch.Tensor:
-        """Return the blob."""
         blob = self.blob(0)
         return blob.view_as(blob)
 

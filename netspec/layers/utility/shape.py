@@ -34,8 +34,8 @@ class Flatten(Layer):
     Caffe: src/caffe/layers/flatten_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.flatten_param, bottom_shapes[0]
         first = self.canonical_axis(p.axis, shape, "flatten_param", "axis")
         last = self.canonical_axis(p.end_axis, shape, "flatten_param", "end_axis")
@@ -44,8 +44,8 @@ class Flatten(Layer):
             raise self.error(message, "flatten_param")
         return [(*shape[:first], math.prod(shape[first : last + 1]), *shape[last + 1 :])]
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the bottom in its new shape."""
         return x.reshape(self.top_shapes[0])
 
     @override
@@ -66,15 +66,15 @@ class Reshape(Layer):
     Caffe: src/caffe/layers/reshape_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the new axes."""
         self.new_axes = list(self.param.reshape_param.shape.dim)
         if self.new_axes.count(-1) > 1 or min(self.new_axes, default=0) < -1:
             message = f"found shape {self.new_axes}, expected at most one -1 (inferred) and nothing below it"
             raise self.error(message, "reshape_param", "shape")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.reshape_param, bottom_shapes[0]
         start = p.axis if p.axis >= 0 else len(shape) + p.axis + 1
         if not 0 <= start <= len(shape):
@@ -101,8 +101,8 @@ class Reshape(Layer):
             raise self.error(message, "reshape_param", "shape")
         return [tuple(top)]
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the bottom in its new shape."""
         return x.reshape(self.top_shapes[0])
 
     @override
@@ -125,8 +125,8 @@ class Concat(Layer):
 
     bottoms = (1, None)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         first = bottom_shapes[0]
         self.axis = axis = _axis(self, first, "concat_param", "concat_dim")
         for i, shape in enumerate(bottom_shapes):
@@ -136,8 +136,8 @@ class Concat(Layer):
                 raise self.error(message, "bottom", i)
         return [(*first[:axis], sum(shape[axis] for shape in bottom_shapes), *first[axis + 1 :])]
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
-        """Return the joined bottoms."""
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
 
     @override
@@ -162,8 +162,8 @@ class Slice(Layer):
 
     tops = (1, None)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         shape = bottom_shapes[0]
         self.axis = axis = _axis(self, shape, "slice_param", "slice_dim")
         points, size = list(self.param.slice_param.slice_point), shape[axis]
@@ -183,8 +183,8 @@ class Slice(Layer):
             self.sizes = [size // self.num_tops] * self.num_tops
         return [(*shape[:axis], part, *shape[axis + 1 :]) for part in self.sizes]
 
+    @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the parts."""
         return x.split(self.sizes, self.axis)
 
     @override
@@ -225,10 +225,12 @@ class Split(Layer):
 
     tops = (1, None)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape for each top."""
         return [bottom_shapes[0]] * self.num_tops
 
+    @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return one tensor a top, so that each has a gradient of its own."""
         if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
@@ -258,8 +260,8 @@ class Tile(Layer):
     Caffe: src/caffe/layers/tile_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.tile_param, bottom_shapes[0]
         self.axis = axis = self.canonical_axis(p.axis, shape, "tile_param", "axis")
         if p.tiles <= 0:
@@ -267,8 +269,8 @@ class Tile(Layer):
         self.repeats = [p.tiles if i == axis else 1 for i in range(len(shape))]
         return [(*shape[:axis], shape[axis] * p.tiles, *shape[axis + 1 :])]
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the repeated bottom."""
         if self.is_exact(x):
             values = x.reshape(math.prod(x.shape[: self.axis]), -1)
             return Tiles.apply(values, self.repeats[self.axis]).reshape(self.top_shapes[0])
@@ -296,15 +298,15 @@ class BatchReindex(Layer):
     bottoms = (2, 2)
     label_bottoms = frozenset({1})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         data, indices = bottom_shapes
         if len(indices) != 1:
             raise self.error(f"found indices of shape {indices}, expected one axis", "bottom", 1)
         return [(*indices, *data[1:])]
 
+    @override
     def forward(self, x: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
-        """Return the chosen items."""
         chosen = indices.long()
         wrong = chosen[(chosen < 0) | (chosen >= x.shape[0])]
         if wrong.numel():
@@ -334,15 +336,15 @@ class Filter(Layer):
     tops = (1, None)
     counted_axis = 0
 
+    @override
     def setup(self) -> None:
-        """Refuse another number of tops than of filtered bottoms."""
         filtered = len(self.bottom_shapes) - 1
         if self.num_tops != filtered:
             message = f"found {self.num_tops} top blob(s), expected {filtered}: one a bottom but for the selector"
             raise self.error(message, "top")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes as if every item were kept."""
         *data, selector = bottom_shapes
         if math.prod(selector[1:]) != 1:
             raise self.error(f"found a selector of shape {selector}, expected one number an item", "bottom", len(data))
@@ -352,8 +354,8 @@ class Filter(Layer):
                 raise self.error(message, "bottom", i)
         return data
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the kept items."""
         *data, selector = bottoms
         kept = selector.reshape(-1).nonzero().squeeze(1)
         return tuple(x.index_select(0, kept) for x in data)

@@ -155,8 +155,8 @@ class Convolution(_SlidingFilter):
     tops = (1, None)
     same_tops = True
 
+    @override
     def setup(self) -> None:
-        """Read the geometry, add the filters and the bias."""
         self.read_geometry()
         if self.spatial_axes > 3:
             raise self.error(
@@ -184,6 +184,7 @@ class Convolution(_SlidingFilter):
         """Return the spatial shape of a top for a bottom of ``shape``."""
         return self.slide(shape)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return one shape for all tops; the bottoms must suit the filters."""
         self.check_axes(bottom_shapes, self.channels)
@@ -191,6 +192,7 @@ class Convolution(_SlidingFilter):
         top = (*shape[: self.channel_axis], self.num_output, *self.output_shape(shape))
         return [top] * len(bottom_shapes)
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the responses to each bottom."""
         weight = self.blob(0)
@@ -220,8 +222,8 @@ class Convolution(_SlidingFilter):
             return ColumnProducts.apply(maps, weight, bias, sliding, self.group, in_place)
         return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
 
+    @override
     def multiply_adds(self) -> int:
-        """Return output pixels times the filters' weights."""
         pixels = math.prod(self.top_shapes[0]) // self.num_output
         return len(self.top_shapes) * pixels * math.prod(self.blob_shapes[0])
 
@@ -301,17 +303,19 @@ class Deconvolution(Convolution):
     Caffe: src/caffe/layers/base_conv_layer.cpp, deconv_layer.cpp
     """
 
+    @override
     def filter_shape(self) -> Shape:
         """Return the shape of blobs[0]: a convolution's with its ends exchanged."""
         return (self.channels, self.num_output // self.group, *self.kernel)
 
+    @override
     def output_shape(self, shape: Shape) -> Shape:
-        """Return the spatial shape of a top for a bottom of ``shape``."""
         axes = zip(shape[self.channel_axis + 1 :], self.stride, self.extent, self.pad, strict=True)
         spatial = tuple(s * (size - 1) + e - 2 * p for size, s, e, p in axes)
         self.check_output(spatial, shape)
         return spatial
 
+    @override
     def apply_filters(
         self, axes: int, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, *geometry: Shape
     ) -> torch.Tensor:
@@ -323,13 +327,14 @@ class Deconvolution(Convolution):
             return SpreadProducts.apply(maps, weight, bias, sliding, self.group, in_place, size)
         return _DECONVOLVE[axes](maps, weight, bias, stride, pad, 0, self.group, dilation)
 
+    @override
     def multiply_adds(self) -> int:
-        """Return input pixels times the filters' weights."""
         pixels = math.prod(self.bottom_shapes[0]) // self.channels
         return len(self.bottom_shapes) * pixels * math.prod(self.blob_shapes[0])
 
     onnx_op = "ConvTranspose"
 
+    @override
     def overhang(self, shape: Shape) -> list[int]:
         """Return zeros: any filter fits."""
         return [0] * (2 * self.spatial_axes)
@@ -357,21 +362,22 @@ class Im2col(_SlidingFilter):
         f"convolution_param.{name}" for name in ("num_output", "bias_term", "group", "weight_filler", "bias_filler")
     )
 
+    @override
     def setup(self) -> None:
-        """Read the geometry."""
         self.read_geometry()
         if self.spatial_axes < 1:
             raise self.error("the bottom has no spatial axis after its channels", "bottom")
         self.channels = self.bottom_shapes[0][self.channel_axis]
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape with a channel for each pixel of the filter, and the filter's positions."""
         self.check_axes(bottom_shapes, self.channels)
         shape = bottom_shapes[0]
         return [(*shape[: self.channel_axis], self.channels * math.prod(self.kernel), *self.slide(shape))]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the pixels under the filter."""
         overhang = self.overhang(self.bottom_shapes[0])
         if self.is_exact(data):
             maps = F.pad(data, overhang).flatten(0, self.channel_axis - 1) if self.channel_axis else data[None]
@@ -426,6 +432,7 @@ class Crop(Layer):
 
     bottoms = (2, 2)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the wanted shape; place the window."""
         data, wanted = bottom_shapes
@@ -447,8 +454,8 @@ class Crop(Layer):
             self.window.append(slice(offset, offset + wanted[i]))
         return [(*data[:axis], *wanted[axis : len(data)])]
 
+    @override
     def forward(self, data: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-        """Return the window."""
         return data[tuple(self.window)]
 
     @override

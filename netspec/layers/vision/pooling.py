@@ -253,8 +253,8 @@ class Pooling(_PoolingBase):
 
     tops = (1, 2)
 
+    @override
     def setup(self) -> None:
-        """Read the method and the windows' geometry."""
         param = self.param.pooling_param
         self.method: int = param.pool
         if self.num_tops > 1 and self.method != MAX:
@@ -286,8 +286,8 @@ class Pooling(_PoolingBase):
             )
         return pair
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of the pooled maps, and of the mask."""
         shape, param = bottom_shapes[0], self.param.pooling_param
         if len(shape) != 4:
             raise self.error(f"pooling needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
@@ -300,8 +300,8 @@ class Pooling(_PoolingBase):
             raise self.error(message, "pooling_param")
         return [(*shape[:2], *self.windows.count)] * self.num_tops
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
-        """Return the pooled maps, and the mask if it is asked for."""
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
 
@@ -331,11 +331,12 @@ class SPP(_PoolingBase):
     Caffe: src/caffe/layers/spp_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Refuse a pyramid without a level."""
         if self.param.spp_param.pyramid_height < 1:
             raise self.error("pyramid_height must be at least 1", "spp_param", "pyramid_height")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the number of features; place each level's windows."""
         shape, param = bottom_shapes[0], self.param.spp_param
@@ -348,8 +349,8 @@ class SPP(_PoolingBase):
             return [(*shape[:2], *self.levels[0].count)]
         return [(shape[0], shape[1] * sum(w.count[0] * w.count[1] for w in self.levels))]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the features, the coarsest level's first."""
         several = len(self.levels) > 2 and self.is_exact(data)  # Caffe's SPP is a net of its own, with a Split
         copies = Copies.apply(data, len(self.levels)) if several else [data] * len(self.levels)
         method = self.param.spp_param.pool
