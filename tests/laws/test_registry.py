@@ -25,11 +25,11 @@ MAPS = (2, 4, 5, 6)
 
 
 def labels(shape: Shape) -> torch.Tensor:
-    return torch.arange(np.prod(shape)).reshape(shape) % 4
+    return torch.arange(int(np.prod(shape))).reshape(shape) % 4
 
 
 def flags(shape: Shape) -> torch.Tensor:
-    return torch.arange(np.prod(shape)).reshape(shape) % 2
+    return torch.arange(int(np.prod(shape))).reshape(shape) % 2
 
 
 def ones(shape: Shape) -> torch.Tensor:
