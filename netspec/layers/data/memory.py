@@ -71,6 +71,10 @@ class DummyData(Layer):
             blob = self._fill(i, torch.Generator())
             self._constants.append(blob if filler.type == "constant" else None)
 
+    def filled_once(self) -> Sequence[torch.Tensor | None]:
+        """Return the constant blobs."""
+        return self._constants
+
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shapes."""
         return self.shapes

@@ -32,6 +32,8 @@ class Flatten(Layer):
     Caffe: src/caffe/layers/flatten_layer.cpp
     """
 
+    shares = frozenset({"data", "diff"})
+
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the top's shape."""
         p, shape = self.param.flatten_param, bottom_shapes[0]
@@ -55,6 +57,8 @@ class Reshape(Layer):
     top[0]     the same numbers, shape[:axis] + reshape_param.shape + shape[axis + num_axes:]
     Caffe: src/caffe/layers/reshape_layer.cpp
     """
+
+    shares = frozenset({"data", "diff"})
 
     def setup(self) -> None:
         """Read the new axes."""
@@ -107,6 +111,11 @@ class Concat(Layer):
 
     bottoms = (1, None)
 
+    def setup(self) -> None:
+        """A single bottom is not copied."""
+        if len(self.bottom_shapes) == 1:
+            self.shares = frozenset({"data", "diff"})
+
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the top's shape."""
         first = bottom_shapes[0]
@@ -133,6 +142,11 @@ class Slice(Layer):
     """
 
     tops = (1, None)
+
+    def setup(self) -> None:
+        """A single top is not copied."""
+        if self.num_tops == 1:
+            self.shares = frozenset({"data", "diff"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the tops' shapes."""
@@ -170,6 +184,7 @@ class Split(Layer):
     """
 
     tops = (1, None)
+    shares = frozenset({"data"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape for each top."""

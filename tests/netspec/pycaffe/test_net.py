@@ -1,0 +1,107 @@
+"""caffe.Net: what Caffe's own test_net.py checks, in our words and on our nets."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import netspec.pycaffe as caffe
+
+CLASSES = 7
+SMALL = f"""
+name: "small" force_backward: true
+layer {{ name: "numbers" type: "DummyData" top: "data" top: "label"
+  dummy_data_param {{
+    shape {{ dim: 4 dim: 3 dim: 5 dim: 6 }} shape {{ dim: 4 }}
+    data_filler {{ type: "gaussian" std: 1 }} data_filler {{ type: "constant" }} }} }}
+layer {{ name: "filters" type: "Convolution" bottom: "data" top: "maps"
+  param {{ decay_mult: 1 }} param {{ decay_mult: 0 }}
+  convolution_param {{ num_output: 8 kernel_size: 3 pad: 1
+    weight_filler {{ type: "gaussian" std: 1 }} bias_filler {{ type: "constant" value: 2 }} }} }}
+layer {{ name: "scores" type: "InnerProduct" bottom: "maps" top: "score"
+  inner_product_param {{ num_output: {CLASSES}
+    weight_filler {{ type: "gaussian" std: 0.1 }} bias_filler {{ type: "constant" value: -3 }} }} }}
+layer {{ name: "cost" type: "SoftmaxWithLoss" bottom: "score" bottom: "label" top: "cost" }}
+"""
+
+
+@pytest.fixture
+def net(net_of: Callable[..., caffe.Net]) -> caffe.Net:
+    net = net_of(SMALL, caffe.TRAIN)
+    net.blobs["label"].data[...] = np.random.default_rng(0).integers(CLASSES, size=4)
+    return net
+
+
+def test_memory_outlives_the_net(net: caffe.Net) -> None:
+    net.forward()
+    net.backward()
+    params = [blob for blobs in net.params.values() for blob in blobs]
+    blobs = list(net.blobs.values())
+    del net
+    for blob in params + blobs:
+        assert np.isfinite(blob.data.sum() + blob.diff.sum())
+
+
+def test_layers_by_name(net: caffe.Net) -> None:
+    assert list(net.layer_dict) == list(net._layer_names) == ["numbers", "filters", "scores", "cost"]
+    assert [net.layer_dict[name].type for name in net._layer_names] == [layer.type for layer in net.layers]
+    assert net.layers[1].type == "Convolution"
+    assert isinstance(net.layers[1], caffe.Layer)
+    assert net.layers[1].blobs is net.params["filters"]
+
+
+def test_forward_from_a_layer_to_a_layer_reads_memory(net: caffe.Net) -> None:
+    maps = np.random.default_rng(1).random(net.blobs["maps"].data.shape, np.float32)
+    net.blobs["maps"].data[:] = maps
+    outputs = net.forward(start="scores", end="scores")
+    assert list(outputs) == ["score"]
+    weight, bias = (blob.data for blob in net.params["scores"])
+    np.testing.assert_allclose(outputs["score"], maps.reshape(4, -1) @ weight.T + bias, rtol=1e-4, atol=1e-5)
+    assert (net.blobs["maps"].data == maps).all()
+
+
+def test_backward_from_a_layer_to_a_layer_reads_memory(net: caffe.Net) -> None:
+    diff = np.random.default_rng(1).random(net.blobs["score"].shape, np.float32)
+    net.blobs["score"].diff[:] = diff
+    outputs = net.backward(start="scores", end="scores")
+    assert list(outputs) == ["maps"]
+    expected = (diff @ net.params["scores"][0].data).reshape(net.blobs["maps"].shape)
+    np.testing.assert_allclose(net.blobs["maps"].diff, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_diffs_of_parameters_add_up_until_they_are_cleared(net: caffe.Net) -> None:
+    net.forward()
+    net.backward()
+    diff = net.params["filters"][0].diff
+    once = diff.copy()
+    assert np.abs(once).max() > 0
+    net.backward()
+    np.testing.assert_allclose(diff, 2 * once, rtol=1e-5, atol=1e-6)
+    net.clear_param_diffs()
+    assert (diff == 0).all()
+
+
+def test_names(net: caffe.Net) -> None:
+    assert net.inputs == []
+    assert net.outputs == ["cost"]
+    tops = [("numbers", ["data", "label"]), ("filters", ["maps"]), ("scores", ["score"]), ("cost", ["cost"])]
+    bottoms = [("numbers", []), ("filters", ["data"]), ("scores", ["maps"]), ("cost", ["score", "label"])]
+    assert net.top_names == OrderedDict(tops)
+    assert net.bottom_names == OrderedDict(bottoms)
+    assert net._blob_names == ["data", "label", "maps", "score", "cost"]
+    assert list(net.blob_loss_weights.items())[-2:] == [("score", 0), ("cost", 1)]
+
+
+def test_weights_are_saved_and_read(net: caffe.Net, caplog: pytest.LogCaptureFixture) -> None:
+    net.save("small.caffemodel")
+    net.save_hdf5("small.h5")
+    other = caffe.Net("net.prototxt", caffe.TRAIN)
+    other.load_hdf5("small.h5")
+    older = caffe.Net("net.prototxt", "small.caffemodel", caffe.TRAIN)
+    assert "Net('net.prototxt', 0, weights='small.caffemodel')" in caplog.text
+    newer = caffe.Net("net.prototxt", caffe.TRAIN, weights="small.caffemodel")
+    for again in (other, older, newer):
+        for name, blobs in net.params.items():
+            for mine, theirs in zip(blobs, again.params[name], strict=True):
+                assert (mine.data == theirs.data).all()
