@@ -23,6 +23,16 @@ from netspec.pycaffe.mode import (
     solver_rank,
 )
 from netspec.pycaffe.net import Net
+from netspec.pycaffe.parallel import NCCL, Timer, has_nccl
+from netspec.pycaffe.solver import (
+    AdaDeltaSolver,
+    AdaGradSolver,
+    AdamSolver,
+    NesterovSolver,
+    RMSPropSolver,
+    SGDSolver,
+    get_solver,
+)
 
 __version__ = "1.0.0"  # of the Caffe whose interface this is
 
