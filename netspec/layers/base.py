@@ -163,7 +163,11 @@ class Layer(torch.nn.Module):
         """Reshape for bottoms of these shapes, if they are others than before."""
         if bottom_shapes != self.bottom_shapes:
             self.bottom_shapes = bottom_shapes
-            self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
+            try:
+                self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
+            except SpecError:
+                self.bottom_shapes = []  # whatever comes next is checked again
+                raise
 
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
         """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""

@@ -6,6 +6,7 @@ Caffe: python/caffe/_caffe.cpp, src/caffe/solver.cpp
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,6 +16,7 @@ from netspec import log
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
 from netspec.pycaffe import mode
+from netspec.pycaffe.debug import debug_info
 from netspec.pycaffe.errors import original_errors
 from netspec.pycaffe.net import Net
 from netspec.solver import solver as core_solver
@@ -51,6 +53,10 @@ class _Training(core_solver.Solver):
         loss = shown.passes.forward(0, len(net.layers) - 1)
         blobs = {name: shown.blobs[name] for name in shown.outputs}
         return loss, {name: blob.data_memory.tensor(blob.shape) for name, blob in blobs.items()}
+
+    def debugged(self, net: core.Net) -> AbstractContextManager[None]:
+        """Log the passes within."""
+        return debug_info(self.shown[net].passes)
 
     def test_all(self) -> None:
         """Test, in the root's process."""

@@ -262,7 +262,8 @@ class Solver:
         total = np.float32(0)
         outputs: dict[str, torch.Tensor] = {}
         for _ in range(self.param.iter_size):
-            with self._debugged(self.net, self._is_due(self.param.display)):
+            wanted = self.param.debug_info and self._is_due(self.param.display)
+            with self.debugged(self.net) if wanted else nullcontext():
                 loss, outputs = self.train_pass()
             self._replicas.backward()
             total += np.float32(loss.item())
@@ -285,8 +286,9 @@ class Solver:
         """Run a net forward; return its loss and outputs."""
         return net.forward_loss()
 
-    def _debugged(self, net: Net, wanted: bool = True) -> AbstractContextManager[None]:
-        return debug_info(net) if wanted and self.param.debug_info else nullcontext()
+    def debugged(self, net: Net) -> AbstractContextManager[None]:
+        """Log the passes within, as ``debug_info`` asks for."""
+        return debug_info(net)
 
     @torch.no_grad()
     def apply_update(self) -> None:
@@ -355,7 +357,7 @@ class Solver:
             if self.stopped:
                 log.info("solver.cpp:396", "Test interrupted.")
                 return
-            with self._debugged(net):
+            with self.debugged(net) if self.param.debug_info else nullcontext():
                 loss, outputs = self.test_pass(net)
             total += loss.item()
             for name, blob in outputs.items():
