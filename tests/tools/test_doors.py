@@ -11,6 +11,8 @@ import pytest
 
 from paths import GOLDEN, ROOT
 
+pytestmark = pytest.mark.slow
+
 DOORS = sorted(
     path.name
     for path in (ROOT / "tools").iterdir()
