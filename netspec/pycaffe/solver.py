@@ -63,6 +63,11 @@ class _Training(core_solver.Solver):
         """Log the passes within."""
         return debug_info(self.shown[net].passes)
 
+    def apply_update(self) -> None:
+        """Move the weights, from the values and gradients that scripts may have written."""
+        self.shown[self.net].passes.upload()
+        super().apply_update()
+
     def test_all(self) -> None:
         """Test, in the root's process."""
         if mode.root_solver():
@@ -70,6 +75,7 @@ class _Training(core_solver.Solver):
 
     def snapshot(self) -> tuple[str, str]:
         """Take a snapshot, in the root's process."""
+        self.shown[self.net].passes.upload()
         return super().snapshot() if mode.root_solver() else ("", "")
 
 

@@ -62,14 +62,18 @@ class Memory:
     def tensor(self, shape: Shape) -> torch.Tensor:
         """Return the first numbers, on the device; who reads the tensor must not write to it."""
         count = math.prod(shape)
+        return self.holder(count).view(-1)[:count].view(shape)
+
+    def holder(self, count: int) -> torch.Tensor:
+        """Return the tensor that holds the first ``count`` numbers; while it is the same one, so are they."""
         if self._fresh is not None and self._fresh.numel() == count:
-            return self._fresh.view(shape)
-        flat = self._settled(count)[:count]
+            return self._fresh
+        flat = self._settled(count)
         if self.device.type == "cpu":
-            return flat.view(shape)
+            return flat
         if self._uploaded is None or self._uploaded.numel() != count:
-            self._uploaded = flat.to(self.device)
-        return self._uploaded.view(shape)
+            self._uploaded = flat[:count].to(self.device)
+        return self._uploaded
 
     def put(self, tensor: torch.Tensor) -> None:
         """Take what a layer has computed; it belongs to the memory from now on."""
