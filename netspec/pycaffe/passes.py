@@ -57,6 +57,10 @@ class Passes:
             self._wire(i)
         self.bottoms = [[self.blobs[b] for b in ids] for ids in self.bottom_ids]
         self.tops = [[self.blobs[b] for b in ids] for ids in self.top_ids]
+        self._losses = [
+            [(top, weight) for top, weight in zip(tops, weights, strict=True) if weight]
+            for tops, weights in zip(self.tops, net.loss_weights, strict=True)
+        ]
         self._kept = [layer.filled_once() for layer in self._layers]
         self._records = [self._is_recorded(i) for i in range(len(self._layers))]
         for i in range(len(self._layers)):
@@ -96,9 +100,8 @@ class Passes:
         for top, constant in zip(self.tops[i], self._kept[i], strict=False):
             if constant is not None:
                 top.data_memory.put(constant.clone())
-        for top, weight in zip(self.tops[i], self.net.loss_weights[i], strict=True):
-            if weight:
-                top.diff_memory.put(torch.full(top.shape, weight, device=self.net.device))
+        for top, weight in self._losses[i]:
+            top.diff_memory.put(torch.full(top.shape, weight, device=self.net.device))
 
     def _is_recorded(self, i: int) -> bool:
         """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
@@ -114,14 +117,16 @@ class Passes:
         """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses, a scalar."""
         self.upload()
         loss: torch.Tensor | None = None
+        before, after = self.hooks["before_forward"], self.hooks["after_forward"]
         for i in range(start, end + 1):
-            self._call_hooks("before_forward", i)
+            for hook in before:
+                hook(i)
             self._forward(i)
-            for top, weight in zip(self.tops[i], self.net.loss_weights[i], strict=True):
-                if weight:
-                    term = self.net.weighted_sum(top.data_memory.tensor(top.shape), weight)
-                    loss = term if loss is None else loss + term
-            self._call_hooks("after_forward", i)
+            for top, weight in self._losses[i]:
+                term = self.net.weighted_sum(top.data_memory.tensor(top.shape), weight)
+                loss = term if loss is None else loss + term
+            for hook in after:
+                hook(i)
         return torch.zeros((), device=self.net.device) if loss is None else loss
 
     @torch.no_grad()
@@ -132,10 +137,12 @@ class Passes:
         """
         self.upload()
         for i in range(start, end - 1, -1):
-            self._call_hooks("before_backward", i)
+            for hook in self.hooks["before_backward"]:
+                hook(i)
             if self.net.backward_plan.layers[i]:
                 self._backward(i)
-            self._call_hooks("after_backward", i)
+            for hook in self.hooks["after_backward"]:
+                hook(i)
 
     def reshape(self) -> None:
         """Give every blob the shape that follows from those of the inputs, and compute nothing."""
@@ -164,10 +171,6 @@ class Passes:
         for learnable in self.net.learnable:
             if learnable.parameter.grad is not None:
                 learnable.parameter.grad.zero_()
-
-    def _call_hooks(self, which: str, i: int) -> None:
-        for hook in self.hooks[which]:
-            hook(i)
 
     def upload(self) -> None:
         """Bring to the GPU what scripts wrote to learnable blobs, before anything else reads or writes these."""
@@ -210,7 +213,7 @@ class Passes:
             values = [blob.data_memory.tensor(blob.shape) for blob in bottoms]
             made = layer.run(*values)
         kept = self._kept[i] or [None] * len(made)
-        taken = _storages([*values, *layer.blobs])
+        taken = _storages(values or list(layer.blobs))
         for top, tensor, constant in zip(tops, made, kept, strict=True):
             if constant is None:
                 top.put_data(_apart(tensor.detach(), taken))
