@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 Shape = tuple[int, ...]
 _CPU = torch.device("cpu")
@@ -130,13 +131,14 @@ class BorrowedMemory(Memory):
         self._copy: torch.Tensor | None = None
         self._written = False
 
+    @override
     def reserve(self, count: int) -> None:
         """Refuse more numbers than there are."""
         if count > self.capacity:
             raise ValueError(f"this blob has {self.capacity} numbers, and cannot become one of {count}")
 
+    @override
     def view(self, shape: Shape) -> np.ndarray:
-        """Return a view of the first numbers."""
         tensor = self._find().detach()
         if tensor.device.type != "cpu":
             if self._copy is None:
@@ -146,10 +148,11 @@ class BorrowedMemory(Memory):
             tensor, self._written = self._copy, True
         return tensor.view(-1).numpy()[: math.prod(shape)].reshape(shape)
 
+    @override
     def tensor(self, shape: Shape) -> torch.Tensor:
-        """Return the first numbers."""
         return self._find().detach().view(-1)[: math.prod(shape)].view(shape)
 
+    @override
     def put(self, tensor: torch.Tensor) -> None:
         """Write to the tensor."""
         _write(self._find().detach().view(-1), tensor)

@@ -1,31 +1,22 @@
 """Dialects for one test: registry and schema are afterwards as they were before."""
 
-import sys
 from collections.abc import Callable, Iterator
 
 import pytest
 import torch
 
+from fresh_dialects import fresh_dialects
 from netspec.dialects import use_dialect
-from netspec.layers import Layer, registry
+from netspec.layers import Layer
 from netspec.net.one_layer import make_layer
-from netspec.proto.dialect import files as dialect_files
-from netspec.proto.dialect import registry as dialect
 from netspec.proto.schema import TEST
 from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 
 @pytest.fixture(autouse=True)
 def _leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    assert dialect.active() == []
     torch.manual_seed(0)
-    monkeypatch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
-    yield
-    for name in dialect.active():
-        dialect.deactivate(name)
-    own = [file.module for file in dialect_files.known_files().values()]
-    for name in [name for name in sys.modules if name in own or name.startswith("netspec_dialect_")]:
-        del sys.modules[name]
+    yield from fresh_dialects(monkeypatch)
 
 
 @pytest.fixture
