@@ -62,6 +62,10 @@ class Random:
     """The net's random draws, reproducible from one seed; one generator a device."""
 
     def __init__(self, seed: int) -> None:
+        self.restart(seed)
+
+    def restart(self, seed: int) -> None:
+        """Begin anew, from another seed."""
         self.seed = seed
         self._generators: dict[str, torch.Generator] = {}
 
@@ -126,6 +130,7 @@ class Layer(torch.nn.Module):
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
     reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
     ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
+    shares: frozenset[str] = frozenset()  # of "data", "diff": its tops lie where its bottom lies, in Caffe's memory
     gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (of it), "top": see net/in_place.py
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
@@ -173,6 +178,10 @@ class Layer(torch.nn.Module):
         """Return whether to compute in Caffe's order: :func:`netspec.exact.switch.applies`, for one type of numbers."""
         applies = switch.applies(self.context.exact, bottom, small)
         return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
+
+    def filled_once(self) -> Sequence[torch.Tensor | None]:
+        """Return, by top, what is written when the layer is made and never again; empty where there is no such top."""
+        return ()
 
     def restart(self) -> None:
         """Return to the first record, where the layer reads any."""
@@ -232,12 +241,19 @@ class Layer(torch.nn.Module):
 
     def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Reshape if the bottoms' shapes changed, run ``forward``, return a tuple."""
-        shapes = [tuple(b.shape) for b in bottoms]
-        if shapes != self.bottom_shapes:
-            self.bottom_shapes = shapes
-            self.top_shapes = [tuple(s) for s in self.reshape(shapes)]
+        self.fit([tuple(b.shape) for b in bottoms])
         tops = self(*bottoms)
         return tops if isinstance(tops, tuple) else (tops,)
+
+    def fit(self, bottom_shapes: list[Shape]) -> None:
+        """Reshape for bottoms of these shapes, if they are others than before."""
+        if bottom_shapes != self.bottom_shapes:
+            self.bottom_shapes = bottom_shapes
+            try:
+                self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
+            except SpecError:
+                self.bottom_shapes = []  # whatever comes next is checked again
+                raise
 
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
         """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""

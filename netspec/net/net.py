@@ -232,7 +232,7 @@ class Net(torch.nn.Module):
                     memories[v].data = top.detach()
             for top, weight in zip(tops, self.loss_weights[i], strict=True):
                 if weight:
-                    term = self._weighted_sum(top, weight)
+                    term = self.weighted_sum(top, weight)
                     loss = term if loss is None else loss + term
             for v in self._last_use[i]:
                 if v not in kept:
@@ -259,7 +259,7 @@ class Net(torch.nn.Module):
             return run_overwritten(layer, bottoms[0], memory, node.in_place[0])
         return layer.run(*bottoms)
 
-    def _weighted_sum(self, top: torch.Tensor, weight: float) -> torch.Tensor:
+    def weighted_sum(self, top: torch.Tensor, weight: float) -> torch.Tensor:
         """Return the share of a top in the net's loss (Caffe: Layer::Forward)."""
         if top.numel() > 1 and applies(self._exact, top):
             return RowSums.apply(top.reshape(1, -1), weight)[0]

@@ -66,11 +66,19 @@ def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
     A blob that layers share is written by each of them, in HDF5 by its owner alone. Raises SpecError where the file
     cannot be written; then what was there before is there still.
     """
+    (write_hdf5 if str(path).endswith(".h5") else write_binary)(net, path, diff)
+
+
+def write_binary(net: Net, path: str | Path, diff: bool = False) -> None:
+    """Do what :func:`save_weights` does in Caffe's binary form, whatever the file's name."""
     with whole_file(path) as unfinished:
-        if str(path).endswith(".h5"):
-            _to_hdf5(net, unfinished, diff)
-        else:
-            unfinished.write_bytes(net_to_proto(net, diff).SerializeToString(deterministic=True))
+        unfinished.write_bytes(net_to_proto(net, diff).SerializeToString(deterministic=True))
+
+
+def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
+    """Do what :func:`save_weights` does in HDF5, whatever the file's name."""
+    with whole_file(path) as unfinished:
+        _to_hdf5(net, unfinished, diff)
 
 
 def net_to_proto(net: Net, diff: bool = False) -> NetParameter:

@@ -99,6 +99,10 @@ class DummyData(Layer):
                 yield self.error(str(fault), "dummy_data_param", "data_filler", i)
 
     @override
+    def filled_once(self) -> Sequence[torch.Tensor | None]:
+        return self._constants
+
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self.shapes
 

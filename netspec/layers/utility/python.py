@@ -10,14 +10,14 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from typing_extensions import override
 
 from netspec.errors import SpecError, did_you_mean
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
-from netspec.layers.utility.pycaffe_shim import Blob, importable
+from netspec.layers.utility.live_blobs import Blob
+from netspec.layers.utility.pycaffe_shim import importable
 
 
 class _Call(torch.autograd.Function):
@@ -88,11 +88,11 @@ class Python(Layer):
 
     def call_forward(self, tensors: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Show the tensors (bottoms, learnable blobs) to the code, run it, return the tops."""
-        for blob, tensor in zip([*self.bottom, *self.code.blobs], tensors, strict=True):
-            blob.bind(_array(tensor.clone() if blob in self.top else tensor))
         like = tensors[0] if tensors else torch.empty(0, device=self.context.device)
+        for blob, tensor in zip([*self.bottom, *self.code.blobs], tensors, strict=True):
+            blob.put_data((tensor.clone() if blob in self.top else tensor).detach().cpu())
         for blob in self.top:
-            blob.cast(_array(like[:0]).dtype)
+            blob.data_memory.cast(like.dtype)
         self._call("reshape", self.bottom, self.top)
         self._call("forward", self.bottom, self.top)
         return tuple(torch.tensor(blob.data, device=like.device) for blob in self.top)
@@ -100,9 +100,9 @@ class Python(Layer):
     def call_backward(self, grads: Sequence[torch.Tensor], needed: Sequence[bool]) -> list[torch.Tensor | None]:
         """Run the code's backward; return the gradients of the bottoms and learnable blobs that are needed."""
         for blob in (*self.bottom, *self.code.blobs):
-            blob.diff.fill(0)
+            blob.diff_memory.put(torch.zeros(blob.shape, dtype=grads[0].dtype))
         for blob, grad in zip(self.top, grads, strict=True):
-            blob.diff[...] = _array(grad)
+            blob.diff_memory.put(grad.cpu().clone())
         self._call("backward", self.top, list(needed[: len(self.bottom)]), self.bottom)
         return [
             torch.tensor(blob.diff, device=grads[0].device) if need else None
@@ -142,11 +142,6 @@ class Python(Layer):
             raise
         except Exception as fault:
             raise self.error(f"{p.module}.{p.layer}.{method}: {_describe(fault)}", "python_param") from fault
-
-
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    """Return a view of the tensor's values, or a copy where they are elsewhere than in main memory."""
-    return tensor.detach().contiguous().cpu().numpy()
 
 
 def _describe(fault: Exception) -> str:

@@ -34,6 +34,8 @@ class Flatten(Layer):
     Caffe: src/caffe/layers/flatten_layer.cpp
     """
 
+    shares = frozenset({"data", "diff"})
+
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.flatten_param, bottom_shapes[0]
@@ -65,6 +67,8 @@ class Reshape(Layer):
     top[0]     the same numbers, shape[:axis] + reshape_param.shape + shape[axis + num_axes:]
     Caffe: src/caffe/layers/reshape_layer.cpp
     """
+
+    shares = frozenset({"data", "diff"})
 
     @override
     def setup(self) -> None:
@@ -126,6 +130,11 @@ class Concat(Layer):
     bottoms = (1, None)
 
     @override
+    def setup(self) -> None:
+        if len(self.bottom_shapes) == 1:  # it is not copied
+            self.shares = frozenset({"data", "diff"})
+
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         first = bottom_shapes[0]
         self.axis = axis = _axis(self, first, "concat_param", "concat_dim")
@@ -161,6 +170,11 @@ class Slice(Layer):
     """
 
     tops = (1, None)
+
+    @override
+    def setup(self) -> None:
+        if self.num_tops == 1:  # it is not copied
+            self.shares = frozenset({"data", "diff"})
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -224,6 +238,7 @@ class Split(Layer):
     """
 
     tops = (1, None)
+    shares = frozenset({"data"})
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:

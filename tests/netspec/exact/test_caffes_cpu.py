@@ -10,7 +10,13 @@ import pytest
 from paths import ROOT
 
 CPU = Path("/proc/cpuinfo")
-COMPARING_BITS = ["exact/test_blas.py", "layers/test_golden.py", "solver/test_examples.py", "solver/test_golden.py"]
+COMPARING_BITS = [
+    "exact/test_blas.py",
+    "layers/test_golden.py",
+    "pycaffe/test_golden.py",
+    "solver/test_examples.py",
+    "solver/test_golden.py",
+]
 
 
 @pytest.mark.slow

@@ -1,0 +1,263 @@
+"""Blobs as pycaffe shows them: ``data`` and ``diff`` are numpy views of memory that lives on from pass to pass.
+
+A piece of memory grows and never shrinks: a blob of a smaller shape uses its front. A view that somebody holds shows
+what the next pass writes. As copying every blob to where views look would slow down each pass, a tensor that a layer
+returns is kept as it is, and copied, or made the memory itself, when somebody looks.
+
+Caffe: include/caffe/blob.hpp, src/caffe/syncedmem.cpp, python/caffe/_caffe.cpp
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import weakref
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+Shape = tuple[int, ...]
+_CPU = torch.device("cpu")
+
+
+def _nobody() -> np.ndarray | None:
+    return None
+
+
+class Memory:
+    """One piece of memory (Caffe: SyncedMemory), ``capacity`` numbers long, zeros at first.
+
+    ``view`` shows it, ``tensor`` is its content for layers to read, ``put`` gives it what a layer has computed. On a
+    GPU a view shows what was there when ``view`` was called, and what is written to it then takes effect, as in Caffe.
+    """
+
+    def __init__(self, device: torch.device = _CPU) -> None:
+        self.capacity = 0
+        self.device = device
+        self.dtype = torch.float32
+        self._fresh: torch.Tensor | None = None  # what a layer has put here since somebody looked
+        self._flat: torch.Tensor | None = None  # what views show, one axis, in main memory
+        self._seen: Callable[[], np.ndarray | None] = _nobody  # the array that all views are views of, while any lives
+        self._uploaded: torch.Tensor | None = None  # ``_flat`` on the GPU
+
+    def reserve(self, count: int) -> None:
+        """Make room for ``count`` numbers; memory that grows is new memory, of zeros."""
+        if count > self.capacity:
+            self.capacity = count
+            self._fresh = self._flat = self._uploaded = None
+            self._seen = _nobody
+
+    def view(self, shape: Shape) -> np.ndarray:
+        """Return a view of the first numbers."""
+        count = math.prod(shape)
+        flat = self._settled(count)
+        array = self._seen()
+        if array is None:
+            array = flat.numpy()
+            self._seen = weakref.ref(array)
+        self._uploaded = None
+        return array[:count].reshape(shape)
+
+    def tensor(self, shape: Shape) -> torch.Tensor:
+        """Return the first numbers, on the device; who reads the tensor must not write to it."""
+        count = math.prod(shape)
+        return self.holder(count).view(-1)[:count].view(shape)
+
+    def holder(self, count: int) -> torch.Tensor:
+        """Return the tensor that holds the first ``count`` numbers; while it is the same one, so are they."""
+        if self._fresh is not None and self._fresh.numel() == count:
+            return self._fresh
+        flat = self._settled(count)
+        if self.device.type == "cpu":
+            return flat
+        if self._uploaded is None or self._uploaded.numel() != count:
+            self._uploaded = flat[:count].to(self.device)
+        return self._uploaded
+
+    def put(self, tensor: torch.Tensor) -> None:
+        """Take what a layer has computed; it belongs to the memory from now on."""
+        self.reserve(tensor.numel())
+        if tensor.dtype != self.dtype:
+            self.cast(tensor.dtype)
+        self._uploaded = None
+        if self._flat is not None and self.is_watched():
+            self._fresh = None
+            _write(self._flat, tensor)
+        else:
+            self._fresh = tensor.contiguous()
+            if self._seen() is None:
+                self._flat = None
+
+    def is_watched(self) -> bool:
+        """Return whether somebody holds a view that is to show what layers compute."""
+        return self.device.type == "cpu" and self._seen() is not None
+
+    def cast(self, dtype: torch.dtype) -> None:
+        """Hold numbers of another precision, zeros at first."""
+        if dtype != self.dtype:
+            self.dtype, self._fresh, self._flat, self._uploaded, self._seen = dtype, None, None, None, _nobody
+
+    def _settled(self, count: int) -> torch.Tensor:
+        """Return the memory that views show, with what was put last."""
+        self.reserve(count)
+        fresh, self._fresh = self._fresh, None
+        if self._flat is None:
+            if fresh is not None and self._is_all(fresh):
+                self._flat = fresh.detach().view(-1)
+                return self._flat
+            self._flat = torch.zeros(self.capacity, dtype=self.dtype)
+        if fresh is not None:
+            _write(self._flat, fresh)
+        return self._flat
+
+    def _is_all(self, tensor: torch.Tensor) -> bool:
+        """Return whether a tensor can be the memory itself: of its size, and alone in its storage."""
+        whole = tensor.device.type == "cpu" and tensor.numel() == self.capacity and not tensor.is_inference()
+        return whole and tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
+
+
+class BorrowedMemory(Memory):
+    """The memory of a tensor that a net or a solver owns: a learnable blob's values, or their gradient.
+
+    ``find`` returns the tensor. On a GPU views show a copy, which :meth:`upload` brings back.
+    """
+
+    def __init__(self, find: Callable[[], torch.Tensor], capacity: int) -> None:
+        super().__init__()
+        self.capacity = capacity
+        self._find = find
+        self._copy: torch.Tensor | None = None
+        self._written = False
+
+    @override
+    def reserve(self, count: int) -> None:
+        """Refuse more numbers than there are."""
+        if count > self.capacity:
+            raise ValueError(f"this blob has {self.capacity} numbers, and cannot become one of {count}")
+
+    @override
+    def view(self, shape: Shape) -> np.ndarray:
+        tensor = self._find().detach()
+        if tensor.device.type != "cpu":
+            if self._copy is None:
+                self._copy = torch.empty(tensor.shape, dtype=tensor.dtype)
+            if not self._written:
+                self._copy.copy_(tensor)
+            tensor, self._written = self._copy, True
+        return tensor.view(-1).numpy()[: math.prod(shape)].reshape(shape)
+
+    @override
+    def tensor(self, shape: Shape) -> torch.Tensor:
+        return self._find().detach().view(-1)[: math.prod(shape)].view(shape)
+
+    @override
+    def put(self, tensor: torch.Tensor) -> None:
+        """Write to the tensor."""
+        _write(self._find().detach().view(-1), tensor)
+
+    @torch.no_grad()
+    def upload(self) -> None:
+        """Bring what views were written to since to the GPU."""
+        if self._written and self._copy is not None:
+            self._find().detach().copy_(self._copy)
+        self._written = False
+
+
+def _write(flat: torch.Tensor, tensor: torch.Tensor) -> None:
+    """Write a tensor to the front of memory; what autograd has saved of it changes too, as what Caffe reads does."""
+    flat.data[: tensor.numel()].copy_(tensor.detach().reshape(-1))
+
+
+class Blob:
+    """An array and its gradient; ``data`` and ``diff`` are live views, read and written in place.
+
+    ``data_memory`` and ``diff_memory`` may be another blob's too (Caffe: ShareData, ShareDiff).
+    """
+
+    def __init__(
+        self,
+        shape: Shape = (),
+        data: Memory | None = None,
+        diff: Memory | None = None,
+    ) -> None:
+        """Make a blob, of zeros unless it is given memory."""
+        self.data_memory = data or Memory()
+        self.diff_memory = diff or Memory()
+        self._shape: Shape = ()
+        self.reshape(*shape)
+
+    @property
+    def data(self) -> np.ndarray:
+        """The values."""
+        return self.data_memory.view(self._shape)
+
+    @property
+    def diff(self) -> np.ndarray:
+        """The gradient."""
+        return self.diff_memory.view(self._shape)
+
+    @property
+    def shape(self) -> Shape:
+        """The shape."""
+        return self._shape
+
+    @property
+    def count(self) -> int:
+        """How many values there are."""
+        return math.prod(self._shape)
+
+    @property
+    def num(self) -> int:
+        """Axis 0, 1 where there is none."""
+        return self._legacy_axis(0)
+
+    @property
+    def channels(self) -> int:
+        """Axis 1, 1 where there is none."""
+        return self._legacy_axis(1)
+
+    @property
+    def height(self) -> int:
+        """Axis 2, 1 where there is none."""
+        return self._legacy_axis(2)
+
+    @property
+    def width(self) -> int:
+        """Axis 3, 1 where there is none."""
+        return self._legacy_axis(3)
+
+    def reshape(self, *shape: int) -> None:
+        """Take another shape, at once; the values stay where they are, those of memory that has to grow are 0."""
+        axes = tuple(operator.index(size) for size in shape)
+        if min(axes, default=0) < 0:
+            raise ValueError(f"Check failed: shape[i] >= 0: found shape {axes}, expected no size below 0")
+        if len(axes) > MOST_AXES:
+            raise ValueError(f"Check failed: shape.size() <= kMaxBlobAxes ({len(axes)} vs. {MOST_AXES})")
+        self._shape = axes
+        self.data_memory.reserve(self.count)
+        self.diff_memory.reserve(self.count)
+
+    def put_data(self, tensor: torch.Tensor) -> None:
+        """Take values, and their shape, that a layer has computed."""
+        if tensor.shape != self._shape:
+            self.reshape(*tensor.shape)
+        self.data_memory.put(tensor)
+
+    def _legacy_axis(self, axis: int) -> int:
+        if len(self._shape) > 4:
+            message = "Check failed: num_axes() <= 4: Cannot use legacy accessors on Blobs with > 4 axes."
+            raise ValueError(f"{message} This one has shape {self._shape}")
+        return self._shape[axis] if axis < len(self._shape) else 1
+
+
+MOST_AXES = 32  # caffe: kMaxBlobAxes
+
+
+class BlobVec(list[Blob]):
+    """A layer's learnable blobs."""
+
+    def add_blob(self, *shape: int) -> None:
+        """Append a blob of zeros."""
+        self.append(Blob(shape))

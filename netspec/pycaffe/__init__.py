@@ -1,0 +1,40 @@
+"""Caffe's Python interface: ``import netspec.pycaffe as caffe``.
+
+Caffe: python/caffe/__init__.py
+"""
+
+import sys
+
+from netspec.layers import layer_types as layer_type_list
+from netspec.layers.utility import pycaffe_shim
+from netspec.layers.utility.pycaffe_shim import TEST, TRAIN, Layer
+from netspec.pycaffe import logs
+from netspec.pycaffe.logs import init_log
+from netspec.pycaffe.logs import log_message as log
+from netspec.pycaffe.mode import (
+    set_device,
+    set_mode_cpu,
+    set_mode_gpu,
+    set_multiprocess,
+    set_random_seed,
+    set_solver_count,
+    set_solver_rank,
+    solver_count,
+    solver_rank,
+)
+from netspec.pycaffe.net import Net
+from netspec.pycaffe.parallel import NCCL, Timer, has_nccl
+from netspec.pycaffe.solver import (
+    AdaDeltaSolver,
+    AdaGradSolver,
+    AdamSolver,
+    NesterovSolver,
+    RMSPropSolver,
+    SGDSolver,
+    get_solver,
+)
+
+__version__ = "1.0.0"  # of the Caffe whose interface this is
+
+logs.start()
+pycaffe_shim.offer(sys.modules[__name__])

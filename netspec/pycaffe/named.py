@@ -1,0 +1,43 @@
+"""Ordered dictionaries whose keys are names of a prototxt, and which scripts of Python 2 can read."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+from netspec.errors import did_you_mean
+
+T = TypeVar("T")
+
+
+class Named(OrderedDict[str, T]):
+    """An OrderedDict that says which names there are when it is asked for another."""
+
+    def __init__(self, what: str = "name", items: Any = ()) -> None:
+        self.what = what
+        super().__init__(items)
+
+    def __missing__(self, name: str) -> T:
+        known = ", ".join(self) or "none"
+        hint = did_you_mean(str(name), list(self)) or ";"
+        raise KeyError(f'no {self.what} "{name}" in this net{hint} it has: {known}')
+
+    def __reduce__(self) -> Any:
+        return Named, (self.what, list(self.items()))
+
+    def has_key(self, name: str) -> bool:
+        """Return whether there is such a name."""
+        return name in self
+
+    def iterkeys(self) -> Iterator[str]:
+        """Return an iterator over the names."""
+        return iter(self.keys())
+
+    def itervalues(self) -> Iterator[T]:
+        """Return an iterator over what is named."""
+        return iter(self.values())
+
+    def iteritems(self) -> Iterator[tuple[str, T]]:
+        """Return an iterator over both."""
+        return iter(self.items())

@@ -1,0 +1,305 @@
+"""Forward and backward passes through the memory of a net's blobs, layer by layer, as Caffe makes them.
+
+A net of netspec hands tensors from layer to layer, and autograd goes backward through all of them. Scripts of pycaffe
+read and write the blobs between two layers' passes: so here each layer reads its bottoms' memory and writes its tops',
+and each layer's backward reads the diffs of its tops, and what it needs of the data, from that memory.
+
+Caffe: Net::ForwardFromTo, Net::BackwardFromTo, Net::Reshape (src/caffe/net.cpp)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from netspec import log
+from netspec.layers.base import Layer
+from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
+from netspec.layers.utility.pycaffe_shim import importable
+from netspec.layers.utility.python import Python
+from netspec.net.net import Net
+
+AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
+Hook = Callable[[int], object]
+
+
+@dataclass(frozen=True)
+class _Tape:
+    """One run of a layer watched by autograd: copies of what it read, the tensors that held it, what it returned."""
+
+    leaves: list[torch.Tensor]
+    holders: list[torch.Tensor]
+    made: tuple[torch.Tensor, ...]
+
+
+class Passes:
+    """The blobs of a net and the passes through them.
+
+    ``names`` and ``blobs`` run in step, in Caffe's order; ``bottoms[i]`` and ``tops[i]`` are the blobs of layer i,
+    ``params[i]`` its learnable blobs. ``hooks`` are called with a layer's number, before and after its passes.
+    """
+
+    def __init__(self, net: Net) -> None:
+        self.net = net
+        self.names: list[str] = []
+        self.blobs: list[Blob] = []
+        self.bottom_ids: list[list[int]] = []
+        self.top_ids: list[list[int]] = []
+        self.hooks: dict[str, list[Hook]] = {
+            f"{when}_{which}": [] for when in ("before", "after") for which in ("forward", "backward")
+        }
+        self._layers: list[Layer] = list(net.layers)
+        self.params = [_parameters(layer) for layer in self._layers]
+        self._tapes: list[_Tape | None] = [None] * len(self._layers)
+        for i in range(len(self._layers)):
+            self._wire(i)
+        self.bottoms = [[self.blobs[b] for b in ids] for ids in self.bottom_ids]
+        self.tops = [[self.blobs[b] for b in ids] for ids in self.top_ids]
+        self._losses = [
+            [(top, weight) for top, weight in zip(tops, weights, strict=True) if weight]
+            for tops, weights in zip(self.tops, net.loss_weights, strict=True)
+        ]
+        self._kept = [layer.filled_once() for layer in self._layers]
+        self._records = [self._is_recorded(i) for i in range(len(self._layers))]
+        for i in range(len(self._layers)):
+            self._set_up(i)
+
+    # Building
+
+    def _wire(self, i: int) -> None:
+        """Make the blobs that layer ``i`` adds (Caffe: AppendBottom, AppendTop)."""
+        plan, layer = self.net.plan, self._layers[i]
+        node = plan.nodes[i]
+        current = {name: b for b, name in enumerate(self.names)}
+        bottoms = [current[plan.blobs[v]] for v in node.bottoms]
+        tops = []
+        for j, shape in enumerate(layer.top_shapes):
+            if j < len(node.tops) and node.in_place[j]:
+                tops.append(bottoms[j])
+                continue
+            blob = layer.top[j] if isinstance(layer, Python) and layer.code else Blob(shape)
+            blob.data_memory.device = blob.diff_memory.device = self.net.device
+            tops.append(len(self.blobs))
+            self.blobs.append(blob)
+            self.names.append(plan.blobs[node.tops[j]] if j < len(node.tops) else AUTOMATIC)
+            if "data" in layer.shares:
+                blob.data_memory = self.blobs[bottoms[0]].data_memory
+            if "diff" in layer.shares:
+                blob.diff_memory = self.blobs[bottoms[0]].diff_memory
+        self.bottom_ids.append(bottoms)
+        self.top_ids.append(tops)
+
+    def _set_up(self, i: int) -> None:
+        """Write what Caffe writes when it makes the layer."""
+        layer = self._layers[i]
+        if isinstance(layer, Python) and layer.code:
+            layer.bottom[:], layer.top[:] = self.bottoms[i], self.tops[i]
+            layer.code.blobs[:] = self.params[i]
+        for top, constant in zip(self.tops[i], self._kept[i], strict=False):
+            if constant is not None:
+                top.data_memory.put(constant.clone())
+        for top, weight in self._losses[i]:
+            top.diff_memory.put(torch.full(top.shape, weight, device=self.net.device))
+
+    def _is_recorded(self, i: int) -> bool:
+        """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
+        layer, plan = self._layers[i], self.net.backward_plan
+        from_memory = isinstance(layer, Python) or layer.shares or layer.gradient_reads
+        wanted = any(plan.bottoms[i]) or any(blob.requires_grad for blob in layer.blobs)
+        return plan.layers[i] and wanted and not from_memory
+
+    # Running
+
+    @torch.no_grad()
+    def forward(self, start: int, end: int) -> torch.Tensor:
+        """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses, a scalar."""
+        self.upload()
+        loss: torch.Tensor | None = None
+        before, after = self.hooks["before_forward"], self.hooks["after_forward"]
+        for i in range(start, end + 1):
+            for hook in before:
+                hook(i)
+            self._forward(i)
+            for top, weight in self._losses[i]:
+                term = self.net.weighted_sum(top.data_memory.tensor(top.shape), weight)
+                loss = term if loss is None else loss + term
+            for hook in after:
+                hook(i)
+        return torch.zeros((), device=self.net.device) if loss is None else loss
+
+    @torch.no_grad()
+    def backward(self, start: int, end: int) -> None:
+        """Run the backward passes of layers ``start`` down to ``end``, both included, from the diffs of their tops.
+
+        Bottoms' diffs are overwritten, those of learnable blobs added to. Layers that need none are passed over.
+        """
+        self.upload()
+        for i in range(start, end - 1, -1):
+            for hook in self.hooks["before_backward"]:
+                hook(i)
+            if self.net.backward_plan.layers[i]:
+                self._backward(i)
+            for hook in self.hooks["after_backward"]:
+                hook(i)
+
+    def reshape(self) -> None:
+        """Give every blob the shape that follows from those of the inputs, and compute nothing."""
+        for i in range(len(self._layers)):
+            self._reshape(i)
+
+    def share_with(self, other: Passes) -> None:
+        """Use the learnable blobs of another net (Caffe: ShareTrainedLayersWith); their gradients stay apart."""
+        other.upload()
+        mine = {layer.param.name: layer for layer in reversed(self._layers)}
+        for theirs in other._layers:
+            layer = mine.get(theirs.param.name)
+            if layer is None:
+                log.info("net.cpp:680", f"Ignoring source layer {theirs.param.name}")
+                continue
+            if layer.blob_shapes != theirs.blob_shapes:
+                found = f"blobs {layer.blob_shapes} here, {theirs.blob_shapes} there"
+                raise layer.error(f"cannot share param weights of the other net: {found}")
+            for blob, source in zip(layer.blobs, theirs.blobs, strict=True):
+                blob.data = source.data
+
+    @torch.no_grad()
+    def clear_param_diffs(self) -> None:
+        """Set the gradients of all learnable blobs to 0, where they are."""
+        self.upload()
+        for learnable in self.net.learnable:
+            if learnable.parameter.grad is not None:
+                learnable.parameter.grad.zero_()
+
+    def upload(self) -> None:
+        """Bring to the GPU what scripts wrote to learnable blobs, before anything else reads or writes these."""
+        if self.net.device.type != "cpu":
+            for blobs in self.params:
+                for blob in blobs:
+                    for memory in (blob.data_memory, blob.diff_memory):
+                        if isinstance(memory, BorrowedMemory):
+                            memory.upload()
+
+    def _reshape(self, i: int) -> None:
+        layer = self._layers[i]
+        if layer.is_input or not self.bottoms[i]:
+            return
+        if isinstance(layer, Python):
+            with importable():
+                layer.code.reshape(self.bottoms[i], self.tops[i])
+            return
+        layer.fit([blob.shape for blob in self.bottoms[i]])
+        for top, shape in zip(self.tops[i], layer.top_shapes, strict=True):
+            if top.shape != shape:
+                top.reshape(*shape)
+
+    def _forward(self, i: int) -> None:
+        layer, bottoms, tops = self._layers[i], self.bottoms[i], self.tops[i]
+        if layer.is_input:
+            return
+        if isinstance(layer, Python):
+            with importable():
+                layer.code.reshape(bottoms, tops)
+                layer.code.forward(bottoms, tops)
+            return
+        if layer.shares:
+            self._reshape(i)
+            return
+        if self._records[i]:
+            tape = self._tapes[i] = self._record(i)
+            values, made = tape.leaves, tape.made
+        else:
+            values = [blob.data_memory.tensor(blob.shape) for blob in bottoms]
+            made = layer.run(*values)
+        kept = self._kept[i] or [None] * len(made)
+        taken = _storages(values or list(layer.blobs))
+        for top, tensor, constant in zip(tops, made, kept, strict=True):
+            if constant is None:
+                top.put_data(_apart(tensor.detach(), taken))
+
+    def _record(self, i: int) -> _Tape:
+        """Run layer ``i`` watched by autograd."""
+        leaves, holders = [], []
+        for blob, wanted in zip(self.bottoms[i], self.net.backward_plan.bottoms[i], strict=True):
+            memory = blob.data_memory
+            value = memory.tensor(blob.shape)
+            overwritten = memory.is_watched() and self._is_in_place(i, blob)
+            leaves.append((value.clone() if overwritten else value.detach()).requires_grad_(wanted))
+            holders.append(memory.holder(blob.count))
+        with torch.enable_grad():
+            return _Tape(leaves, holders, self._layers[i].run(*leaves))
+
+    def _tape(self, i: int) -> _Tape:
+        """Return the record of the last forward pass of layer ``i``, its bottoms' values as they are now in memory.
+
+        A layer that has not run, or on other shapes, runs for it.
+        """
+        tape, bottoms = self._tapes[i], self.bottoms[i]
+        if tape is None or any(leaf.shape != blob.shape for leaf, blob in zip(tape.leaves, bottoms, strict=True)):
+            return self._record(i)
+        for leaf, holder, blob in zip(tape.leaves, tape.holders, bottoms, strict=True):
+            kept = self._is_in_place(i, blob) or blob.data_memory.holder(blob.count) is holder
+            if not kept:
+                leaf.data.copy_(blob.data_memory.tensor(blob.shape))
+        return tape
+
+    def _is_in_place(self, i: int, blob: Blob) -> bool:
+        """Return whether layer ``i`` writes over one of its bottoms: then it has kept what its gradient needs."""
+        return any(top is blob for top in self.tops[i])
+
+    def _backward(self, i: int) -> None:
+        layer, bottoms, tops = self._layers[i], self.bottoms[i], self.tops[i]
+        wanted = self.net.backward_plan.bottoms[i]
+        if isinstance(layer, Python):
+            with importable():
+                layer.code.backward(tops, list(wanted), bottoms)
+            return
+        if "diff" in layer.shares:
+            return
+        diffs = [top.diff_memory.tensor(top.shape) for top in tops]
+        if layer.gradient_reads:
+            if wanted[0]:
+                bottom, top = (blob.data_memory.tensor(blob.shape) for blob in (bottoms[0], tops[0]))
+                bottoms[0].diff_memory.put(layer.caffes_gradient(bottom, top, diffs[0]))
+            return
+        tape = self._tape(i)
+        ends = [(top, diff) for top, diff in zip(tape.made, diffs, strict=True) if top.requires_grad]
+        for leaf in tape.leaves:
+            leaf.grad = None
+        if ends:
+            torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends], retain_graph=True)
+        taken = _storages(diffs)
+        for blob, leaf, asked in zip(bottoms, tape.leaves, wanted, strict=True):
+            if asked:
+                diff = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+                blob.diff_memory.put(_apart(diff, taken))
+                leaf.grad = None
+
+
+def _storages(tensors: Sequence[torch.Tensor]) -> set[int]:
+    """Return where tensors lie in main memory. (What views show of a GPU's tensors is a copy.)"""
+    return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.device.type == "cpu"}
+
+
+def _apart(tensor: torch.Tensor, taken: set[int]) -> torch.Tensor:
+    """Return a tensor, or a copy of one that lies where others do."""
+    aliased = tensor.device.type == "cpu" and tensor.untyped_storage().data_ptr() in taken
+    return tensor.clone() if aliased else tensor
+
+
+def _parameters(layer: Layer) -> BlobVec:
+    """Return a layer's learnable blobs, as views of its parameters and of their gradients."""
+    made = BlobVec()
+    for j, shape in enumerate(layer.blob_shapes):
+        count = layer.blobs[j].numel()
+        data = BorrowedMemory(lambda j=j: layer.blobs[j], count)
+        made.append(Blob(shape, data, BorrowedMemory(lambda j=j: _gradient(layer.blobs[j]), count)))
+    return made
+
+
+def _gradient(parameter: torch.Tensor) -> torch.Tensor:
+    """Return where a parameter's gradient is summed up; passes add to it and never replace it."""
+    if parameter.grad is None:
+        parameter.grad = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
+    return parameter.grad

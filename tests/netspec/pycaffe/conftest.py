@@ -1,0 +1,33 @@
+"""How tests of pycaffe make nets: from text, in a folder of their own, which is the working directory."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import netspec.pycaffe as caffe
+from netspec.pycaffe import logs
+
+logs.stop()  # pytest keeps it
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """``write(text, name="net.prototxt")``: the path of a file with that text."""
+    monkeypatch.chdir(tmp_path)
+
+    def write_text(text: str, name: str = "net.prototxt") -> str:
+        Path(name).write_text(text)
+        return name
+
+    return write_text
+
+
+@pytest.fixture
+def net_of(write: Callable[..., str]) -> Callable[..., caffe.Net]:
+    """``net_of(text, phase=caffe.TEST, **options)``: the net of a prototxt's text."""
+
+    def build(text: str, phase: int = caffe.TEST, **options: object) -> caffe.Net:
+        return caffe.Net(write(text), phase, **options)
+
+    return build

@@ -1,0 +1,126 @@
+"""What BVLC Caffe computed, computed again through caffe.Net and the solvers: their passes are not netspec's own."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netspec.pycaffe as caffe
+from golden_cases import EVERY, SAMPLED, LayerCase, assert_same_layers, lay_out_examples, promised, set_parameters
+from netspec.pycaffe import mode
+from paths import GOLDEN
+from pycaffe_cases import compute
+
+LAYERS = sorted((GOLDEN / "layers").iterdir())
+TRAININGS = sorted(folder.name for folder in (GOLDEN / "train").iterdir())
+EXAMPLES = sorted(folder.name for folder in (GOLDEN / "examples" / "runs").iterdir())
+TOLERANCE = 1e-5  # of the largest element
+
+
+@pytest.fixture
+def exact() -> Iterator[Callable[[str], None]]:
+    before = mode.exact()
+    yield mode.set_exact
+    mode.set_exact(before)
+
+
+@pytest.mark.parametrize("folder", LAYERS, ids=lambda path: path.name)
+def test_blobs_hold_what_caffes_held(folder: Path) -> None:
+    case = LayerCase(folder)
+    found = compute(case)
+    assert set(found) == {key for key in case.golden if key.split("/")[0] not in ("in", "param_init", "topdiff")}
+    for key, value in found.items():
+        expected = case.golden[key]
+        assert (value.shape, value.dtype) == (expected.shape, np.float32), key
+        scale = max(float(np.abs(expected).max(initial=0)), 1e-30)
+        worst = float(np.abs(value.astype(np.float64) - expected).max(initial=0)) / scale
+        assert worst <= TOLERANCE, f"{key}: off by {worst:.2e} of the largest element"
+
+
+@pytest.mark.parametrize("folder", LAYERS, ids=lambda path: path.name)
+def test_blobs_hold_caffes_bits(folder: Path, exact: Callable[[str], None], same_blas: bool) -> None:
+    if not same_blas:
+        pytest.skip("another kind of CPU than Caffe's: its BLAS rounds differently")
+    if "all" not in promised(folder):
+        pytest.skip("not even netspec's own passes promise it")
+    exact("all")
+    case = LayerCase(folder)
+    for key, value in compute(case).items():
+        np.testing.assert_array_equal(value, case.golden[key], key)
+
+
+@pytest.mark.parametrize("case", TRAININGS)
+def test_solvers_follow_caffe(
+    case: str, work_in: Callable[..., Path], exact: Callable[[str], None], same_blas: bool
+) -> None:
+    """A loop of step(1), as scripts have it: losses, final weights and test losses."""
+    if not same_blas and case in ("adadelta", "rmsprop"):
+        pytest.skip("decided by ties in max poolings, which fall as the CPU's kernels round")
+    work_in(f"train/{case}")
+    exact("all")
+    golden = np.load(f"{case}/trajectory.npz")
+    solver = caffe.get_solver(f"{case}/solver.prototxt")
+    solver.net.copy_from(f"{case}/init.caffemodel")
+    found = []
+    for _ in golden["loss"]:
+        solver.step(1)
+        found.append(float(solver.net.blobs["loss"].data))
+    solver.test_nets[0].share_with(solver.net)
+    tested = [float(solver.test_nets[0].forward()["loss"]) for _ in golden["test/loss"]]
+    assert solver.iter == len(golden["loss"])
+    if solver.param.iter_size == 1:  # else the file has the mean of several passes
+        np.testing.assert_allclose(found, golden["loss"], rtol=0 if same_blas else 1e-2)
+    np.testing.assert_allclose(tested, golden["test/loss"], rtol=0 if same_blas else 1e-2)
+    if same_blas:
+        for key in golden:
+            if key.startswith("final/"):
+                _, layer, index = key.split("/")
+                np.testing.assert_array_equal(solver.net.params[layer][int(index)].data, golden[key], key)
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return lay_out_examples(tmp_path_factory.mktemp("examples"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", EXAMPLES)
+def test_caffes_examples(
+    run: str,
+    folder: Path,
+    exact: Callable[[str], None],
+    same_blas: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """LeNet, the autoencoder and the Siamese net: outputs, and what was subtracted from the weights first."""
+    monkeypatch.chdir(folder)
+    exact("all")
+    meta = json.loads(Path(f"examples/runs/{run}/meta.json").read_text())
+    golden = np.load(f"examples/runs/{run}/trajectory.npz")
+    solver = caffe.get_solver(f"examples/runs/{run}/solver.prototxt")
+    solver.param.test_initialization = False
+    for name in meta["init"]:
+        set_parameters(solver.net.passes.net, np.load(f"examples/init/{name}.npz"))
+    solver.step(1)
+    updates = {key: sampled(solver, key, "diff") for key in golden.files if key.startswith("update/")}
+    assert_same_layers(updates, golden, 1e-4)
+    if not same_blas:
+        return
+    outputs = [{name: float(solver.net.blobs[name].data) for name in solver.net.outputs}]
+    for _ in range(meta["iterations"] - 1):
+        solver.step(1)
+        outputs.append({name: float(solver.net.blobs[name].data) for name in solver.net.outputs})
+    for key in golden.files:
+        if key.startswith("out/"):
+            np.testing.assert_array_equal(np.float32([out[key[4:]] for out in outputs]), golden[key], key)
+        if key.startswith("final/"):
+            np.testing.assert_array_equal(sampled(solver, key, "data"), golden[key], key)
+
+
+def sampled(solver: caffe.SGDSolver, key: str, what: str) -> np.ndarray:
+    """Return ``data`` or ``diff`` of the parameter KIND/LAYER/INDEX, sampled as the examples' files are."""
+    _, layer, index = key.split("/")
+    values = getattr(solver.net.params[layer][int(index)], what)
+    return values if values.size < SAMPLED else values.reshape(-1)[::EVERY]
