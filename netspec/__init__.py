@@ -31,6 +31,20 @@ _HOMES = {
 __all__ = ["Net", "Solver", "SpecError", "load_net", "load_solver", "load_weights", "save_weights", "use_dialect"]
 
 
+def load_ipython_extension(ipython: object) -> None:
+    """Let ``import caffe`` find netspec in a notebook: ``%load_ext netspec``."""
+    from netspec.scripts import finder
+
+    finder.install()
+
+
+def unload_ipython_extension(ipython: object) -> None:
+    """Undo :func:`load_ipython_extension`."""
+    from netspec.scripts import finder
+
+    finder.uninstall()
+
+
 __path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the names they had before
 
 

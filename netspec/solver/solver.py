@@ -27,7 +27,7 @@ from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
-from netspec.solver.checks import check_settings, check_writable
+from netspec.solver.checks import check_settings, check_writable, fields_without_effect
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
@@ -131,6 +131,8 @@ class Solver:
         node = node or Place(Where("<solver>"))
         log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
         check_settings(param, node)
+        for line in fields_without_effect(param, node):
+            log.warning("solver.cpp:45", line)
         if param.snapshot:
             check_writable(param, node)
         self.param = param

@@ -1,32 +1,21 @@
-"""Dialects for one test: registry and schema are afterwards as they were before."""
+"""How tests of dialects build one layer, and check its gradients."""
 
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 
 import pytest
 import torch
 
 from netspec.dialects import use_dialect
-from netspec.layers import Context, Layer, Random, layer_class, registry
-from netspec.proto.dialect import files as dialect_files
-from netspec.proto.dialect import registry as dialect
+from netspec.layers import Context, Layer, Random, layer_class
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text
 from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 
 @pytest.fixture(autouse=True)
-def _leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    assert dialect.active() == []
+def _leave_no_dialect(leave_no_dialect: None) -> None:
     torch.manual_seed(0)
-    monkeypatch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
-    yield
-    for name in dialect.active():
-        dialect.deactivate(name)
-    own = [file.module for file in dialect_files.known_files().values()]
-    for name in [name for name in sys.modules if name in own or name.startswith("netspec_dialect_")]:
-        del sys.modules[name]
 
 
 @pytest.fixture
