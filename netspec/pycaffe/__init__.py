@@ -26,6 +26,16 @@ from netspec.pycaffe.mode import (
 )
 from netspec.pycaffe.net import Net
 from netspec.pycaffe.net_spec import NetSpec, layers, params, to_proto
+from netspec.pycaffe.parallel import NCCL, Timer, has_nccl
+from netspec.pycaffe.solver import (
+    AdaDeltaSolver,
+    AdaGradSolver,
+    AdamSolver,
+    NesterovSolver,
+    RMSPropSolver,
+    SGDSolver,
+    get_solver,
+)
 
 __version__ = "1.0.0"  # of the Caffe whose interface this is
 

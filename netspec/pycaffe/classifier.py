@@ -50,8 +50,8 @@ class Classifier(Net):
             top, left = (np.array(self.image_dims) / 2.0 - self.crop_dims / 2.0).astype(int)
             images = images[:, top : top + self.crop_dims[0], left : left + self.crop_dims[1], :]
         in_ = self.inputs[0]
-        inputs: dict[str, Any] = {in_: np.stack([self.transformer.preprocess(in_, image) for image in images])}
-        predictions = self.forward_all(**inputs)[self.outputs[0]]
+        blobs: dict[str, Any] = {in_: np.stack([self.transformer.preprocess(in_, image) for image in images])}
+        predictions = self.forward_all(**blobs)[self.outputs[0]]
         if oversample:
             predictions = predictions.reshape((len(predictions) // 10, 10, -1)).mean(1)
         return predictions

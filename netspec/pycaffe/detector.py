@@ -46,8 +46,8 @@ class Detector(Net):
         for name, windows in images_windows:
             image = io.load_image(name).astype(np.float32)
             given += [self.transformer.preprocess(in_, self.crop(image, np.array(window))) for window in windows]
-        inputs: dict[str, Any] = {in_: np.stack(given)}
-        predictions = self.forward_all(**inputs)[self.outputs[0]]
+        blobs: dict[str, Any] = {in_: np.stack(given)}
+        predictions = self.forward_all(**blobs)[self.outputs[0]]
         places = ((name, window) for name, windows in images_windows for window in windows)
         return [
             {"window": window, "prediction": prediction, "filename": name}

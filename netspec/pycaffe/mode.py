@@ -11,7 +11,9 @@ from dataclasses import dataclass, field
 import torch
 
 from netspec import log
+from netspec.exact import CHOICES, SMALL
 from netspec.layers.base import Random
+from netspec.net.options import BuildOptions
 
 
 @dataclass
@@ -21,6 +23,7 @@ class _Mode:
     warned: bool = False
     seed: int | None = None
     nets: int = 0  # made since the seed was set
+    exact: str = SMALL
     multiprocess: bool = False
     solver_count: int = 1
     solver_rank: int = 0
@@ -75,9 +78,34 @@ def follow_seed(random: Random) -> None:
     _mode.draws.add(random)
 
 
+def set_exact(choice: str) -> None:
+    """Say whose sums are Caffe's to the last bit, in nets that are built from now on: "none", "small" or "all".
+
+    Not of Caffe; see netspec/exact/__init__.py.
+    """
+    if choice not in CHOICES:
+        raise ValueError(f"found exact {choice!r}, expected {', '.join(map(repr, CHOICES))}")
+    _mode.exact = choice
+
+
+def exact() -> str:
+    """Return what :func:`set_exact` was told last."""
+    return _mode.exact
+
+
+def build_options() -> BuildOptions:
+    """Return how the next net is built."""
+    return BuildOptions(device(), next_seed(), allow_python=True, exact=_mode.exact, accumulate_in_place=True)
+
+
 def set_multiprocess(value: bool) -> None:
     """Say whether several processes train side by side."""
     _mode.multiprocess = bool(value)
+
+
+def multiprocess() -> bool:
+    """Return whether several processes train side by side."""
+    return _mode.multiprocess and _mode.solver_count > 1
 
 
 def set_solver_count(count: int) -> None:

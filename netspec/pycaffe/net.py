@@ -20,7 +20,6 @@ from netspec.layers.utility.live_blobs import Blob, BlobVec
 from netspec.layers.utility.python import Python
 from netspec.net import net as core
 from netspec.net.build import build_net
-from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights, write_binary, write_hdf5
 from netspec.proto.text import parse_net
 from netspec.pycaffe import mode
@@ -66,8 +65,7 @@ class Net:
                 raise RuntimeError(f"Could not open file {path}")
         with original_errors():
             net, source = parse_net(network_file)
-            options = BuildOptions(mode.device(), mode.next_seed(), allow_python=True, accumulate_in_place=True)
-            self._hold(build_net(with_state(net, int(phase), level or 0, stages or ()), source, options))
+            self._hold(build_net(with_state(net, int(phase), level or 0, stages or ()), source, mode.build_options()))
         if weights is not None:
             self.copy_from(weights)
 
@@ -151,7 +149,7 @@ class Net:
         return {name: self.blobs[name].diff for name in dict.fromkeys(wanted)}
 
     def _forward(self, start: int, end: int) -> float:
-        return self.passes.forward(start, end)
+        return self.passes.forward(start, end).item()
 
     def _backward(self, start: int, end: int) -> None:
         self.passes.backward(start, end)

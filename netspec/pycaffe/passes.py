@@ -101,8 +101,8 @@ class Passes:
     # Running
 
     @torch.no_grad()
-    def forward(self, start: int, end: int) -> float:
-        """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses."""
+    def forward(self, start: int, end: int) -> torch.Tensor:
+        """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses, a scalar."""
         self._upload()
         loss: torch.Tensor | None = None
         for i in range(start, end + 1):
@@ -113,7 +113,7 @@ class Passes:
                     term = self.net.weighted_sum(top.data_memory.tensor(top.shape), weight)
                     loss = term if loss is None else loss + term
             self._call_hooks("after_forward", i)
-        return 0.0 if loss is None else loss.item()
+        return torch.zeros((), device=self.net.device) if loss is None else loss
 
     @torch.no_grad()
     def backward(self, start: int, end: int) -> None:

@@ -105,8 +105,9 @@ class Solver:
     """A training: the net it trains, the nets it tests, and where it stands.
 
     ``iteration`` counts the updates done; ``net`` is the training net, ``test_nets`` the others; ``scores`` has, for
-    each test net, the mean of every output element of its last test. ``on_iteration()`` is called after each update,
-    ``on_test(i)`` after test net i was run, ``on_snapshot(model)`` after weights and state were written, with the path
+    each test net, the mean of every output element of its last test. ``on_start()`` is called before each iteration's
+    passes, ``on_gradients()`` between them and the update, ``on_iteration()`` after it; ``on_test(i)`` after test net i
+    was run, ``on_snapshot(model)`` after weights and state were written, with the path
     of the weights.
     """
 
@@ -119,12 +120,14 @@ class Solver:
         others: Sequence[torch.device] = (),
         allow_python: bool = False,
         exact: str = SMALL,
+        seed: int | None = None,
         action: Callable[[], str | None] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Build the nets of a solver as ``proto.text.parse_solver`` returns it; raise SpecError for what is wrong.
 
-        ``device`` overrides solver_mode and device_id; on ``others`` run replicas of the training net. ``action`` is
+        ``device`` overrides solver_mode and device_id; on ``others`` run replicas of the training net. ``seed`` stands
+        in for a random_seed that is not given; without it one is drawn. ``action`` is
         asked between iterations, also those of a test: "stop" ends the training, "snapshot" takes one. ``clock`` gives
         the seconds behind "iter/s".
         """
@@ -139,6 +142,8 @@ class Solver:
         self.node = node
         self.action = action or (lambda: None)
         self.clock = clock
+        self.on_start: Callable[[], object] = lambda: None
+        self.on_gradients: Callable[[], object] = lambda: None
         self.on_iteration: Callable[[], object] = lambda: None
         self.on_test: Callable[[int], object] = lambda i: None
         self.on_snapshot: Callable[[str], object] = lambda model: None
@@ -152,7 +157,7 @@ class Solver:
         self._device = device or choose_device(param, node)
         self._allow_python = allow_python
         self._exact = exact
-        drawn = int.from_bytes(os.urandom(4), "little")
+        drawn = int.from_bytes(os.urandom(4), "little") if seed is None else seed
         self._seed = param.random_seed if param.random_seed >= 0 else drawn
 
         train, *tests = nets.solver_nets(param, node)
@@ -217,7 +222,7 @@ class Solver:
             return
         if self._is_due(self.param.display):
             with torch.no_grad():
-                self._losses.append(self.net.forward_loss()[0].item())
+                self._losses.append(self.test_pass(self.net)[0].item())
             log.info("solver.cpp:327", f"Iteration {self.iteration}, loss = {log.number(self.loss)}")
         if self._is_due(self.param.test_interval):
             self.test_all()
@@ -234,12 +239,13 @@ class Solver:
                 self.test_all()
                 if self.stopped:
                     return
+            self.on_start()
             loss, outputs = self._forward_backward()
             self._losses.append(loss)
             if self._is_due(self.param.display):
                 self._display(outputs)
-            self._apply_update()
-            self.iteration += 1
+            self.on_gradients()
+            self.apply_update()
             self.on_iteration()
             request = self.action()
             if self._is_due(self.param.snapshot) or request == "snapshot":
@@ -253,27 +259,40 @@ class Solver:
 
     def _forward_backward(self) -> tuple[float, dict[str, torch.Tensor]]:
         """Sum the gradients of iter_size passes; return the mean of their losses, and the outputs of the last."""
-        for learnable in self.net.learnable:
-            learnable.parameter.grad = None
+        self.clear_gradients()
         self._replicas.clear()
         total = np.float32(0)
         outputs: dict[str, torch.Tensor] = {}
         for _ in range(self.param.iter_size):
             with self._debugged(self.net, self._is_due(self.param.display)):
-                loss, outputs = self.net.forward_loss()
-                if loss.requires_grad:
-                    loss.backward()
+                loss, outputs = self.train_pass()
             self._replicas.backward()
             total += np.float32(loss.item())
         self._replicas.reduce()
         return float(total / np.float32(self.param.iter_size)), outputs
 
+    def clear_gradients(self) -> None:
+        """Begin the sum of an iteration's gradients anew."""
+        for learnable in self.net.learnable:
+            learnable.parameter.grad = None
+
+    def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Run the training net forward and backward; return its loss and outputs."""
+        loss, outputs = self.net.forward_loss()
+        if loss.requires_grad:
+            loss.backward()
+        return loss, outputs
+
+    def test_pass(self, net: Net) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Run a net forward; return its loss and outputs."""
+        return net.forward_loss()
+
     def _debugged(self, net: Net, wanted: bool = True) -> AbstractContextManager[None]:
         return debug_info(net) if wanted and self.param.debug_info else nullcontext()
 
     @torch.no_grad()
-    def _apply_update(self) -> None:
-        """Move the weights; the gradients then hold what was subtracted, as in Caffe."""
+    def apply_update(self) -> None:
+        """Move the weights and count the iteration; the gradients then hold what was subtracted, as in Caffe."""
         rate = self._advance_rate()
         if self._is_due(self.param.display):
             log.info("sgd_solver.cpp:112", f"Iteration {self.iteration}, lr = {log.number(rate)}")
@@ -296,6 +315,7 @@ class Solver:
         self._rule.compute(self.param, diffs, rates, self.history, self.iteration)
         update.subtract(weights, diffs)
         self._replicas.update()
+        self.iteration += 1
 
     def _advance_rate(self) -> float:
         step = next_step(self.param, self.iteration, self.current_step)
@@ -338,7 +358,7 @@ class Solver:
                 log.info("solver.cpp:396", "Test interrupted.")
                 return
             with self._debugged(net):
-                loss, outputs = net.forward_loss()
+                loss, outputs = self.test_pass(net)
             total += loss.item()
             for name, blob in outputs.items():
                 scores = blob.reshape(-1).tolist()

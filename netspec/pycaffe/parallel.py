@@ -1,0 +1,81 @@
+"""Several processes that train side by side, as Caffe's python/train.py starts them; and a stopwatch.
+
+Caffe's NCCL class averages the gradients of all solvers; here torch.distributed does, on GPUs through the NCCL library.
+
+Caffe: src/caffe/parallel.cpp, python/caffe/_caffe.cpp
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import uuid
+from pathlib import Path
+
+import torch
+from torch import distributed
+
+from netspec.pycaffe import mode
+from netspec.pycaffe.solver import Solver
+
+
+def has_nccl() -> bool:
+    """Return whether several processes can train side by side."""
+    return distributed.is_available()
+
+
+class NCCL:
+    """Joins the solvers of ``solver_count()`` processes that were given the same ``uid``.
+
+    Every process makes its own, having set its ``set_solver_rank``; the constructor waits for the others.
+    """
+
+    def __init__(self, solver: Solver, uid: str) -> None:
+        self._learnable = solver._training.net.learnable
+        self._count = mode.solver_count()
+        if self._count > 1 and not distributed.is_initialized():
+            backend = "nccl" if mode.device().type == "cuda" else "gloo"
+            place = f"file://{Path(tempfile.gettempdir(), uid)}"
+            distributed.init_process_group(backend, place, world_size=self._count, rank=mode.solver_rank())
+
+    @staticmethod
+    def new_uid() -> str:
+        """Return a name for a group of processes."""
+        return f"netspec-{uuid.uuid4().hex}"
+
+    @torch.no_grad()
+    def bcast(self) -> None:
+        """Give every process the root's weights."""
+        for item in self._learnable:
+            if self._count > 1:
+                distributed.broadcast(item.parameter.detach(), 0)
+
+    def on_start(self) -> None:
+        """Do nothing: the weights are alike."""
+
+    @torch.no_grad()
+    def on_gradients_ready(self) -> None:
+        """Replace each gradient by the mean of all processes' gradients."""
+        for item in self._learnable:
+            if self._count > 1 and item.parameter.grad is not None:
+                distributed.all_reduce(item.parameter.grad)
+                item.parameter.grad /= self._count
+
+    def __call__(self, layer: int) -> None:
+        """Do nothing after a layer's backward: all gradients are averaged at once (layer_wise_reduce only hurries)."""
+
+
+class Timer:
+    """A stopwatch: ``start``, ``stop``, and ``ms``, the milliseconds between."""
+
+    def __init__(self) -> None:
+        self._began = 0.0
+        self.ms = 0.0
+
+    def start(self) -> None:
+        """Begin."""
+        self._began = time.perf_counter()
+
+    def stop(self) -> None:
+        """End."""
+        self.ms = (time.perf_counter() - self._began) * 1e3

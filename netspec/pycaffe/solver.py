@@ -1,0 +1,197 @@
+"""``caffe.SGDSolver`` and the others.
+
+Caffe: python/caffe/_caffe.cpp, src/caffe/solver.cpp
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+
+from netspec import log
+from netspec.net import net as core
+from netspec.proto.text import parse_solver
+from netspec.pycaffe import mode
+from netspec.pycaffe.errors import original_errors
+from netspec.pycaffe.net import Net
+from netspec.solver import solver as core_solver
+from netspec.solver.update import find_rule
+
+Outputs = dict[str, torch.Tensor]
+
+
+class _Training(core_solver.Solver):
+    """A training whose passes go through the memory of the nets' blobs."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
+
+    def _build(self, described: Any, offset: int, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
+        if offset == 0 and mode.multiprocess():
+            rank, ranks = mode.solver_rank(), mode.solver_count()
+        return super()._build(described, offset, device, rank, ranks)
+
+    def clear_gradients(self) -> None:
+        """Zero the gradients where they are: views of them stay valid."""
+        self.shown[self.net].clear_param_diffs()
+
+    def train_pass(self) -> tuple[torch.Tensor, Outputs]:
+        """Run the training net forward and backward; return its loss and outputs."""
+        loss, outputs = self.test_pass(self.net)
+        self.shown[self.net].passes.backward(len(self.net.layers) - 1, 0)
+        return loss, outputs
+
+    def test_pass(self, net: core.Net) -> tuple[torch.Tensor, Outputs]:
+        """Run a net forward; return its loss and outputs."""
+        shown = self.shown[net]
+        loss = shown.passes.forward(0, len(net.layers) - 1)
+        blobs = {name: shown.blobs[name] for name in shown.outputs}
+        return loss, {name: blob.data_memory.tensor(blob.shape) for name, blob in blobs.items()}
+
+    def test_all(self) -> None:
+        """Test, in the root's process."""
+        if mode.root_solver():
+            super().test_all()
+
+    def snapshot(self) -> tuple[str, str]:
+        """Take a snapshot, in the root's process."""
+        return super().snapshot() if mode.root_solver() else ("", "")
+
+
+class Solver:
+    """A training, from a solver's prototxt: ``get_solver(file)``, or ``SGDSolver(file)`` whatever type the file has.
+
+    ``net`` and ``test_nets`` are live: their blobs hold what the last iteration left in them, their parameters' diffs
+    what it subtracted. Raises SpecError (a ValueError) for every fault of the files.
+    """
+
+    type_name: ClassVar[str] = ""
+
+    def __init__(self, solver_file: str | Path) -> None:
+        param, node = parse_solver(solver_file)
+        if self.type_name:
+            param.type = self.type_name
+        with original_errors():
+            self._training = _Training(
+                param, node, device=mode.device(), allow_python=True, exact=mode.exact(), seed=mode.next_seed()
+            )
+        self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
+        self._training.on_start = lambda: self._call(0)
+        self._training.on_gradients = lambda: self._call(1)
+
+    @property
+    def net(self) -> Net:
+        """The training net."""
+        return self._training.shown[self._training.net]
+
+    @property
+    def test_nets(self) -> list[Net]:
+        """The test nets; they share the training net's weights from the first test on."""
+        return [self._training.shown[net] for net in self._training.test_nets]
+
+    @property
+    def iter(self) -> int:
+        """How many updates were done."""
+        return self._training.iteration
+
+    @property
+    def param(self) -> Any:
+        """The settings, a SolverParameter; what is changed there holds from the next iteration on."""
+        return self._training.param
+
+    @property
+    def lr(self) -> float:
+        """The learning rate of the iteration to come."""
+        return self._training.learning_rate
+
+    def solve(self, resume_file: str | Path | None = None) -> None:
+        """Train up to max_iter, from a .solverstate on where one is given."""
+        if resume_file:
+            log.info("solver.cpp:296", f"Restoring previous solver status from {resume_file}")
+            self.restore(resume_file)
+        self._training.solve()
+
+    def step(self, iterations: int) -> None:
+        """Train for some iterations."""
+        self._training.step(int(iterations))
+
+    def restore(self, state_file: str | Path) -> None:
+        """Go on from a .solverstate, and from its weights."""
+        self._training.restore(state_file)
+
+    def snapshot(self) -> None:
+        """Write the weights and the state, as snapshot_prefix says."""
+        self._training.snapshot()
+
+    def share_weights(self, net: Net) -> None:
+        """Let a net use the training net's weights."""
+        net.share_with(self.net)
+
+    def apply_update(self) -> None:
+        """Move the weights by the gradients that are there, and count an iteration."""
+        self._training.apply_update()
+
+    def add_callback(self, on_start: Any, on_gradients_ready: Callable[[], object] | None = None) -> None:
+        """Call two functions at each iteration: before its passes, and between them and the update.
+
+        An object that has ``on_start`` and ``on_gradients_ready`` may stand for both, as a :class:`NCCL` does.
+        """
+        whole = on_gradients_ready is None
+        self._callbacks.append(
+            (on_start.on_start, on_start.on_gradients_ready) if whole else (on_start, on_gradients_ready)
+        )
+
+    def _call(self, which: int) -> None:
+        for pair in self._callbacks:
+            pair[which]()
+
+
+class SGDSolver(Solver):
+    """Stochastic gradient descent with momentum."""
+
+    type_name = "SGD"
+
+
+class NesterovSolver(Solver):
+    """Nesterov's accelerated gradient."""
+
+    type_name = "Nesterov"
+
+
+class AdaGradSolver(Solver):
+    """AdaGrad."""
+
+    type_name = "AdaGrad"
+
+
+class RMSPropSolver(Solver):
+    """RMSProp."""
+
+    type_name = "RMSProp"
+
+
+class AdaDeltaSolver(Solver):
+    """AdaDelta."""
+
+    type_name = "AdaDelta"
+
+
+class AdamSolver(Solver):
+    """Adam."""
+
+    type_name = "Adam"
+
+
+_SOLVERS = (SGDSolver, NesterovSolver, AdaGradSolver, RMSPropSolver, AdaDeltaSolver, AdamSolver)
+
+
+def get_solver(solver_file: str | Path) -> Solver:
+    """Return the solver of the type that the file has."""
+    param, node = parse_solver(solver_file)
+    find_rule(param, node)
+    named = {cls.type_name.lower(): cls for cls in _SOLVERS}
+    return named[param.type.lower()](solver_file)

@@ -1,0 +1,141 @@
+"""The module itself: layer types, modes, seeds, the log, several processes (Caffe: test_layer_type_list, test_nccl)."""
+
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netspec.pycaffe as caffe
+from paths import ROOT
+from pycaffe_nets import SMALL
+
+
+def test_layer_types() -> None:
+    types = caffe.layer_type_list()
+    for name in ("Data", "Convolution", "InnerProduct", "Python", "SoftmaxWithLoss"):
+        assert name in types
+
+
+@pytest.mark.parametrize("name", ["_caffe", "pycaffe"])
+def test_submodules_have_the_same_names(name: str) -> None:
+    module = importlib.import_module(f"netspec.pycaffe.{name}")
+    assert module.Net is caffe.Net
+    assert module.SGDSolver is caffe.SGDSolver
+
+
+def test_a_group_of_processes_has_a_name_of_its_own() -> None:
+    if caffe.has_nccl():
+        assert caffe.NCCL.new_uid() != caffe.NCCL.new_uid()
+
+
+def test_timer() -> None:
+    timer = caffe.Timer()
+    timer.start()
+    timer.stop()
+    assert 0 <= timer.ms < 1000
+
+
+def test_a_seed_makes_nets_alike(net_of: Callable[..., caffe.Net], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(caffe.mode._mode, "seed", None)
+    nets = []
+    for _ in range(2):
+        caffe.set_random_seed(5)
+        nets.append([net_of(SMALL), net_of(SMALL)])
+    weights = [[net.params["filters"][0].data for net in row] for row in nets]
+    assert np.array_equal(weights[0][0], weights[1][0])
+    assert np.array_equal(weights[0][1], weights[1][1])
+    assert not np.array_equal(weights[0][0], weights[0][1])
+    caffe.set_random_seed(6)
+    nets[0][0].forward()
+    first = nets[0][0].blobs["data"].data.copy()
+    caffe.set_random_seed(6)
+    nets[0][0].forward()
+    assert np.array_equal(first, nets[0][0].blobs["data"].data)
+
+
+def test_no_gpu_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(caffe.mode._mode, "warned", False)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    caffe.set_mode_gpu()
+    caffe.set_device(0)
+    caffe.set_mode_gpu()
+    assert [record.getMessage() for record in caplog.records] == [
+        "set_mode_gpu: torch finds no GPU here: nets run on the CPU"
+    ]
+    assert caffe.mode.device().type == "cpu"
+    caffe.set_mode_cpu()
+
+
+def script(code: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    path = {"PYTHONPATH": str(ROOT), **environment}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **path},
+    )
+
+
+def test_the_log_is_glogs(write: Callable[..., str], tmp_path: Path) -> None:
+    write(SMALL)
+    code = "import netspec.pycaffe as caffe; caffe.log('hello'); caffe.Net('net.prototxt', caffe.TEST)"
+    loud = script(code, tmp_path)
+    assert loud.returncode == 0, loud.stderr
+    lines = loud.stderr.splitlines()
+    assert lines[0].split(maxsplit=3)[3].partition("] ")[2] == "hello"
+    assert lines[0][0] == "I"
+    assert any("Setting up filters" in line for line in lines)
+    assert loud.stdout == ""
+    quiet = script(code, tmp_path, GLOG_minloglevel="2")
+    assert quiet.stderr == ""
+    later = script(f"import os; os.environ['GLOG_minloglevel'] = '3'; {code}", tmp_path)
+    assert later.stderr == ""
+    assert script(f"{code}; caffe.init_log(2); caffe.log('not this')", tmp_path).stderr.count("not this") == 0
+
+
+TWO = """
+import sys
+import netspec.pycaffe as caffe
+rank, uid = int(sys.argv[1]), sys.argv[2]
+caffe.set_solver_count(2)
+caffe.set_solver_rank(rank)
+caffe.set_multiprocess(True)
+caffe.set_random_seed(rank)
+assert (caffe.solver_count(), caffe.solver_rank()) == (2, rank)
+solver = caffe.SGDSolver("solver.prototxt")
+nccl = caffe.NCCL(solver, uid)
+nccl.bcast()
+solver.add_callback(nccl)
+solver.step(2)
+print(repr(solver.net.params["fc"][0].data.tolist()))
+"""
+
+
+def test_two_processes_train_one_net(write: Callable[..., str], tmp_path: Path) -> None:
+    write("""
+    layer { name: "data" type: "DummyData" top: "data" top: "wanted" dummy_data_param {
+      shape { dim: 4 dim: 3 } shape { dim: 4 dim: 1 } data_filler { type: "gaussian" std: 1 } } }
+    layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
+      inner_product_param { num_output: 1 weight_filler { type: "gaussian" std: 1 } } }
+    layer { name: "loss" type: "EuclideanLoss" bottom: "fc" bottom: "wanted" top: "loss" }
+    """)
+    write('net: "net.prototxt" base_lr: 0.1 lr_policy: "fixed"', "solver.prototxt")
+    uid = caffe.NCCL.new_uid()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "GLOG_minloglevel": "2"}
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-c", TWO, str(rank), uid],
+            cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )
+        for rank in (0, 1)
+    ]  # fmt: skip
+    outputs = [process.communicate(timeout=120) for process in running]
+    assert [process.returncode for process in running] == [0, 0], outputs
+    assert outputs[0][0] == outputs[1][0] != ""

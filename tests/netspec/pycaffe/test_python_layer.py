@@ -1,0 +1,250 @@
+"""Python layers in caffe.Net: what Caffe's test_python_layer.py and test_python_layer_with_param_str.py check."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netspec.pycaffe as caffe
+
+CODE = '''
+import caffe
+import numpy as np
+
+
+class Tenfold(caffe.Layer):
+    def setup(self, bottom, top):
+        pass
+
+    def reshape(self, bottom, top):
+        top[0].reshape(*bottom[0].data.shape)
+
+    def forward(self, bottom, top):
+        top[0].data[...] = 10 * bottom[0].data
+
+    def backward(self, top, propagate_down, bottom):
+        bottom[0].diff[...] = 10 * top[0].diff
+
+
+class Scaled(Tenfold):
+    def setup(self, bottom, top):
+        self.factor = float(self.param_str)
+
+    def forward(self, bottom, top):
+        top[0].data[...] = self.factor * bottom[0].data
+
+    def backward(self, top, propagate_down, bottom):
+        bottom[0].diff[...] = self.factor * top[0].diff
+
+
+class Broken(caffe.Layer):
+    def setup(self, bottom, top):
+        raise RuntimeError("setup of a broken layer")
+
+
+class Breaks(Tenfold):
+    def forward(self, bottom, top):
+        raise ZeroDivisionError("forward of a broken layer")
+
+
+class Learned(caffe.Layer):
+    def setup(self, bottom, top):
+        self.blobs.add_blob(1)
+        self.blobs[0].data[0] = 0
+
+    def reshape(self, bottom, top):
+        top[0].reshape(1)
+
+    def forward(self, bottom, top):
+        top[0].data[0] = self.blobs[0].data[0]
+
+    def backward(self, top, propagate_down, bottom):
+        self.blobs[0].diff[0] = 1
+
+
+class Phase(caffe.Layer):
+    def setup(self, bottom, top):
+        pass
+
+    def reshape(self, bottom, top):
+        top[0].reshape()
+
+    def forward(self, bottom, top):
+        top[0].data[()] = self.phase
+
+
+class Rows(caffe.Layer):
+    """A data layer as Fast R-CNN has it: the script hands it its records."""
+
+    def setup(self, bottom, top):
+        self.kept = top
+        top[0].reshape(1, 2)
+        top[1].reshape(1)
+        top[1].data[...] = 7
+
+    def set_rows(self, rows):
+        self.rows, self.next = rows, 0
+
+    def reshape(self, bottom, top):
+        pass
+
+    def forward(self, bottom, top):
+        row = self.rows[self.next]
+        self.next = (self.next + 1) % len(self.rows)
+        top[0].reshape(1, len(row))
+        top[0].data[...] = row
+
+    def backward(self, top, propagate_down, bottom):
+        pass
+'''
+
+
+def layer(kind: str, name: str, bottom: str, more: str = "") -> str:
+    bottoms = f'bottom: "{bottom}"' if bottom else ""
+    return (
+        f'layer {{ type: "Python" name: "{name}" {bottoms} top: "{name}" '
+        f'python_param {{ module: "mine" layer: "{kind}" {more} }} }}\n'
+    )
+
+
+@pytest.fixture
+def python_net(
+    net_of: Callable[..., caffe.Net], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., caffe.Net]:
+    """``python_net(text, phase)``: its module is found on sys.path, not in the working directory."""
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "mine.py").write_text(CODE)
+    monkeypatch.syspath_prepend(tmp_path / "modules")
+    monkeypatch.delitem(__import__("sys").modules, "mine", raising=False)
+    return net_of
+
+
+THREE = (
+    'force_backward: true input: "data" input_shape { dim: 10 dim: 9 dim: 8 }\n'
+    + layer("Tenfold", "one", "data")
+    + layer("Tenfold", "two", "one")
+    + layer("Tenfold", "three", "two")
+)
+
+
+def test_forward(python_net: Callable[..., caffe.Net]) -> None:
+    net = python_net(THREE, caffe.TRAIN)
+    net.blobs["data"].data[...] = 8
+    net.forward()
+    assert (net.blobs["three"].data == 8000).all()
+
+
+def test_backward_needs_no_forward(python_net: Callable[..., caffe.Net]) -> None:
+    net = python_net(THREE, caffe.TRAIN)
+    net.blobs["three"].diff[...] = 7
+    net.backward()
+    assert (net.blobs["data"].diff == 7000).all()
+
+
+def test_reshape(python_net: Callable[..., caffe.Net]) -> None:
+    net = python_net(THREE, caffe.TRAIN)
+    net.blobs["data"].reshape(4, 4, 4, 4)
+    net.forward()
+    assert {blob.data.shape for blob in net.blobs.values()} == {(4, 4, 4, 4)}
+    net.blobs["data"].reshape(2, 3)
+    net.reshape()
+    assert {blob.data.shape for blob in net.blobs.values()} == {(2, 3)}
+
+
+def test_exceptions_are_the_codes_own(python_net: Callable[..., caffe.Net]) -> None:
+    with pytest.raises(RuntimeError, match="setup of a broken layer"):
+        python_net(layer("Broken", "broken", ""))
+    net = python_net('input: "data" input_shape { dim: 1 }' + layer("Breaks", "breaks", "data"))
+    with pytest.raises(ZeroDivisionError, match="forward of a broken layer"):
+        net.forward()
+
+
+def test_learnable_blobs(python_net: Callable[..., caffe.Net]) -> None:
+    text = "force_backward: true\n" + layer("Learned", "layer", "")
+    net = python_net(text, caffe.TRAIN)
+    net.forward()
+    net.backward()
+    code = net.layers[list(net._layer_names).index("layer")]
+    assert code.type == "Python"
+    assert code.blobs[0].data[0] == 0
+    assert code.blobs[0].diff[0] == 1
+    code.blobs[0].data[0] += code.blobs[0].diff[0]
+    assert code.blobs[0].data[0] == 1
+    net.save("learned.caffemodel")
+    code.blobs[0].data[0] = -1
+    assert net.forward()["layer"] == [-1]
+    net.copy_from("learned.caffemodel")
+    assert code.blobs[0].data[0] == 1
+    other = caffe.Net("net.prototxt", caffe.TRAIN)
+    other.share_with(net)
+    theirs = other.layers[list(other._layer_names).index("layer")]
+    assert theirs.blobs[0].data[0] == 1
+    code.blobs[0].data[0] = 5
+    assert theirs.blobs[0].data[0] == 5
+    assert other.forward()["layer"] == [5]
+
+
+def test_phase(python_net: Callable[..., caffe.Net]) -> None:
+    for phase in (caffe.TRAIN, caffe.TEST):
+        assert python_net(layer("Phase", "phase", ""), phase).forward()["phase"] == phase
+
+
+def test_param_str(python_net: Callable[..., caffe.Net]) -> None:
+    text = 'force_backward: true input: "data" input_shape { dim: 10 dim: 9 dim: 8 }\n'
+    text += layer("Scaled", "ten", "data", 'param_str: "10"') + layer("Scaled", "two", "ten", 'param_str: "2"')
+    net = python_net(text, caffe.TRAIN)
+    net.blobs["data"].data[...] = 8
+    net.forward()
+    assert (net.blobs["two"].data == 160).all()
+    net.blobs["two"].diff[...] = 7
+    net.backward()
+    assert (net.blobs["data"].diff == 140).all()
+
+
+def test_the_script_reaches_the_layers_own_object(python_net: Callable[..., caffe.Net]) -> None:
+    text = 'layer { type: "Python" name: "rows" top: "row" top: "label" python_param { module: "mine" layer: "Rows" } }'
+    net = python_net(text)
+    assert net.blobs["label"].data == [7]  # written in setup
+    net.layers[0].set_rows([[1, 2], [3, 4, 5]])
+    assert net.forward()["row"].tolist() == [[1, 2]]
+    assert net.forward()["row"].tolist() == [[3, 4, 5]]
+    assert net.layers[0].kept[0] is net.blobs["row"]
+
+
+def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net], tmp_path: Path) -> None:
+    (tmp_path / "modules" / "loss_of_mine.py").write_text(
+        "import caffe\n"
+        "class Squares(caffe.Layer):\n"
+        "    def setup(self, bottom, top): top[0].reshape(1)\n"
+        "    def reshape(self, bottom, top): self.apart = None\n"
+        "    def forward(self, bottom, top):\n"
+        "        self.apart = bottom[0].data - bottom[1].data\n"
+        "        top[0].data[...] = (self.apart ** 2).sum() / bottom[0].num / 2.\n"
+        "    def backward(self, top, propagate_down, bottom):\n"
+        "        for i, sign in enumerate((1, -1)):\n"
+        "            if propagate_down[i]:\n"
+        "                bottom[i].diff[...] = sign * self.apart / bottom[i].num\n"
+    )
+    head = """
+    input: "data" input_shape { dim: 6 dim: 5 } input: "wanted" input_shape { dim: 6 dim: 3 }
+    layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
+      inner_product_param { num_output: 3 weight_filler { type: "gaussian" std: 1 } } }
+    """
+    own = head + (
+        'layer { name: "loss" type: "Python" bottom: "fc" bottom: "wanted" top: "loss" loss_weight: 1 '
+        'python_param { module: "loss_of_mine" layer: "Squares" } }'
+    )
+    caffes = head + 'layer { name: "loss" type: "EuclideanLoss" bottom: "fc" bottom: "wanted" top: "loss" }'
+    nets = [python_net(text, caffe.TRAIN) for text in (own, caffes)]
+    nets[1].share_with(nets[0])
+    random = np.random.default_rng(0)
+    arrays = {"data": random.random((6, 5)), "wanted": random.random((6, 3))}
+    losses = [net.forward(**arrays)["loss"].reshape(()) for net in nets]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-6)
+    for net in nets:
+        net.backward()
+    mine, theirs = (net.params["fc"][0].diff for net in nets)
+    np.testing.assert_allclose(mine, theirs, rtol=1e-5)
+    assert mine.any()
+    assert not nets[0].blobs["wanted"].diff.any()
