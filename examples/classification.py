@@ -1,4 +1,4 @@
-"""Classification of image files: Transformer, mean and oversampling, on drawn shapes that the net is trained on first."""
+"""Image files are classified by Transformer, mean and oversampling: drawn shapes that a net is trained on first."""
 
 import os
 import sys

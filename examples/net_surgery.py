@@ -1,4 +1,4 @@
-"""Net surgery: a classifier of small images becomes a detector on large ones, by its InnerProduct made a Convolution."""
+"""Net surgery: a classifier of small images looks at each place of a large one; InnerProduct becomes Convolution."""
 
 import os
 import sys

@@ -25,10 +25,11 @@ from typing import IO, Any
 from loopclosure.report.table_one import read_runs, text_table, write_report
 from netspec.errors import SpecError, Where
 from netspec.graph.filter import filter_net, with_state
+from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, read_solver
 from netspec.scores import Score, read_scores
 
-PHASES = {"train": 0, "validation": 1}
+PHASES = {"train": TRAIN, "validation": TEST}
 PROGRESS = ("Iteration ", "    Test net output", "Snapshotting to", "Optimization Done")  # lines of the log to show
 Say = Callable[[str], None]
 

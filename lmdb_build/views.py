@@ -19,7 +19,7 @@ from lmdb_build.pairs.list_file import write_pair_list
 from lmdb_build.pairs.runs import Indices, Runs
 from lmdb_build.picture import CORNERS, seen_through, write_jpeg
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_image
+from loopclosure.places.frames import read_bgr
 from loopclosure.progress import Progress, silent
 
 # What changes between two views, drawn anew for each.
@@ -169,7 +169,7 @@ def write_views(
         mirrored, about = rng.random() < 0.5, rng.uniform(0, 1, 2)
         names = [f"{folder.name}/{number:06d}_{side}.jpg" for side in "ab"]
         for image, name in zip(pair, names, strict=True):
-            picture = read_image(root / runs.names[image])
+            picture = read_bgr(root / runs.names[image])
             view = cut_view(picture[:, ::-1] if mirrored else picture, size, about, rng)
             write_jpeg(folder.parent / name, view)
         listed.append((*names, int(same[number])))

@@ -1,4 +1,4 @@
-"""The judge: knows places and no networks. What is the same place, which descriptors tell it, and how well.
+"""Loop closure: which images show the same place, and how well a method finds them. It uses no networks.
 
 ``LoopDetector`` is loaded when it is first used, so that reading a trajectory loads nothing else.
 """
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["LoopDetector", "LoopResult"]
 
 
-__path__.append(f"{__path__[0]}/moved")  # loopclosure.baselines, by the name it had before
+__path__.append(f"{__path__[0]}/moved")  # loopclosure.baselines, a former name
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The one kind of error of this wing, printed the way compilers print theirs."""
+"""The error that this package raises for a fault of the user, printed as compilers print theirs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import os
 class InputError(ValueError):
     """A fault of a user's file or choice: what was found, what was expected, what to do, and where.
 
-    ``str(error)`` is one line: ``file:line:column: message``; ``file: message`` where no line is known (line 0); the
-    message alone where no file is to blame.
+    ``str(error)`` is one line: ``file:line:column: message``; ``file: message`` if no line is known (line 0); the
+    message alone if the fault is not in a file.
     """
 
     def __init__(self, message: str, file: str | os.PathLike[str] = "", line: int = 0, column: int = 0) -> None:

@@ -1,17 +1,18 @@
-"""Any set of methods on one data set: scores, figures in both conventions, times."""
+"""Any set of methods on one data set: scores, measures by both conventions, times."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Method, Setting, make_method
+from loopclosure.methods.base import Images, Method, MethodContext, make_method
 from loopclosure.places.datasets import DataSet
-from loopclosure.precision_recall import BestMatches, PrecisionRecall, all_pairs, best_match, best_matches, recall_at_k
+from loopclosure.precision_recall import BestMatches, JudgedScores, PrecisionRecall
 from loopclosure.progress import Progress, silent
 
 RECALL_AT = (1, 5, 10)
@@ -19,14 +20,14 @@ RECALL_AT = (1, 5, 10)
 
 @dataclass(frozen=True)
 class Outcome:
-    """One method, judged.
+    """One method on one data set: what it answered, and how good that is.
 
     scores     (Q, R), as the method gave them
-    pairs      the curve over all pairs;  best  that of the best match of each query
+    pairs      the curve over all pairs;  best  the curve of the best match of each query
     matches    the best match of each query
     recall_at  k -> share of the queries with a loop that have one among their best k
-    seconds    stage -> seconds in all
-    once       the stages done once, on training images
+    seconds    stage -> total seconds
+    training_stages  the stages done once, on training images
     """
 
     name: str
@@ -36,36 +37,50 @@ class Outcome:
     matches: BestMatches
     recall_at: dict[int, float]
     seconds: dict[str, float]
-    once: tuple[str, ...]
+    training_stages: tuple[str, ...]
     notes: list[str]
 
     @property
     def seconds_on_frames(self) -> float:
-        """Return the seconds in all that grew with the frames, training left out."""
-        return sum(seconds for stage, seconds in self.seconds.items() if stage not in self.once)
+        """Return the total seconds spent on the frames, without training."""
+        return sum(seconds for stage, seconds in self.seconds.items() if stage not in self.training_stages)
+
+    @cached_property
+    def measures(self) -> dict[str, dict[str, float]]:
+        """How good the method is, by convention: convention -> name of the measure -> value in 0..1."""
+        table = {
+            curve.convention: {
+                "average precision": curve.average_precision,
+                "recall at 100 % precision": curve.recall_at_full_precision,
+                "best F1": curve.best_f1,
+            }
+            for curve in (self.pairs, self.best)
+        }
+        table[self.best.convention].update({f"recall at {k}": value for k, value in self.recall_at.items()})
+        return table
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All methods on one data set; ``train`` says on which images vocabularies and the like were made."""
+    """All methods on one data set; ``train`` says which images vocabularies and the like were learned from."""
 
     data: DataSet
     outcomes: list[Outcome]
     train: str = "no training images"
 
     @property
-    def images(self) -> int:
+    def image_count(self) -> int:
         """Return the number of images a method has to describe."""
         return len(self.data.query_images) + len(self.data.reference_images or [])
 
 
-def named_method(text: str, setting: Setting) -> tuple[str, Method]:
-    """Build a method from ``LABEL=METHOD`` or ``METHOD``, and the name it is shown by."""
+def named_method(text: str, context: MethodContext) -> tuple[str, Method]:
+    """Build a method from ``LABEL=METHOD`` or ``METHOD``; return the name to show, and the method."""
     label, equals, spec = text.partition("=")
     if not equals or ":" in label:  # the = of a setting, which follows the colon of its method
-        method = make_method(text, setting)
+        method = make_method(text, context)
         return method.name, method
-    return label.strip(), make_method(spec, setting)
+    return label.strip(), make_method(spec, context)
 
 
 def evaluate(
@@ -75,46 +90,34 @@ def evaluate(
     train: str = "",
     progress: Progress = silent,
 ) -> Evaluation:
-    """Run the methods one after the other on ``data`` and judge each; ``train`` says what the training images are."""
+    """Run the methods on ``data``, one after the other, and judge each; ``train`` describes the training images."""
     names = [name for name, _ in methods]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f'two methods are called "{twice[0]}"; name them, as in --method "first=features:a.npz"')
-    outcomes = [judge(name, method, data, list(train_images), progress) for name, method in methods]
+        raise InputError(f'two methods are called "{twice[0]}"; give them names, as in --method "first=features:a.npz"')
+    outcomes = [judge(name, method, data, train_images, progress) for name, method in methods]
     return Evaluation(data, outcomes, train or f"{len(train_images)} training images")
 
 
-def judge(name: str, method: Method, data: DataSet, train_images: list[Path], progress: Progress = silent) -> Outcome:
-    """Run one method and judge what it says."""
-    result = method.score(data.query_images, data.reference_images, train_images, progress)
-    pairs = all_pairs(result.scores, data.truth)
+def judge(
+    name: str, method: Method, data: DataSet, train_images: Sequence[Path] = (), progress: Progress = silent
+) -> Outcome:
+    """Run one method and judge its scores."""
+    result = method.score(Images(data.query_images, data.reference_images, list(train_images)), progress)
+    judged_scores = JudgedScores(result.scores, data.truth)
     silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
     notes = list(result.notes)
     if silent_pairs:
         judged = int(np.count_nonzero(data.truth.judged))
-        notes.append(f"it says nothing of {silent_pairs} of {judged} judged pairs, which counts as no loop")
+        notes.append(f"no score for {silent_pairs} of {judged} judged pairs, which counts as no loop")
     return Outcome(
         name=name,
         scores=result.scores,
-        pairs=pairs,
-        best=best_match(result.scores, data.truth),
-        matches=best_matches(result.scores, data.truth),
-        recall_at=recall_at_k(result.scores, data.truth, RECALL_AT),
+        pairs=judged_scores.all_pairs_curve(),
+        best=judged_scores.best_match_curve(),
+        matches=judged_scores.best_matches,
+        recall_at=judged_scores.recall_at(RECALL_AT),
         seconds=result.seconds,
-        once=result.once,
+        training_stages=result.training_stages,
         notes=notes,
     )
-
-
-def figures(outcome: Outcome) -> dict[str, dict[str, float]]:
-    """Return the figures of a method by convention: convention -> name of the figure -> value in 0..1."""
-    table = {
-        curve.convention: {
-            "average precision": curve.average_precision,
-            "recall at 100 % precision": curve.recall_at_full_precision,
-            "best F1": curve.best_f1,
-        }
-        for curve in (outcome.pairs, outcome.best)
-    }
-    table[outcome.best.convention].update({f"recall at {k}": value for k, value in outcome.recall_at.items()})
-    return table

@@ -1,18 +1,19 @@
 """Precision and recall of a matrix of scores, exactly: one point for each distinct score, no grid of thresholds.
 
-Two conventions are in use, and their figures must never be mixed; every result here carries the name of its own:
+Two conventions are in use, and their results must never be mixed; every result here has the name of its convention:
 
 - **all pairs**: every judged pair is a sample (the similarity matrix against its truth, as in the paper);
 - **best match of each query**: each query names its best reference, right or wrong; recall is the share of the
-  queries with a loop that have theirs found (FAB-MAP, SeqSLAM and most of the loop-closure literature).
+  queries with a loop whose loop is found (FAB-MAP, SeqSLAM and most of the loop-closure literature).
 
-Soft truth (near enough to be no mistake, but nothing that must be found): over all pairs such a pair is ignored. A
-best match that hits soft truth alone is right for a query that has a loop, and ignored for one that has none.
+Soft truth marks pairs that are near enough not to be a mistake, but need not be found. Over all pairs such a pair is
+ignored. A best match that hits only soft truth is right for a query that has a loop, and ignored for other queries.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -25,14 +26,14 @@ BEST_MATCH = "best match of each query"
 
 @dataclass(frozen=True)
 class PrecisionRecall:
-    """A precision-recall curve, from the highest score down; ties are one point.
+    """A precision-recall curve, from the highest score down; equal scores are one point.
 
     convention         ALL_PAIRS or BEST_MATCH, or what the samples are
-    thresholds         (n,) the distinct scores, falling: what scores >= threshold is called a loop
+    thresholds         (n,) the distinct scores, descending; a score >= threshold is called a loop
     precision, recall  (n,)
-    positives          what there is to find: judged pairs, or queries with a loop
+    positives          how many there are to find: judged pairs, or queries with a loop
     samples            how many scores were judged
-    exclusion          what makes a place the same, and what was left out
+    truth_description  what makes a place the same, and what was left out
     """
 
     convention: str
@@ -41,28 +42,28 @@ class PrecisionRecall:
     recall: np.ndarray
     positives: int
     samples: int
-    exclusion: str = ""
+    truth_description: str = ""
 
     @property
     def average_precision(self) -> float:
-        """Sum of (R_n - R_n-1) P_n over the points (not the trapezoid); NaN where there is nothing to find."""
+        """Sum of (R_n - R_n-1) P_n over the points (not the trapezoid); NaN if there is nothing to find."""
         if not self.positives:
             return float("nan")
         return float(np.sum(np.diff(self.recall, prepend=0.0) * self.precision))
 
     @property
     def recall_at_full_precision(self) -> float:
-        """The greatest recall before the first mistake: 0 if the very first is wrong."""
+        """The greatest recall before the first mistake; 0 if the highest score is wrong."""
         return self.recall_at_precision(1.0)
 
     def recall_at_precision(self, wanted: float) -> float:
-        """Return the greatest recall of any threshold with at least this precision; 0 where there is none."""
+        """Return the greatest recall of any threshold with at least this precision; 0 if there is none."""
         if not self.positives:
             return float("nan")
         return float(np.max(self.recall[self.precision >= wanted], initial=0.0))
 
     def threshold_for_precision(self, wanted: float) -> float | None:
-        """Return the threshold with the greatest recall among those with at least this precision, the highest such."""
+        """Return the highest threshold with the greatest recall among those with at least this precision."""
         good = np.flatnonzero((self.precision >= wanted) & (self.recall > 0))
         return float(self.thresholds[good[np.argmax(self.recall[good])]]) if len(good) else None
 
@@ -73,7 +74,7 @@ class PrecisionRecall:
 
     @property
     def best_f1_threshold(self) -> float:
-        """The threshold of the greatest F1, the highest such; +inf where nothing is ever right."""
+        """The highest threshold with the greatest F1; +inf if nothing is ever right."""
         f1 = self._f1
         return float(self.thresholds[np.argmax(f1)]) if np.any(f1 > 0) else float("inf")
 
@@ -88,17 +89,17 @@ def curve(
     right: np.ndarray,
     positives: int | None = None,
     convention: str = "samples",
-    exclusion: str = "",
+    truth_description: str = "",
 ) -> PrecisionRecall:
-    """Build the curve of samples with a score and a right or wrong answer.
+    """Build the curve of samples that have a score and are right or wrong.
 
     scores     (n,); a NaN or -inf is never called a loop
     right      (n,) bool
-    positives  what there is to find, where that is more than ``right`` holds; the number of True in it by default
+    positives  how many there are to find; by default the number of True in ``right``
     """
     scores, right = np.asarray(scores).reshape(-1), np.asarray(right, dtype=bool).reshape(-1)
     if len(scores) != len(right):
-        raise InputError(f"{len(scores)} scores but {len(right)} truths")
+        raise InputError(f"{len(scores)} scores but {len(right)} answers of right or wrong")
     if positives is None:
         positives = int(np.count_nonzero(right))
     samples = len(scores)
@@ -116,24 +117,17 @@ def curve(
         recall=true_positives / positives if positives else np.zeros(len(last_of_tie)),
         positives=positives,
         samples=samples,
-        exclusion=exclusion,
+        truth_description=truth_description,
     )
-
-
-def all_pairs(scores: np.ndarray, truth: Truth) -> PrecisionRecall:
-    """Judge every pair for itself; ``scores`` (Q, R), higher = more alike. NaN is never found, yet may be missed."""
-    _check_size(scores, truth)
-    counted = truth.judged & (truth.hard | ~truth.soft)
-    return curve(scores[counted], truth.hard[counted], convention=ALL_PAIRS, exclusion=truth.sentence)
 
 
 @dataclass(frozen=True)
 class BestMatches:
     """The best judged reference of each query.
 
-    reference  (Q,) its number, -1 where the query has no candidate with a score; of equal ones the first
-    score      (Q,) its score, -inf there
-    right      (Q,) bool: it hits hard truth, or soft truth where the query has a loop
+    reference  (Q,) its number, -1 if the query has no candidate with a score; of equal scores the first
+    score      (Q,) its score, -inf if it has none
+    right      (Q,) bool: it hits hard truth, or soft truth if the query has a loop
     ignored    (Q,) bool: it hits soft truth and the query has no loop: neither right nor wrong
     """
 
@@ -143,55 +137,70 @@ class BestMatches:
     ignored: np.ndarray
 
 
-def best_matches(scores: np.ndarray, truth: Truth) -> BestMatches:
-    """Find and judge the best match of each query; ``scores`` (Q, R)."""
-    candidates = _candidates(scores, truth)
-    rows = np.arange(len(candidates))
-    reference = np.argmax(candidates, axis=1)
-    score = candidates[rows, reference]
-    none = np.isneginf(score)
-    soft = truth.soft[rows, reference] & ~none
-    loops = truth.queries_with_a_loop
-    return BestMatches(np.where(none, -1, reference), score, soft & loops, soft & ~loops)
+@dataclass(frozen=True)
+class JudgedScores:
+    """The scores (Q, R) of a method, higher = more alike, and the truth that they are judged by.
 
-
-def best_match(scores: np.ndarray, truth: Truth) -> PrecisionRecall:
-    """Judge the best match of each query; ``scores`` (Q, R). A wrong match of a query with a loop is one mistake."""
-    found = best_matches(scores, truth)
-    kept = ~found.ignored
-    positives = int(np.count_nonzero(truth.queries_with_a_loop))
-    return curve(found.score[kept], found.right[kept], positives, BEST_MATCH, truth.sentence)
-
-
-def recall_at_k(scores: np.ndarray, truth: Truth, ks: tuple[int, ...] = (1, 5, 10, 20)) -> dict[int, float]:
-    """Return, for each k, the share of the queries with a loop that have a hard or soft one among their best k.
-
-    Of equal scores the first references count. Queries without a loop are left out; NaN where none has one.
+    A NaN is never found, but may be missed. What several measures need is computed once.
     """
-    candidates = _candidates(scores, truth)
-    queries = np.flatnonzero(truth.queries_with_a_loop)
-    if not len(queries):
-        return {k: float("nan") for k in ks}
-    if min(ks) < 1:
-        raise InputError(f"recall at {min(ks)} was asked for; expected 1 or more")
-    ranked = np.argsort(-candidates[queries], axis=1, kind="stable")[:, : max(ks)]
-    hits = np.take_along_axis(truth.soft[queries], ranked, axis=1)
-    hits &= ~np.isneginf(np.take_along_axis(candidates[queries], ranked, axis=1))
-    found = np.cumsum(hits, axis=1) > 0
-    return {k: float(np.mean(found[:, min(k, found.shape[1]) - 1])) for k in ks}
 
+    scores: np.ndarray
+    truth: Truth
 
-def _candidates(scores: np.ndarray, truth: Truth) -> np.ndarray:
-    """Return the scores with -inf for what is not judged and for NaN."""
-    _check_size(scores, truth)
-    return np.where(truth.judged & ~np.isnan(scores), scores, -np.inf)
+    def __post_init__(self) -> None:
+        if self.scores.shape != self.truth.hard.shape:
+            raise InputError(
+                f"the scores are {_by(self.scores.shape)}, the truth is {_by(self.truth.hard.shape)} "
+                "(query x reference)"
+            )
 
-
-def _check_size(scores: np.ndarray, truth: Truth) -> None:
-    if scores.shape != truth.hard.shape:
-        raise InputError(
-            f"the scores are {_by(scores.shape)}, the truth is {_by(truth.hard.shape)} (query x reference)"
+    def all_pairs_curve(self) -> PrecisionRecall:
+        """Judge every pair by itself."""
+        truth = self.truth
+        counted = truth.judged & (truth.hard | ~truth.soft)
+        return curve(
+            self.scores[counted], truth.hard[counted], convention=ALL_PAIRS, truth_description=truth.description
         )
+
+    def best_match_curve(self) -> PrecisionRecall:
+        """Judge the best match of each query. A wrong match of a query with a loop is one mistake."""
+        found = self.best_matches
+        kept = ~found.ignored
+        positives = int(np.count_nonzero(self.truth.queries_with_a_loop))
+        return curve(found.score[kept], found.right[kept], positives, BEST_MATCH, self.truth.description)
+
+    @cached_property
+    def best_matches(self) -> BestMatches:
+        """The best match of each query, and whether it is right."""
+        rows = np.arange(len(self._candidates))
+        reference = np.argmax(self._candidates, axis=1)
+        score = self._candidates[rows, reference]
+        none = np.isneginf(score)
+        soft = self.truth.soft[rows, reference] & ~none
+        loops = self.truth.queries_with_a_loop
+        return BestMatches(np.where(none, -1, reference), score, soft & loops, soft & ~loops)
+
+    def recall_at(self, ks: tuple[int, ...] = (1, 5, 10, 20)) -> dict[int, float]:
+        """Return, for each k, the share of the queries with a loop that have a hard or soft one among their best k.
+
+        Of equal scores the first references count. Queries without a loop are left out; NaN if no query has one.
+        """
+        queries = np.flatnonzero(self.truth.queries_with_a_loop)
+        if not len(queries):
+            return {k: float("nan") for k in ks}
+        if min(ks) < 1:
+            raise InputError(f"recall at {min(ks)} was asked for; expected 1 or more")
+        candidates = self._candidates[queries]
+        ranked = np.argsort(-candidates, axis=1, kind="stable")[:, : max(ks)]
+        hits = np.take_along_axis(self.truth.soft[queries], ranked, axis=1)
+        hits &= ~np.isneginf(np.take_along_axis(candidates, ranked, axis=1))
+        found = np.cumsum(hits, axis=1) > 0
+        return {k: float(np.mean(found[:, min(k, found.shape[1]) - 1])) for k in ks}
+
+    @cached_property
+    def _candidates(self) -> np.ndarray:
+        """The scores (Q, R), -inf for what is not judged and for NaN."""
+        return np.where(self.truth.judged & ~np.isnan(self.scores), self.scores, -np.inf)
 
 
 def _by(shape: tuple[int, ...]) -> str:

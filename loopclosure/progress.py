@@ -1,4 +1,4 @@
-"""How far the work is, and how long its stages take; what shows it is up to the caller."""
+"""How far the work is, and how long its stages take; the caller decides how it is shown."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Progress(Protocol):
 
 
 def silent(items: Iterable[Item], stage: str, total: int | None = None) -> Iterable[Item]:
-    """Show nothing: the progress of tests and of programs."""
+    """Show nothing: for tests and for programs."""
     return items
 
 

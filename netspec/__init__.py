@@ -10,17 +10,20 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 from netspec.errors import SpecError
+from netspec.proto.dialect.folders import FOLDERS
 
 if TYPE_CHECKING:
     from netspec.dialects import use_dialect
     from netspec.net.build import load_net
     from netspec.net.net import Net
+    from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights
     from netspec.solver.solver import Solver, load_solver
 
 _HOMES = {
     "use_dialect": "netspec.dialects",
     "Net": "netspec.net.net",
+    "layer": "netspec.net.one_layer",
     "load_net": "netspec.net.build",
     "Solver": "netspec.solver.solver",
     "load_solver": "netspec.solver.solver",
@@ -28,7 +31,17 @@ _HOMES = {
     "save_weights": "netspec.net.weights",
 }
 
-__all__ = ["Net", "Solver", "SpecError", "load_net", "load_solver", "load_weights", "save_weights", "use_dialect"]
+__all__ = [
+    "Net",
+    "Solver",
+    "SpecError",
+    "layer",
+    "load_net",
+    "load_solver",
+    "load_weights",
+    "save_weights",
+    "use_dialect",
+]
 
 
 def load_ipython_extension(ipython: object) -> None:
@@ -45,6 +58,7 @@ def unload_ipython_extension(ipython: object) -> None:
     finder.uninstall()
 
 
+FOLDERS.append((f"{__path__[0]}/dialects", "netspec.dialects"))  # told here: an error names them, whatever is imported
 __path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the names they had before
 
 

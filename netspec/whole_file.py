@@ -1,10 +1,14 @@
-"""Files that appear whole or not at all: a run that dies while it writes leaves what was there before."""
+"""Files that appear whole or not at all: a run that dies while it writes leaves what was there before.
+
+And whether one could be written at all, asked beforehand.
+"""
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
@@ -28,3 +32,25 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         raise SpecError(f"cannot be written: {reason}", Where(str(path))) from None
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def why_unwritable(path: str | Path) -> str:
+    """Return why no file can be written at ``path``, in the words of the operating system; "" where one can.
+
+    The file system is asked, nothing is written: a full disk, say, shows only when one tries.
+    """
+    path = Path(path)
+    folder = path.parent
+    try:
+        if not folder.is_dir():
+            folder.stat()
+            return os.strerror(errno.ENOTDIR)
+        with suppress(FileNotFoundError):
+            path.stat()
+    except OSError as fault:
+        return fault.strerror or str(fault)
+    if path.is_dir():
+        return os.strerror(errno.EISDIR)
+    if os.access(path, os.W_OK) if path.exists() else os.access(folder, os.W_OK | os.X_OK):
+        return ""
+    return os.strerror(errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES)

@@ -83,6 +83,7 @@ def test_the_solvers_are_the_papers() -> None:
         assert 3 * small.stepsize == small.max_iter
 
 
+@pytest.mark.slow
 # One of each kind, since the others differ in their last layer alone.
 @pytest.mark.parametrize(
     "folder", [FOLDERS[k] for k in (0, 3, 4, 7)], ids=lambda path: f"{path.parent.name}-{path.name}"

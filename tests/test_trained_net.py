@@ -3,10 +3,14 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from lmdb_build.cli import main as lmdb_build
 from loopclosure.cli import main as loopclosure
 from netspec.cli import main as netspec
 from paths import ROOT
+
+pytestmark = pytest.mark.slow
 
 WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
 

@@ -1,4 +1,4 @@
-"""From a source of pairs to list files: split, choose, warp, write, and say what was chosen."""
+"""From a source of pairs to list files: split, choose, warp, write, and report what was chosen."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ from loopclosure.progress import Progress, silent
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be made of a source.
+    """The lists to make from a source.
 
-    counts       how many pairs each split gets; one of 0 gets no images either
-    by           "time" or "group", what splits are cut along
-    shares       of the images (or groups) for each split
+    counts       how many pairs each split gets; a split of 0 pairs gets no images
+    by           "time" or "group": how images are split
+    shares       share of the images (or groups) for each split
     split_gap    least gap in time between two splits
-    named        the groups of a split, by name
-    features, hard_share  this share of the negatives is the nearest by these features
+    named        the names of a split's groups
+    at_most      if there are too few pairs, take as many as there are
+    features, hard_share  this share of the negatives is nearest by these features
     warp_share   this share of all pairs has a warped image
     """
 
@@ -44,17 +45,19 @@ class Plan:
     warp_share: float = 0.0
 
     def check(self) -> None:
-        """Raise InputError for numbers that make no plan."""
+        """Raise InputError for numbers that are out of range."""
         for split, count in self.counts.items():
             if count < 0 or count % 2:
-                raise InputError(f"--{split}: half of the pairs are positive, so their number is even, not {count}")
+                raise InputError(
+                    f"--{split}: half of the pairs are positive, so their number must be even, not {count}"
+                )
         if not any(self.counts.values()):
-            raise InputError("no pair is asked for; give --train, --val or --test a number")
+            raise InputError("no pairs are asked for; give --train, --val or --test a number")
         for name in ("hard_share", "warp_share"):
             if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"--{name.replace('_', '-')} is 0 to 1, not {getattr(self, name)}")
+                raise InputError(f"--{name.replace('_', '-')} must be 0 to 1, not {getattr(self, name)}")
         if self.seed < 0:
-            raise InputError(f"a seed is 0 or more, not {self.seed}")
+            raise InputError(f"a seed must be 0 or more, not {self.seed}")
         for split, share in self.shares.items():
             if share < 0 or (self.counts.get(split) and not share):
                 raise InputError(f"the share of {split} is {share:g}; expected a number above 0")
@@ -71,8 +74,8 @@ def build_lists(
 ) -> dict[str, Path]:
     """Write ``out``/train.txt, val.txt and test.txt as planned, and warped images below ``out``; return the lists.
 
-    ``say`` gets each split's report, ``warn`` each doubt about its labels. Raises InputError before anything is
-    written where a split has not enough pairs.
+    ``say`` receives each split's report, ``warn`` each doubt about its labels. Raises InputError, before anything is
+    written, if a split does not have enough pairs.
     """
     plan.check()
     splits = split_images(source, plan)
@@ -103,7 +106,7 @@ def build_lists(
 
 
 def split_images(source: PairSource, plan: Plan) -> dict[str, Indices]:
-    """Return the images of each split that is to get pairs; no image is in two of them."""
+    """Return the images of each split that gets pairs; no image is in two splits."""
     shares = {split: plan.shares[split] for split in SPLITS if plan.counts.get(split)}
     if plan.by == "time":
         return split_by_time(source, shares, plan.split_gap)
@@ -124,7 +127,7 @@ def _write_warped(
     out: Path,
     progress: Progress,
 ) -> list[str]:
-    """Write the warped images; return the second images' names with theirs in place."""
+    """Write the warped images; return the names of the second images, with those of the warped images."""
     folder = _below(out / f"{split}_warped", root)
     names = list(seconds)
     for number in progress(np.flatnonzero(pairs.warped), f"{split}: warping"):
@@ -138,13 +141,13 @@ def _below(path: Path, root: Path) -> str:
     try:
         return path.resolve().relative_to(root.resolve()).as_posix()
     except ValueError:
-        raise InputError(f"warped images must lie below the root folder {root}; name another --root", path) from None
+        raise InputError(f"warped images must be below the root folder {root}; give another --root", path) from None
 
 
 def _head(
     source: PairSource, plan: Plan, split: str, images: Indices, pairs: Pairs, root: Path, out: Path
 ) -> dict[str, str]:
-    """Return the settings that make the list again."""
+    """Return the settings from which the list can be made again."""
     cut = f"time, {plan.split_gap:g} between splits" if plan.by == "time" else source.group_word
     shares = ", ".join(f"{name} {plan.shares[name]:g}" for name in SPLITS if plan.counts.get(name))
     head = dict(source.settings)

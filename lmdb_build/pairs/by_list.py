@@ -1,8 +1,8 @@
-"""Pairs that somebody listed: a mask of loops, equal names in two folders, tables, single images."""
+"""Pairs from lists: a mask of loops, equal names in two folders, tables, single images."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +29,8 @@ class MaskSource:
     def __init__(self, mask: Path, images: Path, root: Path, min_gap: int | None = None, camera: str = "all") -> None:
         """Read the mask (Q, Q) and the Q images of a folder, in natural order.
 
-        A mask marks no neighbours in time, though they show one place: pairs nearer than ``min_gap`` images are left
-        out; by default nearer than the nearest marked pair. Soft entries of the mask are left out too.
+        A mask does not mark neighbors in time, though they show one place: pairs nearer than ``min_gap`` images are
+        left out; by default pairs nearer than the nearest marked pair. Soft entries of the mask are left out too.
         ``camera`` says which images are taken: see loopclosure.places.cameras.
         """
         hard, soft = read_truth_matrix(mask)
@@ -71,33 +71,33 @@ class MaskSource:
         return {"gap [images]": np.abs(self.stamps[first] - self.stamps[second])}
 
     def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
-        """Nothing: the mask is what is known."""
+        """Nothing: there is no other information than the mask."""
         return []
 
 
 class PlaceSource:
-    """Images with a group each, and a list of positives: folders with equal names, tables, single images.
+    """Images, each in a group, and a list of positives: folders with equal names, tables, single images.
 
-    Images of different groups are negatives; two images of one group that are not listed are left out.
+    Two images of different groups are a negative pair; two images of one group that are not listed are left out.
     See :class:`lmdb_build.pairs.choose.PairSource`.
     """
 
     def __init__(
         self,
         names: list[str],
-        groups: SequenceOf[str],
-        positives: SequenceOf[tuple[int, int]],
+        groups: Sequence[str],
+        positives: Sequence[tuple[int, int]],
         settings: dict[str, str],
         group_word: str = "place",
         min_gap: float = 0.0,
-        sides: SequenceOf[int] | None = None,
+        sides: Sequence[int] | None = None,
     ) -> None:
-        """Take images, the name of each one's group, and pairs of indices that are the same place.
+        """Take images, the name of each image's group, and pairs of indices that are the same place.
 
-        min_gap  along the groups in the order given: images of different groups nearer than that are left out, since
-                 neighbouring places look alike
-        sides    where positives always join an image of one side (a folder, a season) with one of the other, so must
-                 negatives, or a net learns to tell sides apart instead of places: pairs of one side are left out
+        min_gap  in the given order of the groups: images of different groups nearer than this are left out, since
+                 neighboring places look similar
+        sides    if positives always join an image of one side (a folder, a season) with one of the other, negatives
+                 must too, or a net learns to distinguish sides instead of places: pairs of one side are left out
         """
         self.names, self.group_word, self.settings, self._min_gap = names, group_word, settings, min_gap
         self.group_names = list(dict.fromkeys(groups))
@@ -125,18 +125,18 @@ class PlaceSource:
         return np.column_stack(np.divmod(self._codes, len(self.names)))
 
     def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
-        """Nothing is measured."""
+        """No measures."""
         return {}
 
     def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
-        """Nothing: the list is what is known."""
+        """Nothing: there is no other information than the list."""
         return []
 
 
 def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0) -> PlaceSource:
-    """Pair two folders: images of equal names are the same place (without the ending: a.png and a.jpg are equal).
+    """Pair two folders: images of equal names are the same place (without the suffix: a.png and a.jpg are equal).
 
-    Places are in natural order of their names, those nearer than ``min_gap`` to each other make no pair (frames of a
+    Places are in natural order of their names; places nearer than ``min_gap`` to each other are not paired (frames of a
     traverse). Only images with a partner are taken.
     """
     first, second = ({path.stem: path for path in image_paths(folder)} for folder in (folder_a, folder_b))
@@ -155,7 +155,7 @@ def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0)
 
 
 def singles_source(folder: Path, root: Path) -> PlaceSource:
-    """Take each image of a folder (or list) for a place of its own; positives can only be made by warping."""
+    """Take each image of a folder (or list) as a different place; positives can only be made by warping."""
     names = [relative(path, root) for path in image_paths(folder)]
     return PlaceSource(names, names, [], {"source": f"single images of {folder.name}"}, "image")
 
@@ -163,17 +163,17 @@ def singles_source(folder: Path, root: Path) -> PlaceSource:
 def table_source(table: Path, root: Path, group: str | None = None, index: Path | None = None) -> PlaceSource:
     """Read a CSV table of positives: two columns with names of images, relative to the table's folder.
 
-    Negatives are images of different groups. A group is what stands in column ``group`` of ``index`` (a table with one
-    column of images, which may name more than the positives), or of the table itself; without ``group``, images that
-    are linked by positives are one place. Where no image stands in both columns (a query and a reference, say),
-    negatives too are made of one image of each.
+    Negatives are images of different groups. A group is the value in column ``group`` of ``index`` (a table with one
+    column of images, which may have more images than the positives), or of the table itself; without ``group``, images
+    that are linked by positives are one place. If no image is in both columns (for example queries and references),
+    negatives also consist of one image of each column.
     """
     lines, (column_a, column_b) = read_table(table, 2)
     pairs = [(row[column_a], row[column_b]) for _, row in lines]
     group_of: dict[str, str] = {}
     if index is not None:
         if group is None:
-            raise InputError("an index needs --group, the column whose values are other places", index)
+            raise InputError("an index needs --group, the column that names the places", index)
         rows, (column,) = read_table(index, 1)
         group_of = {row[column]: cell(index, number, row, group) for number, row in rows}
     elif group is not None:
@@ -181,9 +181,7 @@ def table_source(table: Path, root: Path, group: str | None = None, index: Path 
             value = cell(table, number, row, group)
             for image in (row[column_a], row[column_b]):
                 if group_of.setdefault(image, value) != value:
-                    raise InputError(
-                        f'{image} is of {group} "{group_of[image]}" above, here "{value}"', table, number, 1
-                    )
+                    raise InputError(f'{image} has {group} "{group_of[image]}" above, "{value}" here', table, number, 1)
     else:
         group_of = _linked(pairs)
     for (number, _), pair in zip(lines, pairs, strict=True):
@@ -201,7 +199,7 @@ def table_source(table: Path, root: Path, group: str | None = None, index: Path 
 
 
 def index_source(index: Path, root: Path, group: str, track: str, time: str, max_gap: float) -> PlaceSource:
-    """Read a CSV table of frames: neighbours in time are positives, frames of different groups negatives.
+    """Read a CSV table of frames: neighbors in time are positives, frames of different groups are negatives.
 
     Positives are two frames with the same value in column ``track`` whose numbers in column ``time`` differ by at most
     ``max_gap``.
@@ -229,7 +227,7 @@ def index_source(index: Path, root: Path, group: str, track: str, time: str, max
 
 
 def _linked(pairs: list[tuple[str, str]]) -> dict[str, str]:
-    """Name each image's place by one image of those that it is linked with, over any number of pairs."""
+    """Name each image's place by one of the images that it is linked with, directly or indirectly."""
     parent: dict[str, str] = {}
 
     def root_of(image: str) -> str:

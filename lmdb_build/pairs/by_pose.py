@@ -1,8 +1,8 @@
-"""Pairs of posed frames: the paper's rule, and what is known about which sequences show one scene."""
+"""Pairs of frames with poses: the paper's rule, and which sequences show the same scene."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,26 +18,26 @@ from loopclosure.places.same_place import (
     same_place,
     view_angles_deg,
 )
-from loopclosure.places.trajectory import Poses, Sequence
+from loopclosure.places.trajectory import PosedSequence, Poses
 
 # How the images of two sequences relate.
 SAME_SEQUENCE, ONE_FRAME, ONE_SCENE, OTHER_SCENE = range(4)
 NEGATIVES = ("same_sequence", "cross_sequence", "both")
 
-NEIGHBOUR_S = 3.0  # images less than this apart are neighbours in time, hardly two visits of a place
-NEAR_FACTOR = 2.0  # a negative pair within this factor of the rule's limits shows much the same
+NEIGHBOUR_S = 3.0  # images less than this apart are neighbors in time, not two visits to a place
+NEAR_FACTOR = 2.0  # a negative pair within this factor of the rule's limits shows nearly the same
 TOO_MANY = 0.2
 
 
 @dataclass(frozen=True)
 class PoseRule:
-    """How posed pairs are labelled; the defaults are the paper's.
+    """How pairs with poses are labeled; the defaults are the paper's.
 
-    max_distance_m, max_angle_deg  nearer and less turned than these: the same place
-    min_gap_s          two images of one sequence nearer in time make no pair
-    negatives          from the ``same_sequence``, from ``cross_sequence`` pairs, or ``both``
-    clear_distance_m, clear_view_angle_deg  if given, a pair that shares a frame of reference is negative only if it
-                       is so far apart, or its viewing axes are so far turned; what lies between is left out
+    max_distance_m, max_angle_deg  less distance and less rotation than these: the same place
+    min_gap_s          two images of one sequence nearer in time than this are not paired
+    negatives          from ``same_sequence``, from ``cross_sequence`` pairs, or ``both``
+    clear_distance_m, clear_view_angle_deg  if given, a pair in one frame of reference is negative only if it is at
+                       least this far apart, or its viewing axes are; other pairs that are not positive are left out
     """
 
     max_distance_m: float = MAX_DISTANCE_M
@@ -50,25 +50,25 @@ class PoseRule:
 
 @dataclass(frozen=True)
 class Scenes:
-    """What is known about which sequences show the same scene, by their names.
+    """Which sequences show the same scene, by their names.
 
     same_scene   sets of sequences of one scene without a common frame of reference: pairs across them are left out
-    same_frame   sets of sequences of one scene whose poses share a frame: pairs across them are judged by pose
-    all_others_differ  whatever is in no common set shows different scenes: nothing to warn about
+    same_frame   sets of sequences of one scene whose poses share a frame: pairs across them are labeled by pose
+    all_others_differ  sequences that are in no common set show different scenes: no warning
     """
 
     same_scene: tuple[tuple[str, ...], ...] = ()
     same_frame: tuple[tuple[str, ...], ...] = ()
     all_others_differ: bool = False
 
-    def relations(self, names: SequenceOf[str]) -> NDArray[np.int8]:
-        """Return (S, S): how each two of the sequences relate. Raises InputError for a name that is not among them."""
+    def relations(self, names: Sequence[str]) -> NDArray[np.int8]:
+        """Return (S, S): the relation of each two sequences. Raises InputError for a name that is not among them."""
         table = np.full((len(names), len(names)), OTHER_SCENE, np.int8)
         for sets, relation in ((self.same_scene, ONE_SCENE), (self.same_frame, ONE_FRAME)):
             for members in sets:
                 for name in members:
                     if name not in names:
-                        raise InputError(f'no sequence is called "{name}"; there are: {", ".join(names)}')
+                        raise InputError(f'no sequence has the name "{name}"; there are: {", ".join(names)}')
                 at = [names.index(name) for name in members]
                 table[np.ix_(at, at)] = relation
         np.fill_diagonal(table, SAME_SEQUENCE)
@@ -82,16 +82,16 @@ class PoseSource:
 
     def __init__(
         self,
-        sequences: SequenceOf[Sequence],
-        folders: SequenceOf[str],
+        sequences: Sequence[PosedSequence],
+        folders: Sequence[str],
         rule: PoseRule = PoseRule(),
         scenes: Scenes = Scenes(),
     ) -> None:
-        """Take the sequences' frames together; ``folders`` are the sequences' folders, relative to the list's root."""
+        """Take the frames of all sequences; ``folders`` are the sequences' folders, relative to the list's root."""
         self.group_names = [sequence.name for sequence in sequences]
         for name in self.group_names:
             if self.group_names.count(name) > 1:
-                raise InputError(f'two sequences are called "{name}"; rename one of the folders')
+                raise InputError(f'two sequences have the name "{name}"; rename one of the folders')
         self.names = [
             f"{folder}/{frame.path}" if folder not in ("", ".") else frame.path
             for folder, sequence in zip(folders, sequences, strict=True)
@@ -116,9 +116,9 @@ class PoseSource:
             "negative": f"{' or '.join(clear) or 'the others'}; {rule.negatives}",
             "least time gap": f"{rule.min_gap_s:g} s",
         }
-        for words, sets in (("one scene", scenes.same_scene), ("one frame of reference", scenes.same_frame)):
+        for relation, sets in (("one scene", scenes.same_scene), ("one frame of reference", scenes.same_frame)):
             if sets:
-                self.settings[words] = "; ".join(" ".join(members) for members in sets)
+                self.settings[relation] = "; ".join(" ".join(members) for members in sets)
 
     def judge(self, first: Indices, second: Indices) -> NDArray[np.int8]:
         """Label pairs (N,) by the rule."""
@@ -146,11 +146,11 @@ class PoseSource:
         return labels
 
     def positives(self) -> None:
-        """Positive pairs are not listed: they have to be searched."""
+        """None: positive pairs are not listed and have to be searched."""
         return None
 
     def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
-        """Distance and angle where poses can be compared, time gap within a sequence."""
+        """Distance and angle if the poses can be compared, time gap within a sequence."""
         relation = self._relations[self.groups[first], self.groups[second]]
         a, b = self.poses[first], self.poses[second]
         comparable = relation <= ONE_FRAME
@@ -163,22 +163,22 @@ class PoseSource:
         }
 
     def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
-        """Say what may make labels false: undeclared scenes, neighbours as positives, negatives near the limits."""
+        """Return what may make labels wrong: undeclared scenes, neighbors as positives, negatives near the limits."""
         found = []
         relation = self._relations[self.groups[first], self.groups[second]]
         across = (labels == NEGATIVE) & (relation == OTHER_SCENE)
         if across.any() and not self.scenes.all_others_differ:
             found.append(
-                f"{across.sum()} negatives are of different sequences that nobody said show different scenes; if they "
-                "show one room (as all of TUM's freiburg1 do), these labels are false: declare --same-scene or "
-                "--same-frame, or --different-scenes if there is nothing to declare"
+                f"{across.sum()} negatives are of different sequences that are not declared to show different scenes; "
+                "if they show one room (as all of TUM's freiburg1 do), these labels are wrong: use --same-scene or "
+                "--same-frame, or --different-scenes if all scenes differ"
             )
         measures = self.measures(first, second)
         neighbours = np.mean(measures["time gap [s]"][labels == POSITIVE] < NEIGHBOUR_S) if POSITIVE in labels else 0.0
         if neighbours > 0.5:
             found.append(
-                f"{neighbours:.0%} of the positives are images less than {NEIGHBOUR_S:g} s apart, hardly two visits "
-                "of a place: --min-gap asks for more"
+                f"{neighbours:.0%} of the positives are images less than {NEIGHBOUR_S:g} s apart, not two visits to a "
+                "place: --min-gap sets a minimum"
             )
         negative = (labels == NEGATIVE) & (relation <= ONE_FRAME)
         near = (
@@ -189,6 +189,6 @@ class PoseSource:
         if negative.any() and near.sum() > TOO_MANY * negative.sum():
             found.append(
                 f"{near.sum() / negative.sum():.0%} of the negatives judged by pose are within twice the limits of the "
-                "rule and show much the same: --clear-view-angle or --clear-distance leaves such pairs out"
+                "rule and show nearly the same: --clear-view-angle or --clear-distance leaves such pairs out"
             )
         return found

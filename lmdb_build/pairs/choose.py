@@ -1,8 +1,7 @@
 """The seeded, balanced choice of image pairs: which images go to which split, and which pairs of them are taken.
 
-What makes a pair positive or negative is the source's affair (:mod:`lmdb_build.pairs.by_list`); here it is only asked.
-All draws follow from the seed, and each split has its own stream, so that asking one split for more pairs leaves the
-others as they are.
+The source decides what makes a pair positive or negative (:mod:`lmdb_build.pairs.by_list`). All random draws follow
+from the seed, and each split has its own random numbers, so that more pairs in one split do not change the others.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ LABEL_WORDS = {POSITIVE: "positive", NEGATIVE: "negative"}
 
 Indices = NDArray[np.intp]
 
-# Up to so many possible pairs all are looked at. Above, pairs are drawn at random and judged until there are enough.
+# Up to this many possible pairs, all are labeled. Above, pairs are drawn at random until there are enough.
 ALL_PAIRS = 4_000_000
 DRAWN_AT_ONCE = 1 << 18
 
@@ -30,11 +29,12 @@ DRAWN_AT_ONCE = 1 << 18
 class PairSource(Protocol):
     """M images and what is known about pairs of them; index i is the image ``names[i]`` below the root folder.
 
-    tracks       (M,) which run of the camera an image is from; along a run, ``stamps`` rise
-    stamps       (M,) when it was taken, or where it is in the run
-    groups       (M,) what a split by group keeps together: a sequence, a place, a floor; called ``group_word``
+    tracks       (M,) which run of the camera an image is from; along a run, ``stamps`` ascend
+    stamps       (M,) when it was taken, or its position in the run
+    groups       (M,) what a split by group keeps together: a sequence, a place, a floor
     group_names  the groups' names
-    settings     what the list's head says about the source
+    group_word   what a group is called in messages
+    settings     what the list's header says about the source
     """
 
     names: list[str]
@@ -50,15 +50,15 @@ class PairSource(Protocol):
         ...
 
     def positives(self) -> Indices | None:
-        """All positive pairs (K, 2), where the source has a list of them; None where they have to be searched."""
+        """All positive pairs (K, 2), if the source has a list of them; None if they have to be searched."""
         ...
 
     def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
-        """Quantities of pairs (N,) by name and unit, NaN where a pair has none: for the report."""
+        """Quantities of pairs (N,) by name and unit, NaN if undefined for a pair: for the report."""
         ...
 
     def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
-        """What may make labels of these chosen pairs false, a sentence each."""
+        """What may make labels of these chosen pairs wrong, one sentence each."""
         ...
 
 
@@ -66,8 +66,7 @@ class PairSource(Protocol):
 class Pairs:
     """Chosen pairs, in the order of the list: image indices (N,) and labels (N,), 1 for the same place.
 
-    Where ``warped`` (N,), a warped copy of the second image is to take its place; of a positive pair both indices are
-    then the same.
+    ``warped`` (N,): a warped copy replaces the second image; both indices of a positive pair are then the same.
     """
 
     first: Indices
@@ -80,10 +79,10 @@ class Pairs:
 
 
 def split_by_time(source: PairSource, shares: Mapping[str, float], gap: float = 0.0) -> dict[str, Indices]:
-    """Cut each run into stretches, one a split, as long (in images) as its share; return the images of each split.
+    """Cut each run into one part per split, with its share of the images; return the images of each split.
 
     ``gap`` is the least difference of stamps between two splits: images after a cut are left out until it is reached,
-    since neighbours in time show the same.
+    since neighbors in time show the same scene.
     """
     total = sum(shares.values())
     taken: dict[str, list[Indices]] = {split: [] for split in shares}
@@ -104,11 +103,11 @@ def split_by_time(source: PairSource, shares: Mapping[str, float], gap: float = 
 def split_by_group(
     source: PairSource, shares: Mapping[str, float], seed: int, named: Mapping[str, list[str]] | None = None
 ) -> dict[str, Indices]:
-    """Give whole groups to splits; return the images of each split.
+    """Assign whole groups to splits; return the images of each split.
 
-    ``named`` says which groups go to which split; the split it does not mention gets the rest, and groups of a split
-    that is not in ``shares`` go to none. Without ``named``, groups are drawn by the seed until each split has its share
-    of the groups, and at least one.
+    ``named`` says which groups go to which split; the one split that it does not mention gets the rest, and groups of a
+    split that is not in ``shares`` are not used. Without ``named``, groups are drawn at random until each split has its
+    share of the groups, and at least one.
     Raises InputError for an unknown group, one named twice, or fewer groups than splits.
     """
     word, count = source.group_word, len(source.group_names)
@@ -121,7 +120,7 @@ def split_by_group(
         for split, names in named.items():
             for name in names:
                 if name not in source.group_names:
-                    raise InputError(f'no {word} is called "{name}"; there are: {", ".join(source.group_names)}')
+                    raise InputError(f'no {word} has the name "{name}"; there are: {", ".join(source.group_names)}')
                 index = source.group_names.index(name)
                 if owner[index] >= 0:
                     raise InputError(f'{word} "{name}" is named for two splits')
@@ -132,11 +131,11 @@ def split_by_group(
         if count < len(splits):
             raise InputError(
                 f"{count} {word}{'s'[count == 1 :]} cannot be split by {word} into {' and '.join(splits)}: "
-                f"give more {word}s, split by time, or ask fewer splits for pairs"
+                f"give more {word}s, split by time, or use fewer splits"
             )
         order = np.random.default_rng([seed, 0]).permutation(count)
         edges = np.round(np.cumsum(list(shares.values())) / sum(shares.values()) * count).astype(int)
-        for number in range(len(edges)):  # at least one group each, for those before and those after
+        for number in range(len(edges)):  # at least one group for each split
             least = edges[number - 1] + 1 if number else 1
             edges[number] = np.clip(edges[number], least, count - len(edges) + 1 + number)
         for number, part in enumerate(np.split(order, edges[:-1])):
@@ -156,12 +155,12 @@ def choose_pairs(
 ) -> Pairs:
     """Choose ``count`` different pairs among ``images``, half of them positive, in shuffled order.
 
-    Each half is drawn evenly from all pairs of its label, but for
-    warp_share      this share of the positives is an image and a warped copy of itself; and in the same share of the
-                    negatives the second image is warped, or a net would learn to see the warp instead of the place
-    hard_negatives  (K, 2) pairs that are taken for negatives before any is drawn
+    Each half is drawn uniformly from all pairs of its label, with two exceptions:
+    warp_share      this share of the positives is an image and a warped copy of it; in the same share of the negatives
+                    the second image is warped, or a net would learn to detect the warp instead of the place
+    hard_negatives  (K, 2) pairs that are taken as negatives before any is drawn
 
-    Raises InputError where there are not enough pairs, unless ``at_most``: then as many as there are, half positive.
+    Raises InputError if there are not enough pairs, unless ``at_most``: then as many as there are, half positive.
     """
     half = count // 2
     warped = round(half * warp_share)
@@ -184,18 +183,18 @@ def choose_pairs(
 
 
 def _codes(pairs: Indices) -> Indices:
-    """One number (n,) for each unordered pair (n, 2)."""
+    """Return one number (n,) for each unordered pair (n, 2)."""
     return (np.minimum(pairs[:, 0], pairs[:, 1]) << 32) + np.maximum(pairs[:, 0], pairs[:, 1])
 
 
 def _draw_images(images: Indices, count: int, rng: np.random.Generator) -> Indices:
-    """Draw ``count`` images, none again before all were drawn."""
+    """Draw ``count`` images; no image is drawn again before all were drawn."""
     rounds = [rng.permutation(images) for _ in range(-(-count // max(1, len(images))))]
     return np.concatenate([images[:0], *rounds])[:count]
 
 
 def _enough_pairs(available: Mapping[int, int], half: int, images: int, split: str, at_most: bool) -> int:
-    """Return how many pairs of each label can be taken: ``half``, or with ``at_most`` what there is if that is less."""
+    """Return how many pairs of each label can be taken: ``half``, or with ``at_most`` fewer if there are fewer."""
     least = min(available.values())
     if least >= half:
         return half
@@ -204,7 +203,7 @@ def _enough_pairs(available: Mapping[int, int], half: int, images: int, split: s
         lacking = next(LABEL_WORDS[label] for label in available if available[label] == least)
         remedy = f"ask for {2 * least}, or give --at-most" if least else f"it has no {lacking} pair at all"
         raise InputError(
-            f"{split}: {2 * half} pairs need {half} of each label, but its {images} images have only {counts} ones; "
+            f"{split}: {2 * half} pairs need {half} of each label, but its {images} images have only {counts} pairs; "
             f"{remedy}"
         )
     return least
@@ -213,9 +212,9 @@ def _enough_pairs(available: Mapping[int, int], half: int, images: int, split: s
 def find_pairs(
     source: PairSource, images: Indices, wanted: Mapping[int, int], rng: np.random.Generator
 ) -> dict[int, Indices]:
-    """Draw up to ``wanted[label]`` different pairs (n, 2) of each label among ``images``, evenly, in random order.
+    """Draw up to ``wanted[label]`` different pairs (n, 2) of each label among ``images``, uniformly, in random order.
 
-    Fewer come back only where there are no more: their number is then exact.
+    If there are fewer pairs, all of them are returned.
     """
     found = {label: np.zeros((0, 2), np.intp) for label, number in wanted.items() if not number}
     listed = None if POSITIVE in found else source.positives()
@@ -242,7 +241,7 @@ def _drawn(pairs: Indices, wanted: int, rng: np.random.Generator) -> Indices:
 
 
 def _all_pairs(source: PairSource, images: Indices, labels: tuple[int, ...]) -> dict[int, Indices]:
-    """Judge every pair of ``images``, by blocks; return those of each label (n, 2), the earlier index first."""
+    """Label every pair of ``images``, by blocks; return the pairs of each label (n, 2), the smaller index first."""
     parts: dict[int, list[Indices]] = {label: [] for label in labels}
     height = max(1, DRAWN_AT_ONCE // max(1, len(images)))
     for start in range(0, len(images), height):
@@ -260,7 +259,7 @@ def _all_pairs(source: PairSource, images: Indices, labels: tuple[int, ...]) -> 
 def _draw_and_judge(
     source: PairSource, images: Indices, wanted: Mapping[int, int], rng: np.random.Generator, budget: int
 ) -> dict[int, Indices]:
-    """Draw pairs evenly and keep those of the wanted labels, until there are enough or ``budget`` pairs were drawn."""
+    """Draw pairs uniformly and keep those of the wanted labels, until there are enough or ``budget`` were drawn."""
     count = len(images)
     codes: dict[int, Indices] = {label: np.zeros(0, np.intp) for label in wanted}
     for _ in range(0, budget, DRAWN_AT_ONCE):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lmdb_build.pairs.list_file import ListedPair, read_pair_list
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_image
+from loopclosure.places.frames import read_bgr
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 240, 180
 BORDER, CAPTION, TITLE = 6, 40, 44
@@ -22,7 +22,7 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 def contact_sheet(list_file: Path, root: Path, rows: int = 6, seed: int = 1) -> NDArray:
     """Draw ``rows`` positive pairs on the left and as many negative ones on the right: (H, W, 3) uint8, BGR.
 
-    The pairs are drawn from the list by the seed. Raises InputError for a list or an image that cannot be read.
+    The pairs are drawn from the list at random. Raises InputError for a list or an image that cannot be read.
     """
     pairs = read_pair_list(list_file)
     rng = np.random.default_rng(seed)
@@ -43,9 +43,9 @@ def contact_sheet(list_file: Path, root: Path, rows: int = 6, seed: int = 1) -> 
 
 
 def write_contact_sheet(list_file: Path, root: Path, out: Path, rows: int = 6, seed: int = 1) -> None:
-    """Write :func:`contact_sheet` as a picture; its format follows from the ending."""
+    """Write :func:`contact_sheet` as a picture; the suffix says its format."""
     if rows < 1:
-        raise InputError(f"a contact sheet has at least 1 row, not {rows}")
+        raise InputError(f"a contact sheet must have at least 1 row, not {rows}")
     sheet = contact_sheet(list_file, root, rows, seed)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -53,7 +53,7 @@ def write_contact_sheet(list_file: Path, root: Path, out: Path, rows: int = 6, s
     except (OSError, cv2.error):
         written = False
     if not written:
-        raise InputError("cannot be written as a picture; an ending such as .png says its format", out)
+        raise InputError("cannot be written as a picture; a suffix such as .png says its format", out)
 
 
 def _title(text: str, colour: tuple[int, int, int]) -> NDArray:
@@ -67,7 +67,7 @@ def _pair(pair: ListedPair, list_file: Path, root: Path, colour: tuple[int, int,
     cv2.rectangle(tile, (0, 0), (_width() - 1, IMAGE_HEIGHT + 2 * BORDER - 1), colour, -1)
     for number, name in enumerate((pair.first, pair.second)):
         try:
-            picture = read_image(root / name)
+            picture = read_bgr(root / name)
         except InputError as error:
             raise InputError(f"{root / name} {error.message}", list_file, pair.line, 1) from error
         left = BORDER + number * (IMAGE_WIDTH + BORDER)
@@ -83,7 +83,7 @@ def _width() -> int:
 
 
 def _fitted(picture: NDArray) -> NDArray:
-    """Scale a picture into its frame, its shape kept."""
+    """Scale a picture into its frame, without distortion."""
     scale = min(IMAGE_WIDTH / picture.shape[1], IMAGE_HEIGHT / picture.shape[0])
     size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
     scaled = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
@@ -94,6 +94,6 @@ def _fitted(picture: NDArray) -> NDArray:
 
 
 def _caption(name: str, longest: int = 32) -> list[str]:
-    """Two lines: the folder's end and the file's name's end."""
+    """Return two lines: the end of the folder's name, the end of the file's name."""
     folder, _, file = name.rpartition("/")
     return [text if len(text) <= longest else ".." + text[-(longest - 2) :] for text in (folder, file)]

@@ -1,4 +1,4 @@
-"""Hard negatives: pairs of other places that a net takes for the same place, by the distance of its features."""
+"""Hard negatives: pairs of different places whose features, by some net, are near each other."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.pairs.choose import NEGATIVE, Indices, PairSource
+from loopclosure.descriptors.similarity import squared_distances
 
-# How many nearest images of each image are looked at: in a video the first hundreds may be neighbours in time.
+# How many nearest images of each image are examined: in a video the first hundreds may be neighbors in time.
 DEEPEST = 512
 ROWS_AT_ONCE = 512
 
@@ -15,8 +16,8 @@ ROWS_AT_ONCE = 512
 def hard_negatives(source: PairSource, images: Indices, features: NDArray[np.floating], wanted: int) -> Indices:
     """Choose up to ``wanted`` negative pairs (n, 2) of ``images`` (m,) whose ``features`` (m, D) are nearest.
 
-    Every image's nearest negative comes first, then every image's second, and so on, each time the nearer pairs first:
-    so the pairs spread over all places rather than gather at the one that the net knows least.
+    Every image's nearest negative comes first, then every image's second nearest, and so on, each time with the nearer
+    pairs first. So the pairs are of all places, and not only of the place that the net knows least.
     """
     count = len(images)
     depth = min(DEEPEST, count - 1)
@@ -24,11 +25,11 @@ def hard_negatives(source: PairSource, images: Indices, features: NDArray[np.flo
         return np.zeros((0, 2), np.intp)
     features = features.astype(np.float64)
     squares = (features**2).sum(axis=1)
-    keep = 2 * -(-wanted // count) + 2  # of each image; a pair may be found from both of its images
+    keep = 2 * -(-wanted // count) + 2  # of each image; both images of a pair may find it
     parts = []
     for start in range(0, count, ROWS_AT_ONCE):
         rows = np.arange(start, min(start + ROWS_AT_ONCE, count))
-        distances = squares[rows, None] - 2 * features[rows] @ features.T + squares[None]
+        distances = squared_distances(features[rows], features, squares[rows, None], squares)
         distances[np.arange(len(rows)), rows] = np.inf
         nearest = np.argpartition(distances, depth - 1, axis=1)[:, :depth]
         near = np.take_along_axis(distances, nearest, axis=1)

@@ -1,6 +1,6 @@
-"""The list file of pairs: ``first second label`` a line, its settings in comment lines before them.
+"""The list file of pairs: one ``first second label`` per line, after comment lines with the settings.
 
-A name that holds blanks, or begins with ``#``, stands in double quotes.
+A name that contains blanks, or begins with ``#``, is in double quotes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import numpy as np
 
 from loopclosure.errors import InputError
 
-ROOT_FOLDER = "root folder"  # the setting that says what a list's images are relative to, seen from the list's folder
+ROOT_FOLDER = (
+    "root folder"  # this setting is the folder that image names are relative to, itself relative to the list's folder
+)
 
 
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
@@ -32,9 +34,9 @@ class ListedPair:
 
 
 def write_pair_list(path: Path, pairs: Iterable[tuple[str, str, int]], settings: Mapping[str, str]) -> None:
-    """Write a list; ``settings`` become the lines ``# name: value`` of its head.
+    """Write a list; ``settings`` become the lines ``# name: value`` of its header.
 
-    Raises InputError for an image name that a list cannot hold, or where the file cannot be written.
+    Raises InputError for an image name that a list cannot contain, or if the file cannot be written.
     """
     lines = ["# first second label; 1: the same place, 0: other places"]
     lines += [f"# {name}: {value}" for name, value in settings.items()]
@@ -48,7 +50,7 @@ def write_pair_list(path: Path, pairs: Iterable[tuple[str, str, int]], settings:
 
 
 def read_pair_list(path: Path) -> list[ListedPair]:
-    """Read a list. Raises InputError (file:line:column) for a line that is not one."""
+    """Read a list. Raises InputError (file:line:column) for a malformed line."""
     pairs = []
     for number, line in enumerate(_read_lines(path), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -72,7 +74,7 @@ def read_pair_list(path: Path) -> list[ListedPair]:
 
 
 def read_settings(path: Path) -> dict[str, str]:
-    """Return the ``# name: value`` lines of a list's head."""
+    """Return the ``# name: value`` lines of a list's header."""
     settings = {}
     for line in _read_lines(path):
         if not line.startswith("#"):
@@ -85,19 +87,19 @@ def read_settings(path: Path) -> dict[str, str]:
 
 def _quoted(name: str) -> str:
     if '"' in name or "\n" in name:
-        raise InputError(f"cannot list the image {name!r}: a name has no quotes and no line breaks")
+        raise InputError(f"cannot list the image {name!r}: a name must not contain quotes or line breaks")
     return f'"{name}"' if name.split() != [name] or name.startswith("#") else name
 
 
 def root_of(path: Path) -> Path:
-    """Return the folder that a list's images are relative to, as its head says; the list's own folder otherwise."""
+    """Return the folder that a list's images are relative to: what its header says, or else the list's own folder."""
     return path.parent / read_settings(path).get(ROOT_FOLDER, ".")
 
 
 def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = None) -> tuple[int, Path]:
     """Write the pairs of several lists, shuffled together, as one; return their number and the common root folder.
 
-    Images are named anew, relative to ``root`` or to the common parent of the lists' roots.
+    Image names become relative to ``root`` or to the common parent of the lists' roots.
     """
     roots = [root_of(path).resolve() for path in lists]
     common = Path(os.path.commonpath(roots)) if root is None else root.resolve()
@@ -105,7 +107,9 @@ def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = 
     for path, own_root in zip(lists, roots, strict=True):
         prefix = Path(os.path.relpath(own_root, common)).as_posix()
         if prefix.startswith(".."):
-            raise InputError(f"its images lie in {own_root}, not below the root folder {common}; name another", path)
+            raise InputError(
+                f"its images are in {own_root}, not below the root folder {common}; give another root", path
+            )
         above = "" if prefix == "." else prefix + "/"
         pairs += [(above + pair.first, above + pair.second, pair.label) for pair in read_pair_list(path)]
     order = np.random.default_rng(seed).permutation(len(pairs))

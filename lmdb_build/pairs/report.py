@@ -1,4 +1,4 @@
-"""What was chosen, in words and figures: pairs of each kind, and how far apart they are."""
+"""The report of the chosen pairs: how many of each kind, and the distributions of their measures."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def kinds(source: PairSource, pairs: Pairs) -> dict[str, int]:
 
 
 def _distribution(name: str, known: dict[int, NDArray[np.float64]]) -> list[str]:
-    """Three lines: quantiles of both labels, and their histograms over one range."""
+    """Return three lines: a header, and for both labels quantiles and a histogram over one range."""
     edges = np.histogram_bin_edges(np.concatenate(list(known.values())), BINS)
     head = "".join(f"{_quantile_name(quantile):>9}" for quantile in QUANTILES)
     lines = [f"  {name:<16}{head}   {edges[0]:.3g} {'to':^{BINS - 8}} {edges[-1]:.3g}"]

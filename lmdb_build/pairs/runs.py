@@ -1,4 +1,4 @@
-"""Images as a camera took them, run by run: of a table of frames, or of folders."""
+"""Images of a camera, run by run: from a table of frames, or from folders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Runs:
 
     names   M names below the root folder
     tracks  (M,) the number of the run
-    stamps  (M,) where along it: seconds, or the image's number
+    stamps  (M,) the position along the run: seconds, or the image's number
     """
 
     names: list[str]
@@ -30,7 +30,7 @@ class Runs:
 
 
 def index_runs(index: Path, root: Path, track: str, time: str) -> Runs:
-    """Read a CSV table of frames as runs: column ``track`` names the run, ``time`` says where along it."""
+    """Read a CSV table of frames as runs: column ``track`` names the run, ``time`` is the position along it."""
     rows, (column,) = read_table(index, 1)
     tracks = [cell(index, line, row, track) for line, row in rows]
     return Runs(
@@ -41,7 +41,7 @@ def index_runs(index: Path, root: Path, track: str, time: str) -> Runs:
 
 
 def folder_runs(folders: Sequence[Path], root: Path) -> Runs:
-    """Take each folder (or list) of images for a run, its images one unit of time apart."""
+    """Take each folder (or list) of images as a run, with images one unit of time apart."""
     runs = [[relative(path, root) for path in image_paths(folder)] for folder in folders]
     return Runs(
         names=[name for run in runs for name in run],

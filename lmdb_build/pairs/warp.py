@@ -1,4 +1,4 @@
-"""Pairs made by warping one image: another view of a place that was seen but once."""
+"""Pairs made by warping one image: another view of a place that was seen only once."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.picture import CORNERS, seen_through, write_jpeg
-from loopclosure.places.frames import read_image
+from loopclosure.places.frames import read_bgr
 
-# Each corner of the cut-out is moved inwards by up to this share of the picture's width and height: a crop, a change of
-# scale to 0.6 at least, a shift, a turn and a change of perspective at once, and never a black border.
+# Each corner of the crop is moved inward by up to this share of the picture's width and height. That crops, scales (to
+# at least 0.6), shifts, rotates and changes the perspective, without a black border.
 LARGEST_INSET = 0.2
 GAIN = (0.6, 1.4)
 GAMMA = (0.7, 1.4)
-TINT = 0.08  # each colour channel's gain varies by so much besides
+TINT = 0.08  # the gain of each color channel also varies by this much
 
 
 def warp(image: NDArray, rng: np.random.Generator) -> NDArray:
-    """Return the image (H, W, 3) uint8 as a camera nearby might see it in other light, at the same size."""
+    """Return the image (H, W, 3) uint8, at the same size, as a nearby camera might see it in other light."""
     height, width = image.shape[:2]
     inset = rng.uniform(0, LARGEST_INSET, (4, 2))
     whole = CORNERS * [width - 1, height - 1]
@@ -33,7 +33,7 @@ def warp(image: NDArray, rng: np.random.Generator) -> NDArray:
 
 
 def write_warped(source: Path, target: Path, rng: np.random.Generator) -> None:
-    """Write a warped copy of an image file. Raises InputError where one cannot be read or the other not written."""
-    picture = warp(read_image(source), rng)
+    """Write a warped copy of an image file. Raises InputError if the files cannot be read or written."""
+    picture = warp(read_bgr(source), rng)
     target.parent.mkdir(parents=True, exist_ok=True)
     write_jpeg(target, picture)

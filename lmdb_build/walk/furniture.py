@@ -1,4 +1,4 @@
-"""What stands in the rooms of the made-up house, as textured boxes, and the kinds of rooms there are."""
+"""The furniture of the synthetic house, as textured boxes, and the kinds of rooms."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lmdb_build.walk.textures import Texture, colour
 
 @dataclass(frozen=True)
 class Box:
-    """A box in metres: ``left`` to ``right`` along the wall, ``near`` to ``far`` off it, ``low`` to ``high``."""
+    """A box in meters: ``left`` to ``right`` along the wall, ``near`` to ``far`` from it, ``low`` to ``high``."""
 
     left: float
     right: float
@@ -28,7 +28,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Piece:
-    """A piece of furniture: the floor it takes along the wall and off it, its height (metres), its boxes."""
+    """A piece of furniture: its size along the wall and away from it, its height (meters), its boxes."""
 
     width: float
     depth: float
@@ -42,7 +42,7 @@ Finish = Callable[[np.random.Generator, float], Texture]
 
 @dataclass(frozen=True)
 class Theme:
-    """A kind of room: its walls and floor, drawn in the room's hue, and its furniture, the largest first."""
+    """A kind of room: its walls and floor, drawn in the room's hue, and its furniture, largest first."""
 
     wall: Finish
     floor: Finish
@@ -59,7 +59,7 @@ def _solid(rng: np.random.Generator, width: float, depth: float, height: float, 
 
 
 def bookcase(rng: np.random.Generator, hue: float) -> Piece:
-    """Tall, full of books."""
+    """A tall bookcase, full of books."""
     return _solid(rng, rng.uniform(0.9, 1.7), 0.3, rng.uniform(1.7, 2.2), paint.shelf)
 
 
@@ -70,13 +70,13 @@ def chest(rng: np.random.Generator, hue: float) -> Piece:
 
 
 def wardrobe(rng: np.random.Generator, hue: float) -> Piece:
-    """As tall as a man, with doors, painted in a colour that goes with the room."""
+    """A wardrobe with doors, in a color that goes with the room."""
     tint = colour(hue + rng.choice([0.08, 0.5]), rng.uniform(0.15, 0.5), rng.uniform(0.5, 0.9))
     return _solid(rng, rng.uniform(1.1, 1.6), 0.6, 2.1, paint.drawers(tint, int(rng.integers(2, 4)), 1))
 
 
 def fridge(rng: np.random.Generator, hue: float) -> Piece:
-    """White or coloured, tall and narrow."""
+    """A tall and narrow refrigerator, white or colored."""
     tint = colour(hue + 0.45, rng.choice([0.02, 0.6]), 0.9)
     body = paint.plain(tint, 0.03)
     return Piece(0.65, 0.65, 1.8, (Box(0, 0.65, 0, 0.65, 0, 1.8, paint.drawers(tint, 1, 2), body, body),))
@@ -114,7 +114,7 @@ def tub(rng: np.random.Generator, hue: float) -> Piece:
 
 
 def sofa(rng: np.random.Generator, hue: float) -> Piece:
-    """A sofa in one cloth, with a cushion."""
+    """A sofa with a cushion."""
     width = rng.uniform(1.6, 2.2)
     base = colour(hue + rng.choice([0.33, 0.5, 0.67]), rng.uniform(0.4, 0.8), rng.uniform(0.35, 0.8))
     cloth = paint.plaid(base, colour(hue, 0.4, 0.8)) if rng.uniform() < 0.5 else paint.plain(base, 0.08)
@@ -142,7 +142,7 @@ def television(rng: np.random.Generator, hue: float) -> Piece:
 
 
 def bed(rng: np.random.Generator, hue: float) -> Piece:
-    """A bed, its head at the wall."""
+    """A bed with its head at the wall."""
     width = rng.uniform(1.0, 1.6)
     timber = paint.plain(_timber(rng), 0.1)
     cover = paint.plaid(colour(hue + 0.5, 0.5, 0.7), colour(hue + 0.15, 0.6, 0.9))
@@ -181,7 +181,7 @@ def table(rng: np.random.Generator, hue: float) -> Piece:
 
 
 def crates(rng: np.random.Generator, hue: float) -> Piece:
-    """A stack of coloured crates."""
+    """A stack of colored crates."""
     boxes = []
     for level, left in ((0, 0.0), (0, 0.55), (1, rng.uniform(0, 0.5))):
         tint = colour(rng.uniform(), 0.75, 0.75)
@@ -191,7 +191,7 @@ def crates(rng: np.random.Generator, hue: float) -> Piece:
 
 
 def plant(rng: np.random.Generator, hue: float) -> Piece:
-    """A shrub, cut square, in a pot."""
+    """A rectangular shrub in a pot."""
     leaves = paint.motif(colour(0.33, 0.7, 0.35), colour(rng.uniform(0.25, 0.4), 0.8, 0.6), 0.1)
     pot = paint.plain(colour(0.04, 0.7, rng.uniform(0.5, 0.8)))
     tall = rng.uniform(1.0, 1.5)

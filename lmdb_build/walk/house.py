@@ -1,6 +1,6 @@
-"""The made-up house: a ring of furnished rooms, as textured rectangles in space, and the way that leads through them.
+"""The synthetic house: a ring of furnished rooms, as textured rectangles in space, and the path through them.
 
-World: metres, x and y on the floor, z up. Everything follows from the seed.
+World: meters, x and y on the floor, z up. Everything follows from the seed.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ Glow = Literal["daylight", "lamp"] | None
 HEIGHT_M = 2.6
 DOOR_WIDTH_M, DOOR_HEIGHT_M = 1.1, 2.05
 HALF_WALL_M = 0.1
-CLEARANCE_M = 0.55  # between the way and furniture
-LONGEST_QUAD_M = 2.5  # a longer one is cut, so that each part is drawn at a resolution that suits its distance
+CLEARANCE_M = 0.55  # between the path and furniture
+LONGEST_QUAD_M = 2.5  # longer ones are cut, so that each part is drawn at a resolution for its distance
 
 
 @dataclass(frozen=True)
 class Quad:
     """A textured rectangle: its upper left corner (3,), and the edges (3,) along the texture's rows and columns.
 
-    It is seen from the side to which ``down`` x ``right`` points. ``glow``: what it shines with by itself.
-    ``shell``: wall, floor or ceiling, darker where it meets another.
+    It is visible from the side to which ``down`` x ``right`` points. ``glow``: the light that it emits.
+    ``shell``: wall, floor or ceiling, which are darker near their edges.
     """
 
     origin: Vector
@@ -46,7 +46,7 @@ class Quad:
 
 @dataclass(frozen=True)
 class Wall:
-    """A wall as seen from inside: its left end (2,), unit directions (2,) to the right and inwards, its length in m."""
+    """A wall as seen from inside: its left end (2,), unit directions (2,) to the right and inward, its length in m."""
 
     start: Vector
     right: Vector
@@ -54,13 +54,13 @@ class Wall:
     length: float
 
     def at(self, along: float, inward: float, z: float) -> Vector:
-        """Return the point (3,) in the world at the wall's own coordinates."""
+        """Return the point (3,) in the world of coordinates along the wall."""
         return np.append(self.start + along * self.right + inward * self.inward, z)
 
 
 @dataclass
 class Room:
-    """A room's floor rectangle (x0, y0, x1, y1) in metres, its light and what fills its walls so far."""
+    """A room's floor rectangle (x0, y0, x1, y1) in meters, its lights and the occupied parts of its walls."""
 
     index: int
     bounds: tuple[float, float, float, float]
@@ -81,14 +81,14 @@ class Room:
         lengths = [x1 - x0, y1 - y0, x1 - x0, y1 - y0]
         walls = []
         for (start, inward), length in zip(ends, lengths, strict=True):
-            # Seen from inside one looks along -inward; right is that direction crossed with up.
+            # From inside, the view is along -inward; right is that direction crossed with up.
             walls.append(Wall(np.array(start), np.array([-inward[1], inward[0]]), np.array(inward), length))
         return walls
 
 
 @dataclass(frozen=True)
 class House:
-    """All surfaces, the rooms, and the closed way (P, 2) through every room at equal steps of ``step_m`` metres."""
+    """All surfaces, the rooms, and the closed path (P, 2) through every room at equal steps of ``step_m`` meters."""
 
     quads: list[Quad]
     rooms: list[Room]
@@ -97,7 +97,7 @@ class House:
 
     @property
     def way_length_m(self) -> float:
-        """Length of one lap in metres."""
+        """Length of one lap in meters."""
         return len(self.way) * self.step_m
 
 
@@ -129,7 +129,7 @@ def build_house(seed: int, rooms: int = 4) -> House:
     hue = rng.uniform()
     for room in plan:
         theme = THEMES[themes[room.index % len(THEMES)]]
-        # Hues spread evenly over the house, so that no two rooms are of a colour.
+        # Hues are spread evenly over the house, so that no two rooms have the same color.
         room_hue = hue + room.index / rooms + rng.uniform(-0.04, 0.04)
         quads += _furnish(np.random.default_rng([seed, 2, room.index]), room, theme, room_hue, doors, way)
     for room, door in zip(plan, doors, strict=True):
@@ -138,7 +138,7 @@ def build_house(seed: int, rooms: int = 4) -> House:
 
 
 def _place_door(rng: np.random.Generator, room: Room, following: Room) -> tuple[Vector, Vector]:
-    """Choose where the door between two neighbours is: its centre (2,) and the direction (2,) through it."""
+    """Choose where the door between two neighbors is: its center (2,) and the direction (2,) through it."""
     x0, y0, x1, y1 = room.bounds
     u0, v0, u1, v1 = following.bounds
     margin = DOOR_WIDTH_M / 2 + 0.5
@@ -152,16 +152,16 @@ def _place_door(rng: np.random.Generator, room: Room, following: Room) -> tuple[
 
 
 def _way(rng: np.random.Generator, plan: list[Room], doors: list[tuple[Vector, Vector]]) -> tuple[Vector, float]:
-    """Lead straight through each door and round the middle of each room; return (P, 2) points and their step in m."""
+    """Return a path straight through each door and around each room: (P, 2) points, and their step in m."""
     stops = []
     for room in plan:
         (entry, into), (exit_, out) = doors[room.index - 1], doors[room.index]
         x0, y0, x1, y1 = room.bounds
-        # Further on than straight from door to door, so that each room is seen from several sides.
+        # Not straight from door to door, so that each room is seen from several sides.
         corner = np.array([(x0 + x1) / 2, (y0 + y1) / 2]) + 0.35 * (into - out) + rng.uniform(-0.2, 0.2, 2)
         stops += [entry + 0.7 * into, corner, exit_ - 0.7 * out, exit_]
     line = np.array(stops)
-    for _ in range(4):  # Chaikin: cutting corners ends in a smooth closed curve
+    for _ in range(4):  # Chaikin: cutting corners gives a smooth closed curve
         following = np.roll(line, -1, axis=0)
         line = np.stack([0.75 * line + 0.25 * following, 0.25 * line + 0.75 * following], axis=1).reshape(-1, 2)
     closed = np.vstack([line, line[:1]])
@@ -208,7 +208,7 @@ def _furnish(
 
 
 def _openings(wall: Wall, doors: list[tuple[Vector, Vector]]) -> list[tuple[float, float]]:
-    """Return where doors pierce the wall, as intervals along it in metres."""
+    """Return the doors in the wall, as intervals along it in meters."""
     gaps = []
     for centre, through in doors:
         offset = centre - wall.start
@@ -219,7 +219,7 @@ def _openings(wall: Wall, doors: list[tuple[Vector, Vector]]) -> list[tuple[floa
 
 
 def _outer(room: Room, doors: list[tuple[Vector, Vector]]) -> list[int]:
-    """Return the walls without a door: most of them look outside."""
+    """Return the walls without a door: most of them are outer walls."""
     return [number for number, wall in enumerate(room.walls) if not _openings(wall, doors)]
 
 
@@ -240,7 +240,7 @@ def _wall_with_doors(room: int, wall: Wall, gaps: list[tuple[float, float]], tex
 
 def _jamb(room: int, centre: Vector, through: Vector) -> list[Quad]:
     """Return the four faces of the wall's thickness in a doorway."""
-    across = np.array([through[1], -through[0]])  # to the right of one who walks through
+    across = np.array([through[1], -through[0]])  # to the right when walking through
     timber = np.full((64, 16, 3), (90, 130, 170), np.uint8)
     depth, down = np.append(2 * HALF_WALL_M * through, 0), np.array([0, 0, -DOOR_HEIGHT_M])
     left = np.append(centre - DOOR_WIDTH_M / 2 * across - HALF_WALL_M * through, DOOR_HEIGHT_M)
@@ -255,7 +255,7 @@ def _jamb(room: int, centre: Vector, through: Vector) -> list[Quad]:
 
 
 def _place_piece(rng: np.random.Generator, room: Room, piece: Piece, way: Vector) -> list[Quad]:
-    """Stand a piece of furniture against a wall where it blocks neither the way nor other things, if there is room."""
+    """Place a piece of furniture at a wall where it does not block the path or other things, if there is space."""
     for _ in range(40):
         number = int(rng.integers(4))
         wall = room.walls[number]
@@ -279,7 +279,7 @@ def _place_piece(rng: np.random.Generator, room: Room, piece: Piece, way: Vector
 
 
 def _faces(rng: np.random.Generator, room: int, wall: Wall, left: float, box: Box) -> list[Quad]:
-    """Return the visible faces of a box that stands at ``left`` metres along the wall."""
+    """Return the visible faces of a box at ``left`` meters along the wall."""
     a, b = left + box.left, left + box.right
     across, depth, down = (
         np.append((b - a) * wall.right, 0),
@@ -313,7 +313,7 @@ def _hang(
     glow: Glow = None,
     walls: list[int] | None = None,
 ) -> list[Quad]:
-    """Hang up to ``count`` pictures (or windows) where a wall is free, a little in front of it."""
+    """Hang up to ``count`` pictures (or windows) on free parts of the walls, slightly in front of them."""
     quads = []
     for _ in range(count):
         wide, tall = rng.uniform(*widths), rng.uniform(*heights)
@@ -333,7 +333,7 @@ def _hang(
 
 
 def _shadows(floor: Image, room: Room) -> None:
-    """Darken the floor around what stands on it."""
+    """Darken the floor around furniture."""
     x0, _, _, y1 = room.bounds
     dark = np.zeros(floor.shape[:2], np.float32)
     for p0, o0, p1, o1 in room.footprints:
@@ -352,7 +352,7 @@ def _cut(quad: Quad) -> list[Quad]:
     parts = []
     for row in range(rows):
         for column in range(columns):
-            # Cut between texels, and place the part exactly where its texels are.
+            # Cut between texels, so that each part is exactly where its texels are.
             top, bottom = tall * row // rows, tall * (row + 1) // rows
             left, right = wide * column // columns, wide * (column + 1) // columns
             parts.append(

@@ -1,6 +1,6 @@
-"""A small renderer for the made-up house: perspective-correct textured rectangles, nearest first, with a depth buffer.
+"""A small renderer for the synthetic house: textured rectangles in perspective, nearest first, with a depth buffer.
 
-Camera: pinhole, x to the right, y down, z forward; the centre of pixel (column, row) is at exactly those coordinates.
+Camera: pinhole, x to the right, y down, z forward; the center of pixel (column, row) is at exactly those coordinates.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from lmdb_build.walk.textures import Image
 Array = NDArray[np.float64]
 
 NEAR_M = 0.05
-LIGHT_GRID_M = 0.1  # light changes slowly: it is computed on this grid and interpolated
+LIGHT_GRID_M = 0.1  # light varies slowly: it is computed on this grid and interpolated
 SUBPIXEL_BITS = 4
-AHEAD = np.float32(1.0005)  # so much nearer than what is painted already; faces that meet must not fight
+AHEAD = np.float32(1.0005)  # a new pixel must be nearer by this factor, or faces that touch would flicker
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class Camera:
 
     @property
     def centre(self) -> tuple[float, float]:
-        """The principal point (column, row): the picture's middle."""
+        """The principal point (column, row): the center of the picture."""
         return (self.width - 1) / 2, (self.height - 1) / 2
 
     def project(self, points: Array) -> Array:
-        """Project points (..., 3) in camera coordinates, before the camera, to pixels (..., 2)."""
+        """Project points (..., 3) in camera coordinates, in front of the camera, to pixels (..., 2)."""
         return points[..., :2] / points[..., 2:] * self.focal + np.array(self.centre)
 
 
 @dataclass(frozen=True)
 class Light:
-    """How a lap is lit: BGR factors of the ambient light, of daylight at the windows and of each room's lamp."""
+    """The light of a lap: BGR factors of the ambient light, of daylight at the windows and of each room's lamp."""
 
     ambient: Array  # (3,)
     daylight: Array  # (3,)
@@ -51,7 +51,7 @@ class Light:
 
 
 class Renderer:
-    """Draws a house as one camera sees it. :meth:`relight` costs some 0.1 s, :meth:`draw` some milliseconds."""
+    """Draws a house as one camera sees it. :meth:`relight` takes about 0.1 s, :meth:`draw` a few milliseconds."""
 
     def __init__(self, house: House, camera: Camera, light: Light) -> None:
         self.house, self.camera = house, camera
@@ -72,7 +72,7 @@ class Renderer:
         self.relight(light)
 
     def relight(self, light: Light) -> None:
-        """Change the light: all textures are lit anew."""
+        """Change the light: all textures are lit again."""
         self._pyramids = [_pyramid(_lit(quad, self.house.rooms[quad.room], light)) for quad in self.house.quads]
 
     def draw(self, position: Array, rotation: Array) -> Image:
@@ -105,7 +105,7 @@ class Renderer:
         return picture
 
     def _touches_view(self, corners: Array) -> NDArray[np.bool_]:
-        """Tell which of the (Q, 4, 3) rectangles are not wholly behind or beside the view."""
+        """Return which of the (Q, 4, 3) rectangles are not entirely behind or beside the view."""
         x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
         side, top = self.camera.width / 2 / self.camera.focal, self.camera.height / 2 / self.camera.focal
         outside = [z < NEAR_M, x > side * z, x < -side * z, y > top * z, y < -top * z]
@@ -114,7 +114,7 @@ class Renderer:
     def _draw_quad(
         self, picture: Image, nearness: NDArray[np.float32], pyramid: list[Image], corners: Array, to_unit: Array
     ) -> None:
-        """Paint one rectangle, of ``corners`` (n, 3) before the camera, where it is nearer than what is there."""
+        """Paint one rectangle, of ``corners`` (n, 3) in front of the camera, where it is nearer than what is there."""
         outline = self.camera.project(corners)
         (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)
         x0, y0 = max(int(left), 0), max(int(top), 0)
@@ -123,7 +123,7 @@ class Renderer:
             return
         slope = to_unit[2]
         near = (slope[0] * np.arange(x0, x1))[None] + (slope[1] * np.arange(y0, y1) + slope[2])[:, None]
-        # A filled polygon covers its border pixels whole: beyond the border the plane must not come nearer than it is.
+        # A filled polygon covers its border pixels entirely: there the plane must not be nearer than the rectangle.
         near = np.minimum(near, 1 / corners[:, 2].min()).astype(np.float32)
         mask = np.zeros(near.shape, np.uint8)
         fixed_point = np.round((outline - [x0, y0]) * (1 << SUBPIXEL_BITS)).astype(np.int32)
@@ -148,7 +148,7 @@ class Renderer:
 
 
 def _clip_near(corners: Array) -> Array:
-    """Cut a polygon (4, 3) at the near plane; return what is before it (n, 3)."""
+    """Cut a polygon (4, 3) at the near plane; return the part in front of it (n, 3)."""
     depth = corners[:, 2] - NEAR_M
     if (depth >= 0).all():
         return corners
@@ -164,7 +164,7 @@ def _clip_near(corners: Array) -> Array:
 
 
 def _level(to_unit: Array, pixel: Array, pyramid: list[Image]) -> int:
-    """Choose the pyramid level with about one texel a pixel, at ``pixel`` (column, row, 1)."""
+    """Choose the pyramid level with about one texel per pixel, at ``pixel`` (column, row, 1)."""
     u, v, w = to_unit @ pixel
     (a, b), (c, d) = to_unit[:2, :2] * w - np.outer([u, v], to_unit[2, :2])
     tall, wide = pyramid[0].shape[:2]
@@ -197,7 +197,7 @@ def _lit(quad: Quad, room: Room, light: Light) -> Image:
     ]:
         towards = source - points
         distance = np.linalg.norm(towards, axis=-1)
-        cosine = np.clip(towards @ normal / np.maximum(distance, 0.01), 0.15, None)  # light also comes off the walls
+        cosine = np.clip(towards @ normal / np.maximum(distance, 0.01), 0.15, None)  # walls also reflect light
         power += (cosine / (0.6 + 0.35 * distance**2))[..., None] * strength
     if quad.shell:
         power *= _corner_shade(points, room)[..., None]
@@ -206,7 +206,7 @@ def _lit(quad: Quad, room: Room, light: Light) -> Image:
 
 
 def _corner_shade(points: Array, room: Room) -> Array:
-    """Darken points (..., 3) of the shell near a second of its surfaces, as corners are."""
+    """Return factors that darken points (..., 3) of the shell near another of its surfaces, as in corners."""
     x0, y0, x1, y1 = room.bounds
     x, y, z = np.moveaxis(points, -1, 0)
     gaps = np.sort(np.abs(np.stack([x - x0, x1 - x, y - y0, y1 - y, z, HEIGHT_M - z])), axis=0)

@@ -1,9 +1,9 @@
-"""A made-up walk through textured rooms, in the layout of the TUM RGB-D benchmark.
+"""A synthetic walk through textured rooms, in the layout of the TUM RGB-D benchmark.
 
-The quick start and the tests have no data set to fetch: this is theirs. The camera is carried several times round a
-house (:mod:`lmdb_build.walk.house`), so that places are really seen again: each lap at another time of day, a little
-beside the last one, the head turned a little otherwise. Poses are exact and the geometry is true, so the paper's rule
-of the same place means here what it means with real images. Every picture follows from the seed.
+The quick start and the tests use it instead of a data set to download. The camera is carried around a house
+(:mod:`lmdb_build.walk.house`) several times, so that places are seen again: each lap at another time of day, with small
+changes of position and direction. Poses are exact and the geometry is correct, so the paper's rule of the same place
+means the same as with real images. Every picture follows from the seed.
 """
 
 from __future__ import annotations
@@ -37,16 +37,18 @@ Array = NDArray[np.float64]
 SPEED_M_S = 1.2
 POSES_PER_IMAGE = 10
 EYE_HEIGHT_M = 1.5
-# On laps after the first: at most so far beside the way, and so much turned away from it.
+# On laps after the first: the greatest distance and rotation from the path.
 SIDE_STEP_M, TURN_DEG = 0.25, 5.0
-GLANCE_DEG = 22.0  # the head turns from side to side, in the same places on every lap
-NOISE = 3.0  # standard deviation of the sensor's noise, grey levels
+GLANCE_DEG = 22.0  # the camera turns from side to side, in the same places on every lap
+NOISE = 3.0  # standard deviation of the sensor's noise, in gray levels
 
 
 @dataclass(frozen=True)
 class Walk:
-    """A walk to be taken: ``frames`` pictures of ``width`` x ``height`` pixels over ``laps`` rounds of a house,
-    the first at ``start_s`` seconds."""
+    """A walk: ``frames`` pictures of ``width`` x ``height`` pixels over ``laps`` laps of a house.
+
+    ``start_s`` is the time of the first picture, in seconds.
+    """
 
     frames: int = 400
     width: int = 320
@@ -57,15 +59,15 @@ class Walk:
     start_s: float = 1000.0
 
     def check(self) -> None:
-        """Raise InputError for numbers that make no walk."""
+        """Raise InputError for numbers out of range."""
         limits = {"frames": (2, 1_000_000), "width": (32, 4096), "height": (32, 4096), "laps": (1, 1000)}
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"a walk's {name} must be {low} to {high}, not {getattr(self, name)}")
         if not 4 <= self.rooms <= 40 or self.rooms % 2:
-            raise InputError(f"a house has an even number of rooms, 4 to 40, not {self.rooms}")
+            raise InputError(f"a house must have an even number of rooms, 4 to 40, not {self.rooms}")
         if self.seed < 0:
-            raise InputError(f"a seed is 0 or more, not {self.seed}")
+            raise InputError(f"a seed must be 0 or more, not {self.seed}")
 
     @property
     def camera(self) -> Camera:
@@ -76,18 +78,18 @@ class Walk:
 def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     """Render ``walk`` into ``folder`` (rgb/, rgb.txt, groundtruth.txt, calibration.txt), yielding each picture's path.
 
-    Raises InputError where the numbers make no walk, or the folder holds a sequence already.
+    Raises InputError if numbers are out of range, or if the folder has a sequence already.
     """
     walk.check()
     folder = Path(folder)
     if (folder / "rgb.txt").exists():
-        raise InputError("holds a sequence already; name another folder or remove this one", folder)
+        raise InputError("holds a sequence already; give another folder or remove this one", folder)
     (folder / "rgb").mkdir(parents=True, exist_ok=True)
     house = build_house(walk.seed, walk.rooms)
     carrier = _Carrier(house, walk)
     step_s = float(carrier.duration_s) / walk.frames
     times = step_s * np.arange(walk.frames, dtype=np.float64)
-    # Poses come faster than pictures and never at the same moment, as with motion capture.
+    # Poses are more frequent than pictures and never at the same time, as with motion capture.
     pose_times = step_s * (np.arange(-POSES_PER_IMAGE, (walk.frames + 1) * POSES_PER_IMAGE) + 0.3) / POSES_PER_IMAGE
     poses = carrier.poses(pose_times)
     frames = [Frame(walk.start_s + time, f"rgb/{walk.start_s + time:.6f}.jpg") for time in times]
@@ -102,7 +104,7 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     write_groundtruth(
         folder / "groundtruth.txt", Trajectory(walk.start_s + pose_times, poses.positions, poses.quaternions)
     )
-    write_rgb_list(folder / "rgb.txt", frames)  # last: with it the sequence is whole
+    write_rgb_list(folder / "rgb.txt", frames)  # last: it makes the sequence complete
 
 
 def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iterator[Image]:
@@ -123,7 +125,7 @@ def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iter
 
 
 def lap_light(seed: int, lap: int, rooms: int) -> Light:
-    """Return how a lap is lit: the first by day, later ones at random hours, some lamps on."""
+    """Return the light of a lap: daylight on the first, a random time of day on later ones, with some lamps on."""
     rng = np.random.default_rng([seed, 3, lap])
     day = 0.9 if lap == 0 else rng.uniform(0.25, 1.1)
     warmth = rng.uniform(-0.12, 0.12)  # blue sky or evening sun
@@ -134,7 +136,7 @@ def lap_light(seed: int, lap: int, rooms: int) -> Light:
 
 
 class _Carrier:
-    """Who carries the camera: where it is and where it looks at any time."""
+    """The motion of the camera: its position and direction at any time."""
 
     def __init__(self, house: House, walk: Walk) -> None:
         self.house = house
@@ -146,7 +148,7 @@ class _Carrier:
         self._yaw = _smooth_angles(np.arctan2(step[:, 1], step[:, 0]), 0.35 / house.step_m)
 
     def walked_m(self, times: Array) -> Array:
-        """Path length (N,) walked at ``times`` (N,), faster and slower by turns."""
+        """Path length (N,) walked at ``times`` (N,), with varying speed."""
         sway = 0.3 * np.sin(2 * np.pi * times / 11 + self._phases[0]) - 0.3 * np.sin(self._phases[0])
         return np.clip(SPEED_M_S * times + sway, 0, None)
 
@@ -156,7 +158,7 @@ class _Carrier:
         lap_m = self.house.way_length_m
         at = walked / self.house.step_m % len(self.house.way)
         x, y = _periodic(at, self.house.way[:, 0]), _periodic(at, self.house.way[:, 1])
-        # The way's direction turns round once or not at all in a lap: interpolate it as a vector.
+        # The direction of the path may make a full turn in a lap: interpolate it as a vector.
         along = np.arctan2(_periodic(at, np.sin(self._yaw)), _periodic(at, np.cos(self._yaw)))
         later = np.clip(walked / lap_m - 0.9, 0, 0.1) / 0.1  # 0 on the first lap, 1 on the others
         side = later * SIDE_STEP_M * _sway(walked, (7.3, 17.1), self._phases[1:3])
@@ -172,7 +174,7 @@ class _Carrier:
 
 
 def _look(yaw: Array, pitch: Array, roll: Array) -> Array:
-    """Camera-to-world rotations (N, 3, 3): ``yaw`` from +x towards +y, ``pitch`` downwards, ``roll`` clockwise."""
+    """Camera-to-world rotations (N, 3, 3): ``yaw`` from +x towards +y, ``pitch`` down, ``roll`` clockwise."""
     cos, sin, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
     ahead = np.stack([cos * np.cos(pitch), sin * np.cos(pitch), -np.sin(pitch)], axis=-1)
     right = np.stack([sin, -cos, zero], axis=-1)
@@ -182,7 +184,7 @@ def _look(yaw: Array, pitch: Array, roll: Array) -> Array:
 
 
 def _sway(walked: Array, periods_m: tuple[float, float], phases: Array) -> Array:
-    """A wandering between -1 and 1 whose periods fit no lap, so that each lap differs."""
+    """A variation between -1 and 1 whose periods do not divide a lap, so that laps differ."""
     return 0.6 * np.sin(2 * np.pi * walked / periods_m[0] + phases[0]) + 0.4 * np.sin(
         2 * np.pi * walked / periods_m[1] + phases[1]
     )

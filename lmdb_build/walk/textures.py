@@ -1,7 +1,7 @@
-"""Surfaces of the made-up house: floors, walls, pictures and furniture fronts, drawn from a seed.
+"""Surfaces of the synthetic house: floors, walls, pictures and furniture fronts, drawn from a seed.
 
-Every function takes a random generator and the surface's size in metres, and returns a BGR picture (H, W, 3) of uint8
-at ``PIXELS_PER_METRE``. The first row is the top of a wall, or the far edge of a floor.
+Every function takes a random generator and the surface's size in meters, and returns a BGR picture (H, W, 3) uint8 at
+``PIXELS_PER_METRE``. The first row is the top of a wall, or the far edge of a floor.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[Any]  # (H, W, 3) uint8, BGR; OpenCV does not promise its type
+Image = NDArray[Any]  # (H, W, 3) uint8, BGR; OpenCV does not declare its type
 Colour = tuple[float, float, float]
 Texture = Callable[[np.random.Generator, float, float], Image]
 
@@ -28,12 +28,12 @@ def colour(hue: float, saturation: float, value: float) -> Colour:
 
 
 def shade(base: Colour, factor: float) -> Colour:
-    """Return the colour made darker (factor below 1) or lighter."""
+    """Return a darker (factor below 1) or lighter color."""
     return min(base[0] * factor, 255), min(base[1] * factor, 255), min(base[2] * factor, 255)
 
 
 def plain(base: Colour, roughness: float = 0.05) -> Texture:
-    """Paint or plaster: one colour with faint clouds and grain."""
+    """Paint or plaster: one color with faint clouds and grain."""
 
     def draw(rng: np.random.Generator, width: float, height: float) -> Image:
         picture = _canvas(width, height, base)
@@ -64,7 +64,7 @@ def planks(base: Colour, plank_width: float = 0.14) -> Texture:
 
 
 def tiles(light: Colour, dark: Colour, size: float = 0.3, joint: Colour = (150, 150, 150)) -> Texture:
-    """A chequerboard of two kinds of tiles with joints."""
+    """A checkerboard of two kinds of tiles with joints."""
 
     def draw(rng: np.random.Generator, width: float, height: float) -> Image:
         picture = _canvas(width, height, joint)
@@ -79,7 +79,7 @@ def tiles(light: Colour, dark: Colour, size: float = 0.3, joint: Colour = (150, 
 
 
 def carpet(base: Colour, accent: Colour) -> Texture:
-    """A woven floor with a lattice of small figures."""
+    """A carpet with a lattice of small polygons."""
 
     def draw(rng: np.random.Generator, width: float, height: float) -> Image:
         picture = _canvas(width, height, base)
@@ -94,7 +94,7 @@ def carpet(base: Colour, accent: Colour) -> Texture:
 
 
 def stripes(first: Colour, second: Colour, period: float) -> Texture:
-    """Wallpaper with upright stripes."""
+    """Wallpaper with vertical stripes."""
 
     def draw(rng: np.random.Generator, width: float, height: float) -> Image:
         picture = _canvas(width, height, first)
@@ -108,7 +108,7 @@ def stripes(first: Colour, second: Colour, period: float) -> Texture:
 
 
 def motif(base: Colour, accent: Colour, step_m: float) -> Texture:
-    """Wallpaper with a figure repeated on a lattice."""
+    """Wallpaper with a polygon repeated on a lattice."""
 
     def draw(rng: np.random.Generator, width: float, height: float) -> Image:
         picture = _canvas(width, height, base)
@@ -154,7 +154,7 @@ def wainscot(upper: Texture, lower: Texture, rail: Colour, height_m: float = 1.1
 
 
 def framed(rng: np.random.Generator, width: float, height: float) -> Image:
-    """A picture to hang up: a landscape, blocks, discs, letters or a head, in a frame; no two are alike."""
+    """A picture for the wall: a landscape, blocks, discs, letters or a head, in a frame; all are different."""
     kinds = (_landscape, _blocks, _discs, _letters, _head)
     picture = kinds[rng.integers(len(kinds))](rng, width, height)
     border = max(3, round(0.05 * PIXELS_PER_METRE))
@@ -164,7 +164,7 @@ def framed(rng: np.random.Generator, width: float, height: float) -> Image:
 
 
 def window(rng: np.random.Generator, width: float, height: float) -> Image:
-    """A window: sky, hills and a tree or a tower behind white glazing bars, curtains at the sides."""
+    """A window: sky, hills and a tree or a tower behind white bars, with curtains at the sides."""
     picture = _landscape(rng, width, height)
     rows, columns = picture.shape[:2]
     bar = max(3, round(0.05 * PIXELS_PER_METRE))

@@ -1,1 +1,1 @@
-"""Descriptors of images: the files they come in, how alike two are, whitening."""
+"""Descriptors of images: their files, their similarity, whitening."""

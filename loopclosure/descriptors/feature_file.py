@@ -1,18 +1,19 @@
-"""Descriptors that another program computed: the features.npz of ``netspec extract --images``."""
+"""Descriptors that another program computed: the features.npz of ``netspec extract --images`` (docs/features.md)."""
 
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from loopclosure.descriptors.whitening import Whitening
 from loopclosure.errors import InputError
 
-# Arrays of the file that describe the images rather than being descriptors.
+# Arrays of the file that are about the images and are not descriptors.
 BESIDE_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms")
-# Descriptors of one image by one net, from two machines: they differ by less than this share of their length.
+# Descriptors of one image by one net on two machines differ by less than this share of their length.
 SAME_DESCRIPTOR = 1e-3
 
 
@@ -21,10 +22,10 @@ class Features:
     """Descriptors of images.
 
     features           (N, D) float32; with several views of each image (N, views D), view after view
-    names              the N images' names, empty where the file has none
-    stamps             (N,) seconds, None where the file has none
-    seconds_per_image  what an image took the net, NaN where the file does not say
-    views              how many views of an image were described: the file's ``zooms``
+    names              the N images' names, empty if the file has none
+    stamps             (N,) seconds, None if the file has none
+    seconds_per_image  the net's time per image, NaN if the file does not say
+    views              how many views of each image were described: the file's ``zooms``
     """
 
     path: Path
@@ -37,8 +38,8 @@ class Features:
     def rows_of(self, images: list[Path]) -> np.ndarray:
         """Return the descriptors (len(images), D) of these images, found by name.
 
-        As many last parts of path and name are compared as it takes to tell all images apart: ``rgb/1.png`` of the
-        file is ``/data/fr1/rgb/1.png``. A file without names must have exactly these images, in order.
+        As many trailing parts of path and name are compared as are needed to distinguish all images: ``rgb/1.png`` of
+        the file is ``/data/fr1/rgb/1.png``. A file without names must have exactly these images, in order.
         """
         if not self.names:
             if len(self.features) != len(images):
@@ -58,15 +59,19 @@ class Features:
                 continue
             for image, numbers in zip(images, found, strict=True):
                 if len(numbers) > 1:
-                    raise InputError(f"names {image.name} {len(numbers)} times, which of them is {image}?", self.path)
+                    raise InputError(f"names {image.name} {len(numbers)} times; which one is {image}?", self.path)
             return self.features[[numbers[0] for numbers in found]]
-        raise InputError(f"{missing}; its names are like {self.names[0]}", self.path)
+        raise InputError(f"{missing}; its first name is {self.names[0]}", self.path)
+
+    def whitened(self, whitening: Whitening) -> Features:
+        """Return the same images with whitened descriptors, each view by itself."""
+        return replace(self, features=whitening.of_views(self.features, self.views))
 
     def described_too(self, images: list[Path], rows: np.ndarray) -> list[Path]:
-        """Return those of ``images``, with descriptors ``rows`` (len(images), D), that this file describes as well.
+        """Return those of ``images``, with descriptors ``rows`` (len(images), D), that this file describes too.
 
-        An image is the same where the last part of its name and its descriptor are: many a data set has a 0001.jpg.
-        Where the file has no names, the descriptor alone decides.
+        An image is the same if the last part of its name and its descriptor are: many data sets have a 0001.jpg. If
+        the file has no names, the descriptor alone decides.
         """
         numbers: dict[str, list[int]] = {}
         for number, name in enumerate(self.names):
@@ -80,7 +85,7 @@ class Features:
 
 
 def read_features(path: str | Path) -> Features:
-    """Read a features.npz; without an array ``features`` its only array of any name, a blob's, is taken."""
+    """Read a features.npz; without an array ``features``, its only other array, named after a blob, is taken."""
     path = Path(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -92,7 +97,7 @@ def read_features(path: str | Path) -> Features:
     chosen = "features" if "features" in arrays else candidates[0] if len(candidates) == 1 else ""
     if not chosen:
         found = ", ".join(sorted(arrays)) or "nothing"
-        raise InputError(f"has no array features, nor one array alone; found {found}", path)
+        raise InputError(f'has no array "features", and not exactly one other; found {found}', path)
     features = arrays[chosen]
     if features.ndim < 2 or features.dtype.kind not in "fiu" or not len(features):
         raise InputError(
@@ -107,5 +112,5 @@ def read_features(path: str | Path) -> Features:
     seconds = float(arrays["seconds_per_image"]) if "seconds_per_image" in arrays else float("nan")
     views = len(arrays["zooms"]) if "zooms" in arrays else 1
     if not views or features.shape[1] % views:
-        raise InputError(f"has {features.shape[1]} numbers an image, which are not {views} views", path)
+        raise InputError(f"has {features.shape[1]} numbers per image, which cannot be {views} views", path)
     return Features(path, features, names, stamps, seconds, views)

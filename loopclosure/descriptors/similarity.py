@@ -1,9 +1,9 @@
-"""Descriptors in, similarity out: whole matrices for the eye, the best few of each frame for everything longer.
+"""Similarity of descriptors: whole matrices for short sequences, the best few references of each frame for long ones.
 
-Scores are higher for what is more alike: the cosine similarity, or minus the Euclidean distance, which is what
-ContrastiveLoss trains. Products are taken in the precision of the descriptors. Euclidean distances come from
-|a|^2 + |b|^2 - 2 a.b about the references' mean, whose rounding is some eps * (|a|^2 + |b|^2) in the square: 1e-3 of
-the norm in float32, which only concerns frames that are almost the same.
+Higher scores are more similar: the cosine similarity, or minus the Euclidean distance, which ContrastiveLoss trains.
+Products are computed in the precision of the descriptors. Euclidean distances come from |a|^2 + |b|^2 - 2 a.b about the
+references' mean, with a rounding error of about eps * (|a|^2 + |b|^2) in the square: 1e-3 of the norm in float32, which
+matters only for frames that are almost the same.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
 METRICS = ("euclidean", "cosine")
-# 1024 x 16384 scores in float32 are 64 MiB, whatever the length of the sequence.
+# 1024 x 16384 scores in float32 are 64 MiB, for a sequence of any length.
 BLOCK_ROWS = 1024
 BLOCK_COLUMNS = 16384
 
@@ -31,7 +31,7 @@ class TopK:
     """The best references of each query, best first; equal scores in the order of the references.
 
     indices  (Q, k) int64, -1 where a query has fewer than k candidates
-    scores   (Q, k), higher = more alike, -inf there
+    scores   (Q, k), higher = more similar, -inf where there is no candidate
     """
 
     indices: np.ndarray
@@ -40,10 +40,10 @@ class TopK:
 
 @dataclass(frozen=True)
 class Descriptors:
-    """Descriptors made ready for scoring in one metric.
+    """Descriptors prepared for one metric.
 
-    rows     (N, D): of unit length for cosine (a descriptor of zeros stays one, alike to nothing); about ``mean`` for
-             Euclidean
+    rows     (N, D): of unit length for cosine (a descriptor of zeros stays zero, similar to nothing); less ``mean``
+             for Euclidean
     squares  (N,) their squared lengths
     """
 
@@ -54,20 +54,35 @@ class Descriptors:
 
     def scores(self, queries: Descriptors, rows: slice, columns: slice) -> np.ndarray:
         """Return the scores of some of ``queries`` (rows) against some of these (columns)."""
-        products = queries.rows[rows] @ self.rows[columns].T
         if self.metric == "cosine":
-            return products
-        products *= -2
-        products += queries.squares[rows, None]
-        products += self.squares[columns]
-        np.maximum(products, 0, out=products)
-        np.sqrt(products, out=products)
-        np.negative(products, out=products)
-        return products
+            return queries.rows[rows] @ self.rows[columns].T
+        distances = squared_distances(
+            queries.rows[rows], self.rows[columns], queries.squares[rows, None], self.squares[columns]
+        )
+        np.maximum(distances, 0, out=distances)
+        np.sqrt(distances, out=distances)
+        np.negative(distances, out=distances)
+        return distances
+
+
+def squared_distances(a: np.ndarray, b: np.ndarray, squares_a: np.ndarray | float, squares_b: np.ndarray) -> np.ndarray:
+    """Return |a|^2 + |b|^2 - 2 a.b for each row of ``a`` (N, D) and of ``b`` (M, D): (N, M).
+
+    squares_a  (N, 1) squared lengths of the rows of ``a``; 0 leaves them out, which keeps the order within each row
+    squares_b  (M,) squared lengths of the rows of ``b``
+
+    Rounding may make a result slightly negative. scikit-learn's euclidean_distances and pairwise_distances_argmin
+    compute float32 in float64, which takes several times as long.
+    """
+    products = a @ b.T
+    products *= -2
+    products += squares_a
+    products += squares_b
+    return products
 
 
 def prepare(features: np.ndarray, metric: str = "euclidean", mean: np.ndarray | None = None) -> Descriptors:
-    """Make descriptors (N, D) ready; ``mean`` (D,) is that of the references, their own by default.
+    """Prepare descriptors (N, D); ``mean`` (D,) is that of the references, by default their own.
 
     Raises InputError for another shape, an unknown metric, a NaN or an infinity.
     """
@@ -100,7 +115,7 @@ def prepare(features: np.ndarray, metric: str = "euclidean", mean: np.ndarray | 
 
 
 def check_metric(metric: str) -> None:
-    """Refuse a metric that is not one of METRICS."""
+    """Raise InputError for a metric that is not one of METRICS."""
     if metric not in METRICS:
         raise InputError(f'unknown metric "{metric}"; known: {", ".join(METRICS)}')
 
@@ -110,10 +125,10 @@ def similarity_matrix(
 ) -> np.ndarray:
     """Return all scores (Q, R) at once; ``references`` None compares ``queries`` (Q, D) with themselves.
 
-    Where a descriptor is that of several ``views``, one after the other, two images are as alike as the two of their
-    views that are most alike.
+    A descriptor may consist of those of several ``views``, one after the other. The score of two images is then that of
+    their two most similar views.
 
-    100,000 frames would need 40 GB: take :func:`similarity_blocks` or :func:`top_k` for those.
+    100,000 frames would need 40 GB: use :func:`similarity_blocks` or :func:`top_k` for those.
     """
     if views == 1:
         query, reference = _pair(queries, references, metric)
@@ -139,17 +154,17 @@ def top_k(
     exclusion: Exclusion | None = None,
     stamps: np.ndarray | None = None,
 ) -> TopK:
-    """Find the ``k`` best references of each query, holding only a block of scores at any time.
+    """Find the ``k`` best references of each query; only one block of scores is in memory at a time.
 
-    ``references`` None searches one sequence for its own loops: frame i against the earlier frames j < i, less what
-    ``exclusion`` leaves out (by ``stamps`` (Q,) in seconds, where it speaks of seconds). With references every pair
-    is a candidate.
+    ``references`` None searches one sequence for its own loops: frame i against the earlier frames j < i, without those
+    that ``exclusion`` excludes (by ``stamps`` (Q,) in seconds, if it has seconds). With references every pair is a
+    candidate.
     """
     if k < 1:
         raise InputError(f"the best {k} were asked for; expected 1 or more")
     alone = references is None
     if exclusion is not None and not alone:
-        raise InputError("an exclusion concerns one sequence; with references of their own nothing is near in time")
+        raise InputError("an exclusion applies to one sequence; with other references nothing is near in time")
     exclusion = exclusion or Exclusion()
     query, reference = _pair(queries, references, metric)
     k = min(k, len(reference.rows))
@@ -157,7 +172,7 @@ def top_k(
     scores = np.full((len(query.rows), k), -np.inf, dtype=query.rows.dtype)
     for top in range(0, len(query.rows), BLOCK_ROWS):
         rows = slice(top, min(top + BLOCK_ROWS, len(query.rows)))
-        # Frames after the last query of the block are no candidates of any of its queries.
+        # Frames after the last query of the block are not candidates of any of its queries.
         end = min(rows.stop, len(reference.rows)) if alone else len(reference.rows)
         for left in range(0, end, BLOCK_COLUMNS):
             columns = slice(left, min(left + BLOCK_COLUMNS, end))
@@ -175,7 +190,7 @@ def write_similarity(
     metric: str = "euclidean",
     progress: Progress = silent,
 ) -> tuple[int, int]:
-    """Write all scores (Q, R) as an .npy of float32, block by block, whatever their number; return its shape."""
+    """Write all scores (Q, R) as an .npy file of float32, block by block; return its shape."""
     shape = (len(queries), len(queries) if references is None else len(references))
     try:
         matrix = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
@@ -213,7 +228,7 @@ def _pair(queries: np.ndarray, references: np.ndarray | None, metric: str) -> tu
 def _mask_not_earlier(
     block: np.ndarray, rows: slice, columns: slice, exclusion: Exclusion, stamps: np.ndarray | None
 ) -> None:
-    """Set to -inf, in place, what is excluded or not earlier than its query."""
+    """Set to -inf, in place, the references that are excluded or not earlier than the query."""
     queries, references = np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop)
     query_stamps, reference_stamps = (None, None) if stamps is None else (stamps[rows], stamps[columns])
     block[exclusion.excludes(queries, references, query_stamps, reference_stamps)] = -np.inf
@@ -225,7 +240,7 @@ def _merge(indices: np.ndarray, scores: np.ndarray, block: np.ndarray, left: int
     k = indices.shape[1]
     if block.shape[1] > k:
         chosen = np.argpartition(block, block.shape[1] - k, axis=1)[:, -k:]
-        # Of equal scores at the border argpartition takes any; the earliest are wanted, so that results repeat.
+        # Of equal scores at the border, argpartition takes any; the earliest are wanted, so that results repeat.
         border = np.take_along_axis(block, chosen, axis=1).min(axis=1)
         tied = (np.count_nonzero(block >= border[:, None], axis=1) > k) & ~np.isneginf(border)
         for row in np.flatnonzero(tied):

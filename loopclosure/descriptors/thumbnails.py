@@ -1,67 +1,70 @@
-"""Grey thumbnails compared pixel by pixel: the baseline that keeps one honest, and what SeqSLAM looks at."""
+"""Gray thumbnails compared pixel by pixel: the simplest baseline, and the input of SeqSLAM."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 
 import cv2
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import grey
+from loopclosure.places.frames import gray
 
-# Deviation in grey values below which a patch counts as uniform: its rounded mean may leave a trace of one.
+# Standard deviation in gray values below which a patch counts as uniform; rounding can make it slightly positive.
 UNIFORM = 1e-6
-NORMALISATIONS = ("image", "patch", "none")
+NORMALIZATIONS = ("image", "patch", "none")
 
 
 @dataclass(frozen=True)
 class Thumbnailer:
-    """How an image is made small.
+    """How an image is reduced.
 
     width, height  of the thumbnail in pixels
-    normalise      "image": zero mean and unit deviation; "patch": so for each patch (SeqSLAM); "none": grey values
+    normalize      "image": zero mean, unit deviation; "patch": the same for each patch (SeqSLAM); "none": gray values
     patch          side of a patch in pixels
     """
 
     width: int = 32
     height: int = 24
-    normalise: str = "image"
+    normalize: str = "image"
     patch: int = 8
+    normalise: InitVar[str | None] = None  # British spelling of normalize, still accepted
 
-    def __post_init__(self) -> None:
-        if self.normalise not in NORMALISATIONS:
-            raise InputError(f'unknown normalisation "{self.normalise}"; known: {", ".join(NORMALISATIONS)}')
+    def __post_init__(self, normalise: str | None) -> None:
+        if normalise is not None:
+            object.__setattr__(self, "normalize", normalise)
+        if self.normalize not in NORMALIZATIONS:
+            raise InputError(f'unknown normalization "{self.normalize}"; known: {", ".join(NORMALIZATIONS)}')
         if min(self.width, self.height, self.patch) < 1:
-            raise InputError(f"a thumbnail of {self.width}x{self.height} in patches of {self.patch} is no image")
-        if self.normalise == "patch" and (self.width % self.patch or self.height % self.patch):
-            raise InputError(f"{self.width}x{self.height} pixels do not divide into patches of {self.patch}")
+            raise InputError(f"a thumbnail of {self.width}x{self.height} in patches of {self.patch} has no pixels")
+        if self.normalize == "patch" and (self.width % self.patch or self.height % self.patch):
+            raise InputError(f"{self.width}x{self.height} pixels cannot be divided into patches of {self.patch}")
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the thumbnail (height, width) float32 of an (H, W) or (H, W, 3) uint8 image."""
-        # INTER_AREA averages whole pixels when shrinking; bilinear would look at four of them and alias.
-        small = cv2.resize(grey(image), (self.width, self.height), interpolation=cv2.INTER_AREA).astype(np.float32)
-        if self.normalise == "none":
+        # INTER_AREA averages all pixels; bilinear interpolation would use four of them and alias.
+        small = cv2.resize(gray(image), (self.width, self.height), interpolation=cv2.INTER_AREA).astype(np.float32)
+        if self.normalize == "none":
             return small
-        return normalise_patches(small, self.patch if self.normalise == "patch" else 0)
+        return normalize_patches(small, self.patch if self.normalize == "patch" else 0)
 
 
-def normalise_patches(image: np.ndarray, patch: int = 0) -> np.ndarray:
-    """Return (image - mean) / deviation patch by patch, deviation with n - 1; 0 where a patch is uniform.
+def normalize_patches(image: np.ndarray, patch: int = 0) -> np.ndarray:
+    """Return (image - mean) / deviation for each patch, the deviation with n - 1; 0 if a patch is uniform.
 
-    image (H, W), patch side in pixels, H and W multiples of it; 0 takes the whole image as one patch.
+    image (H, W); patch: its side in pixels, of which H and W are multiples; 0: the whole image is one patch.
     """
     height, width = image.shape
     rows, columns = (patch, patch) if patch else (height, width)
     tiles = image.astype(np.float64).reshape(height // rows, rows, width // columns, columns)
-    centred = tiles - tiles.mean(axis=(1, 3), keepdims=True)
-    deviation = np.sqrt((centred**2).sum(axis=(1, 3), keepdims=True) / max(rows * columns - 1, 1))
-    normalised = np.divide(centred, deviation, out=np.zeros_like(centred), where=deviation > UNIFORM)
-    return normalised.reshape(height, width).astype(np.float32)
+    centered = tiles - tiles.mean(axis=(1, 3), keepdims=True)
+    deviation = np.sqrt((centered**2).sum(axis=(1, 3), keepdims=True) / max(rows * columns - 1, 1))
+    normalized = np.divide(centered, deviation, out=np.zeros_like(centered), where=deviation > UNIFORM)
+    return normalized.reshape(height, width).astype(np.float32)
 
 
 def differences(queries: np.ndarray, references: np.ndarray) -> np.ndarray:
-    """Return the mean absolute difference a pixel (Q, R) of thumbnails (Q, h, w) and (R, h, w)."""
+    """Return the mean absolute difference per pixel (Q, R) of thumbnails (Q, h, w) and (R, h, w)."""
     a, b = queries.reshape(len(queries), -1), references.reshape(len(references), -1)
     return cdist(a, b, "cityblock") / a.shape[1]

@@ -1,8 +1,8 @@
-"""PCA whitening: what descriptors of many places vary in together should not decide which two are of one place.
+"""PCA whitening: directions in which descriptors of all places vary together should not decide which are similar.
 
 After Jegou and Chum, "Negative evidences and co-occurences in image retrieval: the benefit of PCA and whitening"
-(ECCV 2012): centre the descriptors, turn them to their principal directions, keep the strongest, give these equal
-variance, scale to length 1. All of it is learnt from images of other places.
+(ECCV 2012): center the descriptors, rotate them to their principal directions, keep the strongest, give these equal
+variance, scale to length 1. It is learned from images of other places.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ COMPONENTS = 512
 class Whitening:
     """A whitening, to be called with descriptors.
 
-    mean        (D,) float32, of the descriptors it was learnt from
+    mean        (D,) float32, of the descriptors it was learned from
     projection  (D, K) float32: the principal directions, strongest first, divided by their standard deviation ** power
-    images      from how many descriptors it was learnt
+    images      how many descriptors it was learned from
     power       1 makes the variances of the K directions equal, 0 leaves them as they are
-    source      the file that the descriptors came from, for notes and errors
+    source      the file of these descriptors, for notes and errors
     """
 
     mean: np.ndarray
@@ -38,7 +38,7 @@ class Whitening:
         return f"whitened by {self.source or 'other descriptors'}: {size}"
 
     def check(self, descriptors: np.ndarray) -> None:
-        """Raise InputError for descriptors (N, D) of another D than it was learnt from."""
+        """Raise InputError for descriptors (N, D) of another D than it was learned from."""
         if descriptors.shape[1] != len(self.mean):
             raise InputError(
                 f"has descriptors of {len(self.mean)} dimensions, those to be whitened have {descriptors.shape[1]}; "
@@ -47,12 +47,12 @@ class Whitening:
             )
 
     def project(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return descriptors (N, D) whitened, (N, K) float32, of the length they come out with."""
+        """Return descriptors (N, D) whitened, (N, K) float32, not scaled to length 1."""
         self.check(descriptors)
         return (descriptors.astype(np.float32) - self.mean) @ self.projection
 
     def __call__(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return descriptors (N, D) whitened and of length 1, (N, K) float32; one at the mean itself stays zero."""
+        """Return descriptors (N, D) whitened and of length 1, (N, K) float32; zero for the mean itself."""
         rows = self.project(descriptors)
         lengths = np.linalg.norm(rows, axis=1, keepdims=True)
         return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
@@ -67,26 +67,28 @@ def learn_whitening(
 ) -> Whitening:
     """Learn a whitening from descriptors (N, D) of other images, N >= 2.
 
-    At most ``components`` directions are kept, fewer where the descriptors vary in fewer, which are min(N - 1, D) at
-    most. Raises InputError, naming ``source``, for descriptors that do not do and for settings out of their range.
+    At most ``components`` directions are kept, and no more than the descriptors vary in, which is at most
+    min(N - 1, D). Raises InputError, naming ``source``, for unusable descriptors and for settings out of range.
     """
     if components < 1:
         raise InputError(f"components is {components}; expected 1 or more")
     if not 0 <= power <= 1:
         raise InputError(f"power is {power:g}; expected 0 (variances as they are) to 1 (all equal)")
     if len(descriptors) < 2:
-        raise InputError(f"has {len(descriptors)} descriptors; a whitening is learnt from 2 at the least", source)
+        raise InputError(f"has {len(descriptors)} descriptors; a whitening is learned from at least 2", source)
     if not np.all(np.isfinite(descriptors)):
         raise InputError("has a descriptor with a NaN or an infinity; did the net diverge?", source)
     values = descriptors.astype(np.float64)
     mean = values.mean(axis=0)
     _, singular, directions = np.linalg.svd(values - mean, full_matrices=False)
-    # Below this a direction holds the rounding of float32 and no variance: dividing by it would blow the rounding up.
-    # The size is that of the descriptors, not of their differences: their mean is rounded too.
+    # Below this a direction is rounding of float32 and not variance; dividing by it would amplify the rounding.
+    # The scale is that of the descriptors, not of their differences: their mean is rounded too.
     floor = np.finfo(np.float32).eps * np.linalg.norm(values)
     kept = min(components, len(values) - 1, int(np.count_nonzero(singular > floor)))
     if not kept:
-        raise InputError(f"has {len(values)} descriptors that are all the same; there is nothing to whiten by", source)
+        raise InputError(
+            f"has {len(values)} descriptors that are all the same; nothing can be learned from them", source
+        )
     deviations = singular[:kept] / np.sqrt(len(values) - 1)
     projection = directions[:kept].T / deviations**power
     return Whitening(mean.astype(np.float32), projection.astype(np.float32), len(values), power, source)

@@ -6,8 +6,8 @@
         if result.accepted is not None:
             ...  # this frame shows the same place as frame result.accepted
 
-The search is exact: a product of all earlier descriptors with the new one. Its cost grows with the number of frames,
-all else stays: see :meth:`LoopDetector.add`.
+The search is exact: a product of all earlier descriptors with the new one. Its cost grows with the number of frames;
+all other costs are constant: see :meth:`LoopDetector.add`.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.descriptors.similarity import check_metric
+from loopclosure.descriptors.similarity import check_metric, squared_distances
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.precision_recall import PrecisionRecall, curve
 
 Describe = Callable[[np.ndarray], np.ndarray]
-FIRST_CAPACITY = 256  # frames; doubled whenever it is full
+FIRST_CAPACITY = 256  # frames; doubled when full
 FORMAT = 1  # of the file that save writes
 
 
@@ -35,11 +35,11 @@ class LoopResult:
     """What adding one frame found.
 
     query_id    the frame's number, from 0
-    candidates  (id, score) of the best earlier frames, best first, higher = more alike
+    candidates  (id, score) of the best earlier frames, best first, higher = more similar
     accepted    the earlier frame that this one closes a loop with, or None
     verdict     why: "accepted", "no candidate", "no threshold", "below threshold", "not consistent", "not verified"
     score       of the accepted frame, or of the best candidate; -inf without one
-    inliers     point matches of the accepted candidate, or the most of any tried; None where none was tried
+    inliers     inliers of the accepted candidate, or the most of any candidate tried; None if none was tried
     stamp       seconds, as given
     """
 
@@ -57,15 +57,15 @@ class DetectorSettings:
     """How loops are decided.
 
     metric              "euclidean" (score = minus the distance) or "cosine"
-    views               a descriptor is that of so many views of the image, one after the other; the score of two frames
-                        is that of their two views that are most alike
-    exclude_recent      frames i - exclude_recent .. i - 1 are no candidates of frame i
-    exclude_seconds     nor are frames less than so many seconds old
-    top_k               candidates looked at
+    views               how many views of an image a descriptor consists of, one after the other; the score of two
+                        frames is that of their two most similar views
+    exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i
+    exclude_seconds     frames less than this many seconds old are not candidates either
+    top_k               how many candidates are examined
     threshold           a candidate needs score >= threshold; None: nothing is accepted (see ``calibrate``)
-    consistency         in each of so many frames before, a candidate must have led to this one: one within
-                        ``consistency_window`` frames of the next one's, so that places follow one another in time
-    consistency_window
+    consistency         how many previous frames must have had a candidate that leads to this one, so that places
+                        follow each other in time
+    consistency_window  a candidate leads to one of the next frame that is at most this many frames away
     """
 
     metric: str = "euclidean"
@@ -94,7 +94,7 @@ class DetectorSettings:
 
 @dataclass
 class _Frames:
-    """All frames so far, in arrays that double when they are full: ``count`` of the rows (views, D) are in use."""
+    """All frames so far, in arrays that double when full: ``count`` of the rows (views, D) are in use."""
 
     count: int = 0
     rows: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0), np.float32))
@@ -137,7 +137,7 @@ class LoopDetector:
         describe  image (H, W, 3) uint8 BGR -> descriptor (D,), the same D each time, or (views D,); None: use
                   ``add_descriptor``
         settings  or its fields by name: ``LoopDetector(describe, exclude_recent=50, top_k=5, threshold=-0.4)``
-        check     verifies candidates by their geometry, best first; None: none is verified
+        check     verifies candidates by their geometry, best first; None: no verification
         """
         given = asdict(settings or DetectorSettings())
         unknown = set(changes) - set(given)
@@ -148,36 +148,36 @@ class LoopDetector:
         self.check = check
         self.loops: list[LoopResult] = []
         self._frames = _Frames()
-        self._runs: list[tuple[int, int]] = []  # (candidate, frames in a row that led to it) of the last frame
+        self._runs: list[tuple[int, int]] = []  # of the last frame: candidate, consecutive frames that led to it
 
     def __len__(self) -> int:
         return self._frames.count
 
     @property
     def stamps(self) -> np.ndarray:
-        """The stamps (N,) in seconds, NaN where a frame has none."""
+        """The stamps (N,) in seconds, NaN for frames without one."""
         return self._frames.stamps[: len(self)].copy()
 
     @property
     def poses(self) -> np.ndarray:
-        """The poses (N, 7), tx ty tz qx qy qz qw, NaN where a frame has none."""
+        """The poses (N, 7), tx ty tz qx qy qz qw, NaN for frames without one."""
         return self._frames.poses[: len(self)].copy()
 
     def add(
         self, image: np.ndarray, stamp: float | None = None, pose: Sequence[float] | np.ndarray | None = None
     ) -> LoopResult:
-        """Add the next frame, (H, W, 3) uint8 BGR, and say whether it closes a loop.
+        """Add the next frame, (H, W, 3) uint8 BGR, and return whether it closes a loop.
 
-        ``stamp`` in seconds; ``pose`` tx ty tz qx qy qz qw, camera-to-world: only kept, for the export.
+        ``stamp`` in seconds; ``pose`` tx ty tz qx qy qz qw, camera-to-world: kept for the export, not used otherwise.
 
-        It costs ``describe`` and one pass over all earlier descriptors, 4 D bytes a frame. Measured on one 2020s server
-        core, without ``describe``: frame 1,000 takes 0.04 ms and frame 10,000 takes 0.2 ms with D = 128; 0.07 and
-        1.4 to 1.8 ms with D = 512, which no longer fit the cache. So frame 10,000 costs at most twice what frame 1,000
-        costs where ``describe`` takes 2 ms or more (1.7 times at 2 ms, 1.3 at 5 ms, D = 512), as nets and SIFT do; with
-        thumbnails of 768 pixels, described in 0.15 ms, it costs ten times as much: 2.2 ms.
+        The cost is that of ``describe`` and of one pass over all earlier descriptors, 4 D bytes per frame. Measured on
+        one server core of the 2020s, without ``describe``: frame 1,000 takes 0.04 ms and frame 10,000 takes 0.2 ms with
+        D = 128; 0.07 ms and 1.4 to 1.8 ms with D = 512, which no longer fits in the cache. If ``describe`` takes 2 ms
+        or more, as nets and SIFT do, frame 10,000 costs at most twice as much as frame 1,000 (1.7 times at 2 ms, 1.3
+        times at 5 ms, D = 512). With thumbnails of 768 pixels, which take 0.15 ms, it costs ten times as much: 2.2 ms.
         """
         if self.describe is None:
-            raise InputError("this detector has no describe; give one, or use add_descriptor")
+            raise InputError("this detector has no describe function; give one, or use add_descriptor")
         return self.add_descriptor(self.describe(image), stamp, pose, image)
 
     def add_descriptor(
@@ -187,7 +187,7 @@ class LoopDetector:
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
     ) -> LoopResult:
-        """Add a frame whose descriptor (D,) is known already; ``image`` is needed for a geometric check alone."""
+        """Add a frame whose descriptor (D,) is known already; ``image`` is needed only for a geometric check."""
         row = self._checked(descriptor, stamp)
         position = _checked_pose(pose)
         candidates = self._search(row, stamp)
@@ -205,12 +205,13 @@ class LoopDetector:
         return result
 
     def calibrate(self, results: Sequence[LoopResult], same: np.ndarray, precision: float = 0.99) -> PrecisionRecall:
-        """Set the threshold from a validation run: the greatest recall with at least ``precision``.
+        """Set the threshold with the greatest recall that has at least ``precision`` on a validation run.
 
-        results  what adding the frames of the validation run gave (the threshold is not used in it)
+        results  of adding the frames of the validation run (its threshold is not used)
         same     (N, N) bool: frames i and j < i show the same place
-        Returns the curve that the choice was made on: the best candidate of each frame. Consistency and a geometric
-        check, which come after the threshold, can only raise its precision. InputError where none is as precise.
+        Returns the curve of the best candidate of each frame, from which the threshold is chosen. Consistency and a
+        geometric check, which come after the threshold, can only increase the precision. Raises InputError if no
+        threshold has this precision.
         """
         scores = np.array([result.candidates[0][1] if result.candidates else -np.inf for result in results])
         right = np.array([bool(r.candidates) and bool(same[r.query_id, r.candidates[0][0]]) for r in results], bool)
@@ -226,7 +227,7 @@ class LoopDetector:
         return found
 
     def save(self, path: str | Path) -> None:
-        """Write all of it but ``describe`` to an .npz, from which ``load`` goes on as if nothing had happened."""
+        """Write everything except ``describe`` to an .npz file, from which ``load`` continues."""
         count = len(self)
         frames = self._frames
         arrays = {name: getattr(frames, name)[:count] for name in ("stamps", "poses")}
@@ -253,7 +254,7 @@ class LoopDetector:
 
     @classmethod
     def load(cls, path: str | Path, describe: Describe | None = None) -> LoopDetector:
-        """Read what ``save`` wrote; ``describe`` must be the one that it was made with."""
+        """Read what ``save`` wrote; ``describe`` must be the one that the detector was made with."""
         try:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
@@ -310,15 +311,15 @@ class LoopDetector:
             end = min(end, int(np.searchsorted(frames.stamps[:end], stamp - settings.exclude_seconds, side="right")))
         if end == 0:
             return []
-        scores = frames.rows[:end].reshape(-1, row.shape[1]) @ row.T
-        if settings.metric == "euclidean":  # as the distances are ordered, so are these
-            scores *= 2
-            scores -= frames.squares[:end].reshape(-1, 1)
-            scores -= np.square(row).sum(1)
+        rows = frames.rows[:end].reshape(-1, row.shape[1])
+        if settings.metric == "euclidean":  # as the distances are ordered, so are their squares
+            scores = -squared_distances(rows, row, frames.squares[:end].reshape(-1, 1), np.square(row).sum(1))
+        else:
+            scores = rows @ row.T
         scores = scores.reshape(end, -1).max(axis=1)
         k = min(settings.top_k, end)
         best = np.argpartition(scores, end - k)[end - k :]
-        # The product is quick but rounds small distances badly: of the few that are reported they are taken anew.
+        # The product is fast but rounds small distances badly: the few that are reported are computed directly.
         if settings.metric == "euclidean":
             apart = np.linalg.norm(frames.rows[best][:, :, None] - row, axis=-1)
             values = -apart.reshape(k, -1).min(axis=1)
@@ -330,7 +331,7 @@ class LoopDetector:
     def _decide(
         self, candidates: list[tuple[int, float]], stamp: float | None, local: LocalFeatures | None
     ) -> LoopResult:
-        """Threshold, then consistency, then geometry; remember what leads on to the next frame."""
+        """Threshold, then consistency, then geometry; remember what can lead to the next frame."""
         settings = self.settings
         query = len(self)
         before = self._runs

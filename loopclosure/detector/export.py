@@ -1,4 +1,4 @@
-"""Loops as files: a table, and edges for a pose-graph optimiser (g2o).
+"""Loops as files: a table, and edges for a pose-graph optimizer (g2o).
 
 A g2o file has lines ``VERTEX_SE3:QUAT id x y z qx qy qz qw`` and ``EDGE_SE3:QUAT i j`` with the pose of j in the frame
 of i, T_i^-1 T_j, and the 21 upper entries of the information matrix, row by row: translation first, then rotation.
@@ -23,7 +23,7 @@ RelativePose = Callable[[int, int], np.ndarray | None]
 
 @dataclass(frozen=True)
 class Sigmas:
-    """How sure an edge is: standard deviations of its translation in metres and of its rotation in radians."""
+    """The uncertainty of an edge: standard deviations of its translation in meters and of its rotation in radians."""
 
     translation_m: float
     rotation_rad: float
@@ -40,7 +40,7 @@ LOOP_SIGMAS = Sigmas(0.1, 0.05)
 
 
 def relative_pose(pose_a: np.ndarray, pose_b: np.ndarray) -> np.ndarray:
-    """Return the pose (7,) of b in the frame of a, T_a^-1 T_b; poses are tx ty tz qx qy qz qw, w not negative."""
+    """Return the pose (7,) of b in the frame of a, T_a^-1 T_b, with w >= 0; poses are tx ty tz qx qy qz qw."""
     rotation_a, rotation_b = Rotation.from_quat(pose_a[3:]), Rotation.from_quat(pose_b[3:])
     quaternion = (rotation_a.inv() * rotation_b).as_quat()
     step = rotation_a.inv().apply(pose_b[:3] - pose_a[:3])
@@ -53,7 +53,7 @@ def write_loops_csv(
     stamps: np.ndarray | None = None,
     names: Sequence[str] | None = None,
 ) -> None:
-    """Write one row a loop: query_id, match_id, score, inliers, their stamps (N,) in seconds and names (N) if known."""
+    """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as stream:
@@ -65,9 +65,9 @@ def write_loops_csv(
             assert loop.accepted is not None
             ends = (loop.query_id, loop.accepted)
             times = ["" if stamps is None or np.isnan(stamps[i]) else f"{stamps[i]:.6f}" for i in ends]
-            words = ["" if names is None else names[i] for i in ends]
+            names_of_ends = ["" if names is None else names[i] for i in ends]
             inliers = "" if loop.inliers is None else loop.inliers
-            writer.writerow([*ends, f"{loop.score:.9g}", inliers, *times, *words])
+            writer.writerow([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends])
 
 
 def write_g2o(
@@ -78,13 +78,13 @@ def write_g2o(
     odometry: Sigmas = ODOMETRY_SIGMAS,
     closure: Sigmas = LOOP_SIGMAS,
 ) -> int:
-    """Write a pose graph; return how many loops were left out since their relative pose is not known.
+    """Write a pose graph; return how many loops were left out because their relative pose is not known.
 
-    poses     (N, 7) of the frames, tx ty tz qx qy qz qw, as the robot believes them; NaN where not known. They are the
-              vertices, and consecutive ones give the odometry edges.
-    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match, measured otherwise (from depth,
-              from a motion capture), or None. What is not measured is left out: the robot's own poses, whose drift the
-              loop is to correct, say nothing of it, and no transform is made up.
+    poses     (N, 7) of the frames, tx ty tz qx qy qz qw, as the robot estimates them; NaN if not known. They are the
+              vertices, and consecutive poses give the odometry edges.
+    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match, measured in another way (depth,
+              motion capture), or None. Loops without it are left out: it cannot be computed from the robot's poses,
+              since the loop is there to correct their drift.
     """
     poses = np.asarray(poses, np.float64)
     known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))

@@ -1,4 +1,4 @@
-"""The detector over a whole recording: a folder or list of images, a TUM sequence, a video; any code describes them."""
+"""The detector on a whole recording: a folder or list of images, a TUM sequence or a video; with any descriptor."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from loopclosure.places.frames import (
     ALL_FRAMES,
     VIDEO_SUFFIXES,
     Selection,
-    image_paths,
-    read_image,
+    read_bgr,
     video_frames,
     video_length,
 )
+from loopclosure.places.image_list import list_images
 from loopclosure.places.same_place import same_place
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Poses, associate, read_groundtruth, read_rgb_list
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Poses, associate, read_groundtruth
 from loopclosure.progress import Progress, silent
 
 
@@ -37,7 +37,8 @@ class Recording:
     """Frames in order: image files, or ``numbers`` of a video's frames.
 
     names   (N) of the frames
-    stamps  (N,) seconds, None where not known;  poses  (N, 7) tx ty tz qx qy qz qw, NaN or None where not known
+    stamps  (N,) seconds, None if not known
+    poses   (N, 7) tx ty tz qx qy qz qw, NaN or None if not known
     """
 
     source: Path
@@ -54,7 +55,7 @@ class Recording:
         """Yield each image (H, W, 3) uint8 BGR and its stamp."""
         if self.images is not None:
             for i, path in enumerate(self.images):
-                yield read_image(path), None if self.stamps is None else float(self.stamps[i])
+                yield read_bgr(path), None if self.stamps is None else float(self.stamps[i])
             return
         wanted = iter(self.numbers.tolist())
         following = next(wanted, None)
@@ -67,7 +68,7 @@ class Recording:
 
 
 def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Recording:
-    """Open a folder of images, a list of them, a TUM RGB-D sequence (with poses if it has them) or a video file."""
+    """Open a folder or list of images, a TUM RGB-D sequence (with its poses, if it has them) or a video file."""
     source = Path(source)
     if source.suffix.lower() in VIDEO_SUFFIXES:
         if not source.is_file():
@@ -77,12 +78,12 @@ def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Rec
             raise InputError("does not say how many frames it has; save its frames as images", source)
         numbers = selection.numbers(count)
         return Recording(source, [f"frame {number}" for number in numbers], None, numbers)
-    images = image_paths(source)
+    listed = list_images(source)
+    images = listed.paths
     taken = selection.numbers(len(images))
     stamps = poses = None
-    if (source / "rgb.txt").is_file():
-        frames = read_rgb_list(source / "rgb.txt")
-        stamps = np.array([frames[i].stamp for i in taken])
+    if listed.stamps is not None:
+        stamps = listed.stamps[taken]
         if (source / "groundtruth.txt").is_file():
             trajectory = read_groundtruth(source / "groundtruth.txt")
             nearest = associate(stamps, trajectory, MAX_DIFFERENCE_S)
@@ -98,20 +99,13 @@ def run_detector(
     recording: Recording,
     features: Features | None = None,
     progress: Progress = silent,
-    whitening: Whitening | None = None,
 ) -> list[LoopResult]:
-    """Add every frame of a recording.
-
-    ``features``, with a descriptor of each image, replace ``describe``; ``whitening`` is of these alone: a
-    ``describe`` is given whitened (see :func:`whitened`).
-    """
+    """Add every frame of a recording; ``features``, with a descriptor of each image, replace ``describe``."""
     rows = None
     if features is not None:
         if recording.images is None:
-            raise InputError("the frames of a video have no names to find features by; give --describe", features.path)
+            raise InputError("the frames of a video have no names to find features by; use --describe", features.path)
         rows = features.rows_of(recording.images)
-        if whitening is not None:
-            rows = whitening.of_views(rows, detector.settings.views)
     results = []
     if rows is not None and detector.check is None:
         for i, row in enumerate(progress(rows, "frames", len(rows))):
@@ -126,25 +120,24 @@ def run_detector(
     return results
 
 
-def calibrate(
+def calibrate_on_data_set(
     detector: LoopDetector,
     data: DataSet,
     precision: float,
     features: Features | None = None,
     progress: Progress = silent,
-    whitening: Whitening | None = None,
 ) -> str:
-    """Set the threshold of ``detector`` on a validation sequence with its truth; return a sentence on what came out.
+    """Set the threshold of ``detector`` on a validation sequence with its truth; return a sentence about the result.
 
-    The validation run is a detector of its own with the same settings: ``detector`` stays empty. Candidates that are
-    near in time are excluded by the detector's settings, not by the data set's.
+    The validation run uses another detector with the same settings: ``detector`` stays empty. Candidates near in time
+    are excluded by the detector's settings, not by those of the data set.
     """
     if data.reference_images is not None:
         raise InputError(f"{data.name} is two traverses; a detector is calibrated on one sequence")
     trial = LoopDetector(detector.describe, detector.settings)
     images = data.query_images
     recording = Recording(Path(data.name), [p.name for p in images], images, np.arange(len(images)), data.stamps)
-    results = run_detector(trial, recording, features, progress, whitening)
+    results = run_detector(trial, recording, features, progress)
     found = detector.calibrate(results, data.truth.soft, precision)
     return (
         f"threshold {detector.settings.threshold:.6g}: on {data.name} precision at least {precision:g} at recall "
@@ -153,7 +146,7 @@ def calibrate(
 
 
 def from_poses(detector: LoopDetector) -> RelativePose:
-    """Return the relative poses of frames whose poses are measured in one frame of reference (motion capture)."""
+    """Return a function for the relative poses of frames with poses in one frame of reference (motion capture)."""
     poses = detector.poses
 
     def relative(query: int, match: int) -> np.ndarray | None:
@@ -164,7 +157,7 @@ def from_poses(detector: LoopDetector) -> RelativePose:
 
 
 def judged_by_poses(detector: LoopDetector) -> str:
-    """Say how many of the accepted loops are the same place by the paper's rule, of those whose two poses are known."""
+    """Say how many of the accepted loops with two known poses are the same place by the paper's rule."""
     poses = detector.poses
     ends = np.array([(loop.query_id, loop.accepted) for loop in detector.loops], int).reshape(-1, 2)
     known = ends[np.all(np.isfinite(poses[ends]), axis=(1, 2))]
@@ -174,14 +167,14 @@ def judged_by_poses(detector: LoopDetector) -> str:
 
 
 def load_describe(specification: str, options: dict[str, str]) -> Describe:
-    """Return the ``describe`` that ``module:name`` means.
+    """Return the ``describe`` function that ``module:name`` names.
 
-    A function is it; a class is made an object with ``options`` as keywords, which must be callable; so is a function
-    where there are options. Modules are looked for in the working directory too.
+    A class, or a function if there are options, is called with ``options`` as keywords and must return the ``describe``
+    function. Modules are also searched for in the working directory.
     """
     module_name, colon, name = specification.partition(":")
     if not colon or not name:
-        raise InputError(f'"{specification}" names no function; expected module:function')
+        raise InputError(f'"{specification}" does not name a function; expected module:function')
     sys.path.insert(0, os.getcwd())
     try:
         target: Any = importlib.import_module(module_name)
@@ -204,12 +197,12 @@ def load_describe(specification: str, options: dict[str, str]) -> Describe:
 
 
 def views_of(describe: Describe | None, features: Features | None) -> int:
-    """Return how many views of an image are described, by a ``describe`` with ``views`` or by features."""
+    """Return how many views of an image are described, by features or by a ``describe`` with ``views``."""
     return getattr(describe, "views", 1) if features is None else features.views
 
 
 def whitened(describe: Describe, whitening: Whitening, views: int) -> Describe:
-    """Return a ``describe`` whose descriptors (views D,) are those of another, whitened view by view."""
+    """Return a ``describe`` that whitens the descriptors (views D,) of another, view by view."""
     return lambda image: whitening.of_views(np.reshape(describe(image), (1, -1)), views)[0]
 
 

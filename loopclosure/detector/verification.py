@@ -1,7 +1,7 @@
-"""Whether two images show the same thing by their geometry: SIFT, the ratio test, RANSAC on the fundamental matrix.
+"""Whether two images show the same scene, by geometry: SIFT, the ratio test, RANSAC on the fundamental matrix.
 
-The fundamental matrix is not determined by a flat scene or a camera that only turns; its inliers still count points
-that agree, so such pairs are accepted rather than lost. What a pair needs is texture: two views of a bare wall fail.
+A flat scene, or a camera that only rotates, does not determine the fundamental matrix. Its inliers still count points
+that agree, so such pairs are accepted. A pair needs texture: two views of a bare wall fail.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from loopclosure.errors import InputError
 
-# Of fewer matches eight-point estimates say nothing: any seven points have a fundamental matrix.
+# Fewer matches prove nothing: any seven have a fundamental matrix.
 LEAST_MATCHES = 8
 
 
@@ -29,11 +29,11 @@ class LocalFeatures:
 class GeometricCheck:
     """Decides by the number of point matches that agree with one fundamental matrix.
 
-    max_features   SIFT points of an image, the strongest: 66 kB of memory a frame for 500
-    ratio          a match must be nearer than ``ratio`` times the next best (Lowe's test)
+    max_features   how many of the strongest SIFT points are kept per image; 500 need 66 kB of memory per frame
+    ratio          a match must be nearer than ``ratio`` times the second nearest (Lowe's test)
     max_error_px   distance of an inlier from its epipolar line, in pixels
     confidence     of RANSAC
-    min_inliers    a loop needs at least so many
+    min_inliers    the least number of inliers of a loop
     """
 
     max_features: int = 500
@@ -44,33 +44,29 @@ class GeometricCheck:
 
     def describe(self, image: np.ndarray) -> LocalFeatures:
         """Find the points of an image (H, W) or (H, W, 3) uint8; there may be none."""
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        points, descriptors = cv2.SIFT.create(self.max_features).detectAndCompute(grey, None)
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        points, descriptors = cv2.SIFT.create(self.max_features).detectAndCompute(gray, None)
         if descriptors is None or not len(points):
             return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
-        # OpenCV's SIFT descriptors are whole numbers up to 255, in float32: bytes hold them without loss.
+        # OpenCV's SIFT descriptors are integers up to 255, in float32: bytes hold them without loss.
         places = np.array([point.pt for point in points], np.float32)
         return LocalFeatures(places[: self.max_features], descriptors[: self.max_features].astype(np.uint8))
 
     def matches(self, a: LocalFeatures, b: LocalFeatures) -> np.ndarray:
-        """Return the matches (M, 2), point of ``a`` and point of ``b``, that pass the ratio test; none of b twice."""
+        """Return the matches (M, 2), points of ``a`` and ``b``, that pass the ratio test; no point of ``b`` twice."""
         if len(a.points) < 2 or len(b.points) < 2:
             return np.zeros((0, 2), np.int64)
-        products = a.descriptors.astype(np.float32) @ b.descriptors.astype(np.float32).T
-        lengths = [np.sum(f.descriptors.astype(np.float32) ** 2, axis=1) for f in (a, b)]
-        squares = lengths[0][:, None] + lengths[1][None, :] - 2 * products
-        rows = np.arange(len(squares))
-        nearest = np.argmin(squares, axis=1)
-        best = np.maximum(squares[rows, nearest], 0)
-        squares[rows, nearest] = np.inf
-        passed = np.flatnonzero(best < self.ratio**2 * squares.min(axis=1))
-        passed = passed[np.argsort(best[passed], kind="stable")]
-        _, first = np.unique(nearest[passed], return_index=True)
-        kept = np.sort(passed[first])
-        return np.stack([kept, nearest[kept]], axis=1)
+        # As float32: with bytes the matcher takes several times as long.
+        matcher = cv2.BFMatcher(cv2.NORM_L2)
+        nearest_two = matcher.knnMatch(a.descriptors.astype(np.float32), b.descriptors.astype(np.float32), k=2)
+        passed = [best for best, second in nearest_two if best.distance < self.ratio * second.distance]
+        point_of_a: dict[int, int] = {}
+        for match in sorted(passed, key=lambda match: match.distance):
+            point_of_a.setdefault(match.trainIdx, match.queryIdx)
+        return np.array(sorted((i, j) for j, i in point_of_a.items()), np.int64).reshape(-1, 2)
 
     def inliers(self, a: LocalFeatures, b: LocalFeatures) -> int:
-        """Count the matches that agree with one fundamental matrix; 0 where there are too few to tell."""
+        """Count the matches that agree with one fundamental matrix; 0 if there are too few."""
         matches = self.matches(a, b)
         if len(matches) < LEAST_MATCHES:
             return 0
@@ -79,7 +75,7 @@ class GeometricCheck:
         return 0 if mask is None else int(np.count_nonzero(mask))
 
     def accepts(self, inliers: int) -> bool:
-        """Tell whether so many inliers are enough."""
+        """Return whether this many inliers are enough."""
         return inliers >= self.min_inliers
 
     def __post_init__(self) -> None:

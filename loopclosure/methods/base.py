@@ -1,7 +1,7 @@
-"""What a place-recognition method is to the judge, and the names of the methods on the command line.
+"""The interface of a place-recognition method, and the names of the methods on the command line.
 
-A method gets the images of the queries and of the references and returns one matrix of scores. How it came to them
-(features of a net, words, sequences) is its own affair, so that all of them stand in one table.
+A method gets the images of the queries and of the references and returns one matrix of scores, however it computes them
+(features of a net, words, sequences), so that all methods can be compared in one table.
 """
 
 from __future__ import annotations
@@ -18,58 +18,69 @@ from loopclosure.errors import InputError
 from loopclosure.progress import Progress
 
 
+@dataclass(frozen=True)
+class Images:
+    """The images that a method is given.
+
+    queries     Q paths
+    references  R paths; None for one sequence that visits its own places again: the queries are the references, and
+                frame i may match the frames before it
+    train       for vocabularies and the like; may be empty: a method that needs them raises InputError
+    """
+
+    queries: list[Path]
+    references: list[Path] | None = None
+    train: list[Path] = field(default_factory=list)
+
+    @property
+    def tested(self) -> list[Path]:
+        """The queries, then the references if they are other images."""
+        return self.queries + (self.references or [])
+
+
 @dataclass
 class MethodResult:
-    """What a method says of every query and every reference.
+    """The answer of a method.
 
-    scores   (Q, R) floats, higher = more alike; NaN where the method says nothing (the upper triangle of an online one)
-    seconds  stage -> seconds spent on it in all, in the order of the work
-    once     those of the stages that are done once, on training images, rather than for each frame
-    notes    sentences for the report: settings, sizes of vocabularies, what was left out
+    scores           (Q, R) floats, higher = more similar; NaN if the method gives no score (the upper triangle of an
+                     online one)
+    seconds          stage -> total seconds spent on it, in the order of the work
+    notes            sentences for the report: settings, sizes of vocabularies, what was left out
+    training_stages  the stages done once, on training images, rather than for each frame
     """
 
     scores: np.ndarray
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    once: tuple[str, ...] = ()
+    training_stages: tuple[str, ...] = ()
 
 
 class Method(Protocol):
-    """A place-recognition method; a dataclass with its settings as fields serves well."""
+    """A place-recognition method, for example a dataclass with its settings as fields."""
 
     name: str
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
-        """Score each query against each reference.
-
-        ``reference_images`` is None for one sequence that closes loops upon itself: the queries are the references,
-        and frame i may match the frames before it. ``train_images`` are for vocabularies and the like; they may be
-        empty, which a method that needs them refuses with an InputError.
-        """
+    def score(self, images: Images, progress: Progress) -> MethodResult:
+        """Score each query against each reference."""
         ...
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What a method may have to know of the evaluation it takes part in.
+class MethodContext:
+    """What a method may need to know about the evaluation.
 
-    exclude_frames   in one sequence, |i - j| <= exclude_frames is no candidate (SeqSLAM has to know before it searches)
-    seed             of everything drawn by lot
+    exclude_frames   in one sequence, frames with |i - j| <= exclude_frames are not candidates (SeqSLAM must know this
+                     before it searches)
+    seed             of all random numbers
     """
 
     exclude_frames: int = 0
     seed: int = 0
 
 
-# name -> "module:factory"; a factory takes (argument: str, setting: Setting, inner: Method | None), returns a Method.
-# On the command line a method is written name, name:argument, or name+inner[:argument], where inner is a method again
-# whose scores the first one refines: seqslam+features:siamese.npz:cosine.
+# name -> "module:factory", a Factory. On the command line a method is written name, name:argument, or
+# name+inner[:argument], where inner is a method again, whose scores the first one refines:
+# seqslam+features:siamese.npz:cosine.
 METHODS: dict[str, str] = {
     "fabmap": "loopclosure.methods.baselines:fabmap",
     "bow": "loopclosure.methods.baselines:bag_of_words",
@@ -78,26 +89,27 @@ METHODS: dict[str, str] = {
     "features": "loopclosure.methods.features:features",
 }
 
-Factory = Callable[[str, Setting, "Method | None"], Method]
+# The argument after the colon, the context, the inner method.
+Factory = Callable[[str, MethodContext, "Method | None"], Method]
 
 
-def make_method(spec: str, setting: Setting | None = None) -> Method:
+def make_method(spec: str, context: MethodContext | None = None) -> Method:
     """Build the method that a specification such as ``seqslam+features:siamese.npz`` names."""
-    setting = setting or Setting()
+    context = context or MethodContext()
     head, _, argument = spec.partition(":")
     name, plus, inner_name = head.partition("+")
     if name not in METHODS:
         raise InputError(f'unknown method "{name}" in "{spec}"; known: {", ".join(METHODS)}')
-    inner = make_method(spec[len(name) + 1 :], setting) if plus else None
+    inner = make_method(spec[len(name) + 1 :], context) if plus else None
     if inner_name:
         argument = ""
     module_name, _, factory_name = METHODS[name].partition(":")
     factory: Any = getattr(importlib.import_module(module_name), factory_name)
-    return factory(argument, setting, inner)
+    return factory(argument, context, inner)
 
 
 def refuse_overlap(train_images: list[Path], test_images: list[Path], model: str | Path = "") -> None:
-    """Raise InputError when an image is trained on and tested: a vocabulary that knows the test flatters itself."""
+    """Raise InputError if an image is used for training and testing, which would give too good a result."""
     trained = {Path(path).resolve() for path in train_images}
     shared = [path for path in test_images if Path(path).resolve() in trained]
     if shared:

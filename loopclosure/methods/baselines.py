@@ -1,7 +1,8 @@
-"""The baselines as methods of the judge: ``fabmap``, ``bow`` and ``thumbnails`` on the command line.
+"""The baselines as methods: ``fabmap``, ``bow`` and ``thumbnails`` on the command line.
 
 Their argument is a comma-separated list of ``setting=value``; the settings are the fields of the classes below and of
-those they name. ``fabmap:model=words.npz,score=posterior`` keeps its vocabulary in a file and reads it the next time.
+the classes of these fields. ``fabmap:model=words.npz,scored=posterior`` writes its vocabulary to a file, and reads it
+the next time.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer, differences
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Method, MethodResult, Setting, refuse_overlap
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_overlap
 from loopclosure.methods.settings import configure
-from loopclosure.places.frames import read_grey
+from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
 from loopclosure.words.bag_of_words import BagOfWords, check_metric
 from loopclosure.words.fabmap import FabMapModel, FabMapSettings, score_sequence, score_sets
@@ -24,27 +25,25 @@ from loopclosure.words.word_model import TRAINING_STAGES, Training, WordModel, t
 
 
 @dataclass(frozen=True)
-class Words:
-    """Where the words of images come from: trained, or read from ``model`` (written there when it does not exist)."""
+class WordModelSource:
+    """Where the word model comes from: trained, or read from ``model`` (written there if it does not exist)."""
 
     training: Training = field(default_factory=Training)
     model: str = ""
 
-    def learn(
-        self, train_images: list[Path], test_images: list[Path], progress: Progress, seconds: dict[str, float]
-    ) -> tuple[WordModel, list[str]]:
-        """Return the model and notes on it; refuse one that was trained on a test image."""
+    def learn(self, images: Images, progress: Progress, seconds: dict[str, float]) -> tuple[WordModel, list[str]]:
+        """Return the model and notes about it; refuse a model that was trained on a test image."""
         path = Path(self.model)
         if self.model and path.exists():
             model = WordModel.load(path)
             source = f"read from {path}"
         else:
-            refuse_overlap(train_images, test_images)
-            model = train(train_images, self.training, progress, seconds)
+            refuse_overlap(images.train, images.tested)
+            model = train(images.train, self.training, progress, seconds)
             source = f"written to {path}" if self.model else "made for this run"
             if self.model:
                 model.save(path)
-        refuse_overlap(model.training_images, test_images, self.model)
+        refuse_overlap(model.training_images, images.tested, self.model)
         present = (model.training_words > 0).mean(axis=0)
         return model, [
             f"vocabulary ({source}): {model.vocabulary.made}; {model.vocabulary.extractor}",
@@ -54,32 +53,26 @@ class Words:
 
 
 @dataclass
-class _WordsOfImages:
-    """The part that methods on words have in common."""
+class _WordMethod:
+    """The common part of methods on visual words."""
 
-    words: Words = field(default_factory=Words)
+    source: WordModelSource = field(default_factory=WordModelSource)
 
     def _count(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-        seconds: dict[str, float],
+        self, images: Images, progress: Progress, seconds: dict[str, float]
     ) -> tuple[WordModel, np.ndarray, np.ndarray | None, list[str]]:
         """Return the model, the words of queries and references, and notes."""
-        tested = query_images + (reference_images or [])
-        model, notes = self.words.learn(train_images, tested, progress, seconds)
-        counts = model.words(tested, progress, seconds)
+        model, notes = self.source.learn(images, progress, seconds)
+        counts = model.count_words(images.tested, progress, seconds)
         empty = int((counts.sum(axis=1) == 0).sum())
         if empty:
-            notes.append(f"{empty} of {len(tested)} images have no feature at all: places without words")
-        references = None if reference_images is None else counts[len(query_images) :]
-        return model, counts[: len(query_images)], references, notes
+            notes.append(f"{empty} of {len(counts)} images have no features: places without words")
+        size = len(images.queries)
+        return model, counts[:size], None if images.references is None else counts[size:], notes
 
 
 @dataclass
-class FabMapMethod(_WordsOfImages):
+class FabMapMethod(_WordMethod):
     """FAB-MAP; ``scored`` is "log_odds" (evidence against a new place) or "posterior"."""
 
     settings: FabMapSettings = field(default_factory=FabMapSettings)
@@ -90,16 +83,10 @@ class FabMapMethod(_WordsOfImages):
         if self.scored not in ("log_odds", "posterior"):
             raise InputError(f'FAB-MAP\'s score is "log_odds" or "posterior", not "{self.scored}"')
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
-        model, queries, references, notes = self._count(query_images, reference_images, train_images, progress, seconds)
+        model, queries, references, notes = self._count(images, progress, seconds)
         with timed(seconds, "likelihoods"):
             fabmap = FabMapModel(model.tree, model.training_words, self.settings)
             if references is None:
@@ -112,7 +99,7 @@ class FabMapMethod(_WordsOfImages):
 
 
 @dataclass
-class BagOfWordsMethod(_WordsOfImages):
+class BagOfWordsMethod(_WordMethod):
     """Bag of words with tf-idf; ``metric`` as in :class:`BagOfWords`."""
 
     metric: str = "l1"
@@ -121,16 +108,10 @@ class BagOfWordsMethod(_WordsOfImages):
     def __post_init__(self) -> None:
         check_metric(self.metric)
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
-        model, queries, references, notes = self._count(query_images, reference_images, train_images, progress, seconds)
+        model, queries, references, notes = self._count(images, progress, seconds)
         with timed(seconds, "similarity"):
             bag = BagOfWords.learn(model.training_words, self.metric)
             scores = bag.similarity(queries, queries if references is None else references)
@@ -140,57 +121,51 @@ class BagOfWordsMethod(_WordsOfImages):
 
 @dataclass
 class ThumbnailMethod:
-    """Thumbnails, the mean absolute difference with its sign changed."""
+    """Thumbnails; the score is minus the mean absolute difference."""
 
     thumbnailer: Thumbnailer = field(default_factory=Thumbnailer)
     name: str = "thumbnails"
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
-        tested = query_images + (reference_images or [])
+        tested = images.tested
         small = np.zeros((len(tested), self.thumbnailer.height, self.thumbnailer.width), np.float32)
         for i, path in enumerate(progress(tested, "thumbnails", len(tested))):
             with timed(seconds, "thumbnails"):
-                small[i] = self.thumbnailer(read_grey(path))
+                small[i] = self.thumbnailer(read_gray(path))
         with timed(seconds, "differences"):
-            queries = small[: len(query_images)]
-            scores = -differences(queries, queries if reference_images is None else small[len(query_images) :])
-        return MethodResult(scores, seconds, [f"mean absolute difference of grey thumbnails; {self.thumbnailer}"])
+            queries, references = np.split(small, [len(images.queries)])
+            scores = -differences(queries, queries if images.references is None else references)
+        return MethodResult(scores, seconds, [f"mean absolute difference of gray thumbnails; {self.thumbnailer}"])
 
 
-def fabmap(argument: str, setting: Setting, inner: Method | None) -> FabMapMethod:
+def fabmap(argument: str, context: MethodContext, inner: Method | None) -> FabMapMethod:
     """Build ``fabmap[:setting=value,...]``."""
     refuse_inner("fabmap", inner)
-    method, words, training, extractor, settings = configure(
+    method, source, training, extractor, settings = configure(
         "fabmap",
         argument,
         FabMapMethod(),
-        Words(),
-        Training(seed=setting.seed),
+        WordModelSource(),
+        Training(seed=context.seed),
         Extractor(),
-        FabMapSettings(recent=setting.exclude_frames, seed=setting.seed),
+        FabMapSettings(recent=context.exclude_frames, seed=context.seed),
     )
-    words = replace(words, training=replace(training, extractor=extractor))
-    return replace(method, words=words, settings=settings)
+    source = replace(source, training=replace(training, extractor=extractor))
+    return replace(method, source=source, settings=settings)
 
 
-def bag_of_words(argument: str, setting: Setting, inner: Method | None) -> BagOfWordsMethod:
+def bag_of_words(argument: str, context: MethodContext, inner: Method | None) -> BagOfWordsMethod:
     """Build ``bow[:setting=value,...]``."""
     refuse_inner("bow", inner)
-    method, words, training, extractor = configure(
-        "bow", argument, BagOfWordsMethod(), Words(), Training(seed=setting.seed), Extractor()
+    method, source, training, extractor = configure(
+        "bow", argument, BagOfWordsMethod(), WordModelSource(), Training(seed=context.seed), Extractor()
     )
-    return replace(method, words=replace(words, training=replace(training, extractor=extractor)))
+    return replace(method, source=replace(source, training=replace(training, extractor=extractor)))
 
 
-def thumbnails(argument: str, setting: Setting, inner: Method | None) -> ThumbnailMethod:
+def thumbnails(argument: str, context: MethodContext, inner: Method | None) -> ThumbnailMethod:
     """Build ``thumbnails[:setting=value,...]``."""
     refuse_inner("thumbnails", inner)
     method, thumbnailer = configure("thumbnails", argument, ThumbnailMethod(), Thumbnailer())
@@ -198,6 +173,6 @@ def thumbnails(argument: str, setting: Setting, inner: Method | None) -> Thumbna
 
 
 def refuse_inner(method: str, inner: Method | None) -> None:
-    """Raise InputError when a method that looks at images is written as refining another."""
+    """Raise InputError if a method that works on images is given another method to refine."""
     if inner is not None:
         raise InputError(f"{method}+{inner.name}: {method} works on images, not on the scores of another method")

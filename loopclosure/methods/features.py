@@ -1,4 +1,4 @@
-"""Descriptors of files as a method of the judge, compared as they are or whitened: ``features`` on the command line."""
+"""Descriptors from files as a method, compared as they are or whitened: ``features`` on the command line."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS, check_metric, similarity_matrix
 from loopclosure.descriptors.whitening import COMPONENTS, Whitening, learn_whitening
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Method, MethodResult, Setting, refuse_overlap
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_overlap
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
 
-# Where the settings of features:FILES[:METRIC][:SETTINGS] begin; after a comma, whiten= is a setting too and no file.
+# Where the settings of features:FILES[:METRIC][:SETTINGS] begin; after a comma, whiten= begins the settings too.
 SETTINGS_BEGIN = re.compile(r":(?=\w+=)|,(?=whiten=)")
 
 
 @dataclass(frozen=True)
 class WhitenBy:
-    """The settings of a whitening: the file ``whiten`` with descriptors of other images, none where it is empty."""
+    """The settings of a whitening: the file ``whiten`` has descriptors of other images; empty: no whitening."""
 
     whiten: str = ""
     components: int = COMPONENTS
     power: float = 1.0
 
     def learn(self, *tested: tuple[list[Path], np.ndarray]) -> Whitening:
-        """Learn the whitening from every view that the file describes.
+        """Learn the whitening from all views in the file.
 
-        Refuse to learn it from what is ``tested``: N images with the descriptors (N, D) of their first views.
+        Raises InputError if the file has an image that is ``tested``: N images, the descriptors (N, D) of their first
+        views.
         """
         training = read_features(self.whiten)
         views = np.split(training.features, training.views, axis=1)
@@ -44,7 +45,7 @@ class WhitenBy:
 
 @dataclass(frozen=True)
 class FeatureMethod:
-    """Descriptors from files, compared in one metric; one file for queries and references, or one for each."""
+    """Descriptors from files, compared by one metric; one file for queries and references, or one file for each."""
 
     query_file: Path
     reference_file: Path
@@ -53,60 +54,54 @@ class FeatureMethod:
 
     @property
     def name(self) -> str:
-        """The file's name, the metric, whether whitened."""
+        """The file's name, the metric, and whether it is whitened."""
         return f"{self.query_file.stem} ({self.metric}{', whitened' if self.whitening.whiten else ''})"
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
-        """Score as :class:`loopclosure.methods.base.Method` says; the seconds of the net are those the file carries."""
+    def score(self, images: Images, progress: Progress) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says; the net's seconds are read from the file."""
         query_features = read_features(self.query_file)
         views = query_features.views
-        judged = [query_images]
-        rows = [query_features.rows_of(query_images)]
-        if reference_images is not None:
+        described = [images.queries]
+        rows = [query_features.rows_of(images.queries)]
+        if images.references is not None:
             same = self.reference_file == self.query_file
             reference_features = query_features if same else read_features(self.reference_file)
             if reference_features.views != views:
                 raise InputError(
-                    f"describes {reference_features.views} view(s) of an image, {self.query_file} {views}; "
+                    f"has {reference_features.views} view(s) of each image, {self.query_file} has {views}; "
                     "give netspec extract the same --zooms",
                     self.reference_file,
                 )
-            judged.append(reference_images)
-            rows.append(reference_features.rows_of(reference_images))
+            described.append(images.references)
+            rows.append(reference_features.rows_of(images.references))
         size = rows[0].shape[1] // views
         notes = [f"{f'{views} views of ' if views > 1 else ''}{size} dimensions, {self.metric}"]
         seconds: dict[str, float] = {}
         if np.isfinite(query_features.seconds_per_image):
-            seconds["features"] = query_features.seconds_per_image * sum(map(len, judged))
+            seconds["features"] = query_features.seconds_per_image * len(images.tested)
         else:
             notes.append("the file does not say how long the features took")
-        once: tuple[str, ...] = ()
+        training_stages: tuple[str, ...] = ()
         if self.whitening.whiten:
-            once = ("training whitening",)
-            with timed(seconds, *once):
+            training_stages = ("training whitening",)
+            with timed(seconds, *training_stages):
                 whole = [descriptors[:, :size] for descriptors in rows]
-                whitening = self.whitening.learn(*zip(judged, whole, strict=True))
+                whitening = self.whitening.learn(*zip(described, whole, strict=True))
             with timed(seconds, "whitening"):
                 rows = [whitening.of_views(descriptors, views) for descriptors in rows]
             notes.append(str(whitening))
         with timed(seconds, "similarity"):
             scores = similarity_matrix(rows[0], rows[1] if len(rows) == 2 else None, self.metric, views)
-        return MethodResult(scores, seconds, notes, once)
+        return MethodResult(scores, seconds, notes, training_stages)
 
 
-def features(argument: str, setting: Setting, inner: Method | None) -> FeatureMethod:
+def features(argument: str, context: MethodContext, inner: Method | None) -> FeatureMethod:
     """Build the method ``features:FILES[:euclidean|cosine][:whiten=OTHER.npz,components=512,power=1]``.
 
     FILES is PATH.npz, or QUERIES.npz,REFERENCES.npz.
     """
     if inner is not None:
-        raise InputError("features refines no other method; write features:PATH.npz")
+        raise InputError("features cannot refine another method; write features:PATH.npz")
     described, *settings = SETTINGS_BEGIN.split(argument, maxsplit=1)
     files, colon, metric = described.rpartition(":")
     if not colon or metric.endswith(".npz"):
@@ -114,8 +109,8 @@ def features(argument: str, setting: Setting, inner: Method | None) -> FeatureMe
     check_metric(metric)
     paths = [Path(name) for name in files.split(",") if name]
     if len(paths) not in (1, 2):
-        raise InputError(f'"features:{argument}": expected features:PATH.npz, or two files with a comma between')
+        raise InputError(f'"features:{argument}": expected features:PATH.npz, or two files separated by a comma')
     (whitening,) = configure("features", "".join(settings), WhitenBy())
     if settings and not whitening.whiten:
-        raise InputError(f'"features:{argument}": its settings are those of a whitening; add whiten=OTHER.npz')
+        raise InputError(f'"features:{argument}": its settings belong to a whitening; add whiten=OTHER.npz')
     return FeatureMethod(paths[0], paths[-1], metric, whitening)

@@ -1,27 +1,26 @@
-"""SeqSLAM: places recognised by sequences of images rather than by single ones (Milford and Wyeth, ICRA 2012).
+"""SeqSLAM: places are recognized by sequences of images, not by single images (Milford and Wyeth, ICRA 2012).
 
-Everything is a matrix (Q, R) of queries against references, each in the order of its drive; lower is more alike until
-the method at the end, whose scores are higher for more alike. It works on any matrix of distances: on SeqSLAM's own
-differences of thumbnails, and on those of learned features ("seqslam+features:...").
+All matrices are (Q, R), queries against references, each in the order of its traverse. Lower values are more similar,
+except for the scores of the method at the end. It works on any matrix of distances: on SeqSLAM's own differences of
+thumbnails, and on those of learned features ("seqslam+features:...").
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Method, MethodResult, Setting
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult
 from loopclosure.methods.baselines import ThumbnailMethod
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
 
 DIRECTIONS = ("forward", "both")
-ANCHORS = ("centre", "start")
+ANCHORS = ("center", "start")
 EDGES = ("shorten", "drop")
 
 
@@ -30,13 +29,13 @@ class SequenceSettings:
     """How sequences are searched; lengths, windows and velocities are OpenSeqSLAM's.
 
     length         steps of a trajectory (it has length + 1 images), half of them before the query, half after
-    slowest        velocities, in reference frames a query frame
-    fastest
-    velocity_step
-    contrast       local contrast: references i - contrast/2 .. i + contrast/2 are the neighbourhood; 0 leaves it out
-    directions     "forward", or "both": the references may also be passed the other way round
-    anchor         "centre" of the trajectory is the reference it stands for, or, as in OpenSeqSLAM, "start" + length/2
-    edges          where a trajectory leaves the matrix: "drop" it (OpenSeqSLAM), or "shorten" it, to half at the least
+    slowest        least velocity, in reference frames per query frame
+    fastest        greatest velocity
+    velocity_step  step between velocities
+    contrast       local contrast: references i - contrast/2 .. i + contrast/2 are the neighborhood; 0: none
+    directions     "forward", or "both": the references may also be passed in reverse order
+    anchor         the reference that a trajectory belongs to: its "center", or, as in OpenSeqSLAM, "start" + length/2
+    edges          if a trajectory leaves the matrix: "drop" it (OpenSeqSLAM), or "shorten" it, to no less than half
     """
 
     length: int = 10
@@ -45,17 +44,19 @@ class SequenceSettings:
     velocity_step: float = 0.1
     contrast: int = 10
     directions: str = "forward"
-    anchor: str = "centre"
+    anchor: str = "center"
     edges: str = "shorten"
 
     def __post_init__(self) -> None:
+        if self.anchor == "centre":  # the British spelling, still accepted
+            object.__setattr__(self, "anchor", "center")
         for value, choices, name in (
             (self.directions, DIRECTIONS, "directions"),
             (self.anchor, ANCHORS, "anchor"),
             (self.edges, EDGES, "edges"),
         ):
             if value not in choices:
-                raise InputError(f'{name} of SeqSLAM: "{value}" is none of {", ".join(choices)}')
+                raise InputError(f'{name} of SeqSLAM is "{value}"; expected {" or ".join(choices)}')
         if self.length < 1 or self.contrast < 0:
             raise InputError(f"SeqSLAM needs length >= 1 and contrast >= 0, got {self.length} and {self.contrast}")
         if not 0.0 < self.slowest <= self.fastest or self.velocity_step <= 0.0:
@@ -66,15 +67,15 @@ class SequenceSettings:
 
     @property
     def velocities(self) -> np.ndarray:
-        """The velocities tried, reference frames a query frame."""
+        """The velocities that are tried, in reference frames per query frame."""
         steps = int((self.fastest - self.slowest) / self.velocity_step + 1e-9)
         return self.slowest + self.velocity_step * np.arange(steps + 1)
 
     def offsets(self) -> np.ndarray:
-        """Return which reference each trajectory passes at each step, less the one it stands for: (T, length + 1)."""
+        """Return the reference that each trajectory passes at each step, relative to its own: (T, length + 1)."""
         steps = np.arange(self.length + 1)
         half = self.length // 2
-        # The small term lets 1.2 * 5, which is just below 6 in binary, reach 6.
+        # The small term is for products such as 1.2 * 5, which is just below 6 in binary.
         if self.anchor == "start":
             paths = np.floor(np.outer(self.velocities, steps) + 1e-9).astype(int) - half
         else:
@@ -85,32 +86,32 @@ class SequenceSettings:
 
 
 def enhance_contrast(distances: np.ndarray, window: int = 10, valid: np.ndarray | None = None) -> np.ndarray:
-    """Return the distances (Q, R), each less the mean of its neighbourhood among the references, over its deviation.
+    """Return (distance - mean) / deviation of each distance (Q, R), over its neighborhood among the references.
 
-    Neighbourhood: the references i - window/2 .. i + window/2 that exist and are ``valid`` (Q, R). Deviation with
-    n - 1; where all are alike the result is 0. The least of all is then subtracted. What is not valid is NaN.
+    The neighborhood is the references i - window/2 .. i + window/2 that exist and are ``valid`` (Q, R). The deviation
+    is that with n - 1; if it is 0, so is the result. The least result is subtracted from all. Invalid pairs are NaN.
     """
     valid = np.ones(distances.shape, bool) if valid is None else valid
     if not valid.any():
         return np.full(distances.shape, np.nan)
     known = np.where(valid, distances, 0.0)
     count, mean, squares = (np.zeros(distances.shape) for _ in range(3))
-    neighbours = list(_neighbours(distances.shape[1], window // 2))
-    for here, there in neighbours:
+    neighbors = list(_neighbors(distances.shape[1], window // 2))
+    for here, there in neighbors:
         count[:, here] += valid[:, there]
         mean[:, here] += known[:, there]
     mean /= np.maximum(count, 1)
-    for here, there in neighbours:
+    for here, there in neighbors:
         squares[:, here] += np.where(valid[:, there], known[:, there] - mean[:, here], 0.0) ** 2
     deviation = np.sqrt(squares / np.maximum(count - 1, 1))
-    differ = deviation > 1e-12 * np.abs(mean)  # the rounded mean of equal distances may leave a trace of a deviation
+    differ = deviation > 1e-12 * np.abs(mean)  # rounding can make the deviation of equal distances slightly positive
     enhanced = np.divide(known - mean, deviation, out=np.zeros_like(known), where=differ)
     enhanced[~valid] = np.nan
     return enhanced - np.nanmin(enhanced)
 
 
-def _neighbours(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
-    """Return, for each shift up to ``reach``, the columns that have such a neighbour, and these neighbours."""
+def _neighbors(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
+    """Return, for each shift up to ``reach``, the columns that have such a neighbor, and their neighbors."""
     shifts = range(-min(reach, size - 1), min(reach, size - 1) + 1)
     return [(slice(max(0, -s), size - max(0, s)), slice(max(0, s), size - max(0, -s))) for s in shifts]
 
@@ -118,7 +119,7 @@ def _neighbours(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
 def trajectory_costs(distances: np.ndarray, settings: SequenceSettings) -> np.ndarray:
     """Return the least mean distance along any trajectory through each query and reference: (Q, R).
 
-    NaN in ``distances`` (Q, R) lies outside the matrix. A cost is NaN where every trajectory leaves it too early.
+    NaN in ``distances`` (Q, R) counts as outside the matrix. A cost is NaN if too little of every trajectory is inside.
     """
     queries, references = distances.shape
     half = settings.length // 2
@@ -141,11 +142,11 @@ def trajectory_costs(distances: np.ndarray, settings: SequenceSettings) -> np.nd
     return np.where(np.isfinite(best), best, np.nan)
 
 
-def best_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """Return each query's reference of least cost (Q,), -1 where none, and how unrivalled it is (Q,).
+def least_cost_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Return each query's reference of least cost (Q,), -1 if there is none, and how unique it is (Q,).
 
-    The second is the ratio of that cost to the least one more than ``window`` / 2 references away, in [0, 1], smaller =
-    surer (OpenSeqSLAM accepts below 0.9); NaN where there is no match or no rival.
+    The second value is the ratio of that cost to the least cost more than ``window`` / 2 references away, in [0, 1];
+    smaller is more certain (OpenSeqSLAM accepts below 0.9). It is NaN if one of the two costs does not exist.
     """
     finite = np.where(np.isnan(costs), np.inf, costs)
     match = np.argmin(finite, axis=1)
@@ -155,13 +156,13 @@ def best_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray, np.nd
     rival = np.where(near, np.inf, finite).min(axis=1)
     judged = np.isfinite(least) & np.isfinite(rival)
     ratio = np.full(len(costs), np.nan)
-    # Both can be 0 where two references fit exactly: no reason to prefer either.
+    # Both are 0 if two references fit exactly: then neither is preferred.
     ratio[judged] = np.divide(least[judged], rival[judged], out=np.ones(judged.sum()), where=rival[judged] > 0)
     return np.where(np.isfinite(least), match, -1), ratio
 
 
 def earlier(frames: int, exclude: int) -> np.ndarray:
-    """Return which pairs (query, reference) of one sequence may be loops: reference < query - exclude, (n, n) bool."""
+    """Return which pairs (query, reference) of one sequence can be loops: reference < query - exclude, (n, n) bool."""
     return np.tri(frames, frames, -1 - exclude, dtype=bool)
 
 
@@ -169,10 +170,10 @@ def earlier(frames: int, exclude: int) -> np.ndarray:
 class SeqSlam:
     """SeqSLAM on the scores of another method, its own thumbnails by default.
 
-    scored          "cost" of the best trajectory at each pair (sign changed), or "uniqueness": only each query's best
-                    match gets a score, 1 - its ratio to the next best (see :func:`best_matches`)
+    scored          "cost": minus the cost of the best trajectory of each pair; "uniqueness": only each query's best
+                    match gets a score, 1 - its ratio to the next best (see :func:`least_cost_matches`)
     match_window    of the uniqueness
-    exclude_frames  in one sequence, references within so many frames of the query are no candidates
+    exclude_frames  in one sequence, references within this many frames of the query are not candidates
     """
 
     inner: Method
@@ -186,49 +187,43 @@ class SeqSlam:
         if self.scored not in ("cost", "uniqueness"):
             raise InputError(f'SeqSLAM\'s score is "cost" or "uniqueness", not "{self.scored}"')
 
-    def score(
-        self,
-        query_images: list[Path],
-        reference_images: list[Path] | None,
-        train_images: list[Path],
-        progress: Progress,
-    ) -> MethodResult:
+    def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
-        found = self.inner.score(query_images, reference_images, train_images, progress)
+        found = self.inner.score(images, progress)
         seconds = dict(found.seconds)
         with timed(seconds, "sequences"):
             valid = np.isfinite(found.scores)
-            if reference_images is None:
-                valid &= earlier(len(query_images), self.exclude_frames)
+            if images.references is None:
+                valid &= earlier(len(images.queries), self.exclude_frames)
             distances = np.where(valid, -found.scores, np.nan)
             if self.settings.contrast:
                 distances = enhance_contrast(distances, self.settings.contrast, valid)
-            elif self.scored == "uniqueness":  # a ratio needs costs that are not negative; log-odds have no such end
+            elif self.scored == "uniqueness":  # a ratio needs costs >= 0, and log-odds have no bound
                 distances -= distances.min(where=valid, initial=0.0)
             costs = np.where(valid, trajectory_costs(distances, self.settings), np.nan)
             scores = -costs if self.scored == "cost" else self._unique(costs)
         notes = [*found.notes, f"SeqSLAM, score: {self.scored}; {self.settings}"]
-        return MethodResult(scores, seconds, notes, found.once)
+        return MethodResult(scores, seconds, notes, found.training_stages)
 
     def _unique(self, costs: np.ndarray) -> np.ndarray:
-        match, ratio = best_matches(costs, self.match_window)
+        match, ratio = least_cost_matches(costs, self.match_window)
         scores = np.full(costs.shape, np.nan)
         judged = np.flatnonzero(np.isfinite(ratio))
         scores[judged, match[judged]] = 1.0 - ratio[judged]
         return scores
 
 
-def seqslam(argument: str, setting: Setting, inner: Method | None) -> SeqSlam:
+def seqslam(argument: str, context: MethodContext, inner: Method | None) -> SeqSlam:
     """Build ``seqslam[:setting=value,...]`` on SeqSLAM's thumbnails, or ``seqslam+METHOD`` on another method's scores.
 
-    The second without contrast enhancement: it makes up for differences of thumbnails that mean little by themselves,
-    while the scores of a descriptor are comparable from query to query, which it would undo.
+    The second is without contrast enhancement, which helps because differences of thumbnails mean little by themselves.
+    The scores of a descriptor are comparable from query to query, and it would undo that.
     """
-    own = Thumbnailer(width=64, height=32, normalise="patch", patch=8)
+    own = Thumbnailer(width=64, height=32, normalize="patch", patch=8)
     method, settings, thumbnailer = configure(
         "seqslam",
         argument,
-        SeqSlam(ThumbnailMethod(own), exclude_frames=setting.exclude_frames),
+        SeqSlam(ThumbnailMethod(own), exclude_frames=context.exclude_frames),
         SequenceSettings(),
         own,
     )

@@ -1,4 +1,4 @@
-"""The argument of a method on the command line, ``setting=value,setting=value``, put into the settings it names."""
+"""The argument of a method on the command line: ``setting=value,setting=value``."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ from typing import Any
 from loopclosure.errors import InputError
 
 YES_NO = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-# Not of the argument: the name is the method's, the seed that of the whole evaluation.
+# Not settable: the name is the method's, the seed is that of the whole evaluation.
 FIXED = ("name", "seed")
+# British spellings of settings, still accepted.
+BRITISH = {"normalise": "normalize"}
 
 
 def configure(method: str, argument: str, *parts: Any) -> list[Any]:
     """Return the dataclasses ``parts`` with the settings that ``argument`` gives.
 
-    A setting goes to the first part that has a field of its name; its default says whether it is a number, yes or no,
-    or text. InputError for a setting that no part has and for a value that does not fit.
+    A setting goes to the first part that has a field of its name; the type of its default is the type of the value.
+    Raises InputError for a setting that no part has, and for a value of another type.
     """
     changed = list(parts)
     known = {f.name: i for i, part in reversed(list(enumerate(parts))) for f in fields(part) if _settable(part, f.name)}
     for item in filter(None, (text.strip() for text in argument.split(","))):
         key, equals, value = (text.strip() for text in item.partition("="))
+        key = BRITISH.get(key, key)
         if not equals or key not in known:
             raise InputError(f'{method} has no setting "{item}"; write setting=value with {", ".join(sorted(known))}')
         part = changed[known[key]]

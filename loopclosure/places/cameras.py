@@ -53,7 +53,7 @@ def mask_of_places(camera: str, mask: NDArray, images: int, file: Path) -> NDArr
         return np.any(views, axis=0)
     if camera in ("left", "right", "joined") and mask.shape == (len(places), len(places)):
         return mask
-    halved = "; does the folder hold one camera's images only?" if len(mask) == 2 * images else ""
+    halved = "; does the folder have only one camera's images?" if len(mask) == 2 * images else ""
     raise InputError(f"is {mask.shape[0]} x {mask.shape[1]}, but there are {images} images{halved}", file)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from loopclosure.errors import InputError
 from loopclosure.places.cameras import comparable, images_of_places, mask_of_places
-from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_image
+from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_bgr
 from loopclosure.places.masks import read_coordinates, read_place_pairs, read_truth_matrix
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
 
-# Ten seconds are what TUM's 30 Hz sequences are commonly judged with; the other sets have no time.
+# Ten seconds are common for TUM's 30 Hz sequences; the other sets have no time.
 TUM_EXCLUSION = Exclusion(seconds=10.0)
 # New College's own mask has no loop nearer than 142 images (71 pairs of left and right).
 FABMAP_EXCLUSION = Exclusion(frames=50)
@@ -30,13 +30,13 @@ class DataSet:
     """Frames and their truth.
 
     query_images         Q paths
-    reference_images     R paths, or None for one sequence that meets its own places again
+    reference_images     R paths, or None for one sequence that visits its own places again
     truth                (Q, R)
-    exclude_frames       no pair of the sequence further apart than this is excluded (SeqSLAM needs frames, not seconds)
-    stamps               (Q,) seconds, where known
-    positions            (Q, 3) metres or (Q, 2), where known: for the map
-    quaternions          (Q, 4) xyzw, where known
-    notes                what a reader of the figures should know: what was left out, what looks odd
+    exclude_frames       least number of frames that covers all excluded pairs (SeqSLAM needs frames, not seconds)
+    stamps               (Q,) seconds, if known
+    positions            (Q, 3) meters or (Q, 2), if known: for the map
+    quaternions          (Q, 4) xyzw, if known
+    notes                what a reader of the results should know: what was left out, what looks odd
     """
 
     name: str
@@ -66,7 +66,7 @@ def load_tum(
     soft_angle_deg: float | None = None,
     max_difference_s: float = MAX_DIFFERENCE_S,
 ) -> DataSet:
-    """Load a TUM RGB-D sequence; truth by the paper's rule from its poses, with wider limits for soft truth if given.
+    """Load a TUM RGB-D sequence; truth by the paper's rule from its poses, with wider limits for soft truth, if given.
 
     Frames without a pose within ``max_difference_s`` are left out before ``selection`` counts.
     """
@@ -86,7 +86,7 @@ def load_tum(
         rule += f" (soft: {wide_m:g} m, {wide_deg:g} degrees)"
     notes = [f"frames without a pose, left out: {sequence.dropped}"] if sequence.dropped else []
     truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
-    name = f"{sequence.name}{_selection_words(selection)}"
+    name = f"{sequence.name}{_selection_text(selection)}"
     frames = _excluded_frames(exclusion, stamps)
     return _checked(DataSet(name, images, None, truth, frames, stamps, poses.positions, poses.quaternions, notes), hard)
 
@@ -103,10 +103,10 @@ def load_fabmap(
     """Load a set in the form of FAB-MAP's New College and City Centre: numbered images of a left and a right camera.
 
     Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
-    the coordinates (``*Coordinates.mat`` or ``.txt``) are looked for in the folder unless given.
+    the coordinates (``*Coordinates.mat`` or ``.txt``) are searched for in the folder unless given.
 
-    camera     which images are taken: see loopclosure.places.cameras; "joined" ones are written to ``joined_folder``
-    selection  counts images of one camera, or joined ones, or with "both" single ones
+    camera     which images are taken: see loopclosure.places.cameras; "joined" images are written to ``joined_folder``
+    selection  counts images of one camera, or joined images, or with "both" single images
     """
     folder = Path(folder)
     images = image_paths(folder)
@@ -119,18 +119,18 @@ def load_fabmap(
     hard, soft, places = hard[np.ix_(taken, taken)], soft[np.ix_(taken, taken)], places[taken]
     judged = comparable(camera, places)
     if camera == "both":
-        notes.append("pairs of a left with a right image are not judged: the two cameras look to opposite sides")
+        notes.append("pairs of a left and a right image are not judged: the two cameras look to opposite sides")
     if camera == "joined":
         if joined_folder is None:
-            raise InputError("joined images have to be written somewhere; name a folder for them")
+            raise InputError("joined images are written to files; give a folder for them")
         query_images = join_images([(images[a], images[b]) for a, b in places], Path(joined_folder))
     else:
         query_images = [images[place[0]] for place in places]
     positions = _fabmap_positions(folder, coordinates_file, len(images), places)
     rule = f"same place: as {truth_path.name} says"
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
-    words = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
-    name = f"{folder.resolve().name}, {words}{_selection_words(selection)}"
+    views = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
+    name = f"{folder.resolve().name}, {views}{_selection_text(selection)}"
     data = DataSet(name, query_images, None, truth, exclusion.frames, None, positions, None, notes)
     return _checked(data, hard & judged)
 
@@ -142,13 +142,13 @@ def load_folder(
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion = FOLDER_EXCLUSION,
 ) -> DataSet:
-    """Load images with a mask of their own: (N, N) of one sequence, or (Q, R) with ``references``, another folder.
+    """Load images and their mask: (N, N) of one sequence, or (Q, R) with ``references``, another folder.
 
-    With references ``selection`` concerns the queries, all references stay, and nothing is excluded.
+    With references, ``selection`` applies to the queries only, and no pair is excluded.
     """
     queries = image_paths(images)
     hard, soft = read_truth_matrix(truth_file)
-    name = f"{_folder_name(images)}{_selection_words(selection)}"
+    name = f"{_folder_name(images)}{_selection_text(selection)}"
     rule = f"same place: as {Path(truth_file).name} says"
     if references is not None:
         reference_images = image_paths(references)
@@ -179,16 +179,16 @@ def load_traverses(
     soft_tolerance: int | None = None,
     selection: Selection = ALL_FRAMES,
 ) -> DataSet:
-    """Load two traverses of one way whose frames of equal number show the same place (Nordland, corridor style).
+    """Load two traverses of one route whose frames of equal number show the same place, as in Nordland.
 
     ``tolerance``: frames i and j are the same place if |i - j| <= tolerance (counted before ``selection``, which takes
-    the same frames of both); ``soft_tolerance``, wider, for soft truth.
+    the same frames of both); ``soft_tolerance`` is the wider one of soft truth.
     """
     query_images, reference_images = image_paths(queries), image_paths(references)
     if len(query_images) != len(reference_images):
         raise InputError(
             f"{len(query_images)} queries in {queries}, {len(reference_images)} references in {references}; "
-            "expected as many, since frame i of one is frame i of the other"
+            "expected equal numbers, since frame i of one is frame i of the other"
         )
     if tolerance < 0 or (soft_tolerance is not None and soft_tolerance < tolerance):
         raise InputError(f"tolerance {tolerance}, soft tolerance {soft_tolerance}; expected 0 <= tolerance <= soft")
@@ -197,29 +197,29 @@ def load_traverses(
     rule = f"same place: at most {tolerance} frames apart" if tolerance else "same place: the frame of the same number"
     soft = None if soft_tolerance is None else apart <= soft_tolerance
     truth = traverse_truth(apart <= tolerance, rule, soft=soft)
-    name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_words(selection)}"
+    name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_text(selection)}"
     return DataSet(name, [query_images[i] for i in taken], [reference_images[i] for i in taken], truth)
 
 
 def load_place_pairs(folder: str | Path, selection: Selection = ALL_FRAMES) -> DataSet:
-    """Load places photographed twice: a folder with pairs.csv (place_id, query, ref); each query against all of ref."""
+    """Load places photographed twice: a folder with pairs.csv (place_id, query, ref); each query against all refs."""
     folder = Path(folder)
     rows = read_place_pairs(folder / "pairs.csv")
     rows = [rows[i] for i in selection.numbers(len(rows))]
     places = np.array([place for place, _, _ in rows])
     truth = traverse_truth(places[:, None] == places[None, :], "same place: the same place_id in pairs.csv")
-    name = f"{folder.resolve().name}{_selection_words(selection)}"
+    name = f"{folder.resolve().name}{_selection_text(selection)}"
     return DataSet(name, [query for _, query, _ in rows], [reference for _, _, reference in rows], truth)
 
 
-def join_images(pairs: SequenceOf[tuple[Path, Path]], folder: Path) -> list[Path]:
-    """Write left and right images side by side as PNG files into ``folder``; those already there are kept."""
+def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
+    """Write left and right images side by side as PNG files into ``folder``; existing files are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     joined = []
     for left, right in pairs:
         path = folder / f"{left.stem}_{right.stem}.png"
         if not path.is_file():
-            images = read_image(left), read_image(right)
+            images = read_bgr(left), read_bgr(right)
             if images[0].shape[0] != images[1].shape[0]:
                 raise InputError(f"is {images[1].shape[0]} pixels high, {left.name} {images[0].shape[0]}", right)
             if not cv2.imwrite(str(path), np.hstack(images)):
@@ -229,13 +229,13 @@ def join_images(pairs: SequenceOf[tuple[Path, Path]], folder: Path) -> list[Path
 
 
 def _fold(path: Path, hard: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Bring a square mask below the diagonal, where frame i stands against the earlier ones; say what was odd."""
+    """Move a square mask below the diagonal, where frame i is compared with earlier ones; note what was odd."""
     if hard.shape[0] != hard.shape[1]:
         raise InputError(f"is {hard.shape[0]} x {hard.shape[1]}; the mask of one sequence is square", path)
     above = int(np.count_nonzero(np.triu(hard, 1)))
     notes = []
     if above and not np.array_equal(hard, hard.T):
-        notes.append(f"{path.name}: {above} entries above the diagonal were taken for loops of the later frame")
+        notes.append(f"{path.name}: {above} entries above the diagonal were taken as loops of the later frame")
     return np.tril(hard | hard.T, -1), np.tril(soft | soft.T, -1), notes
 
 
@@ -253,19 +253,19 @@ def _fabmap_positions(
     raise InputError(f"has {len(coordinates)} rows, but there are {images} images", path)
 
 
-def _only_file(folder: Path, patterns: SequenceOf[str], needed: str = "") -> Path | None:
-    """Return the first file of the folder that fits a pattern; without one, None, or InputError where it is needed."""
+def _only_file(folder: Path, patterns: Sequence[str], needed: str = "") -> Path | None:
+    """Return the first file of the folder that fits a pattern; without one, None, or InputError if it is needed."""
     for pattern in patterns:
         found = sorted(folder.glob(pattern))
         if found:
             return found[0]
     if needed:
-        raise InputError(f"has no {' or '.join(patterns)}, {needed}; name the file", folder)
+        raise InputError(f"has no {' or '.join(patterns)}, {needed}; give the file", folder)
     return None
 
 
 def _folder_name(source: str | Path) -> str:
-    """Return the name of a folder, with its parent where many sets have one of that name."""
+    """Return the name of a folder, with its parent if many data sets have a folder of that name."""
     path = Path(source).resolve()
     return f"{path.parent.name}/{path.name}" if path.name.lower() in COMMON_NAMES else path.name
 
@@ -278,24 +278,24 @@ def _existing(images: list[Path]) -> list[Path]:
 
 
 def _excluded_frames(exclusion: Exclusion, stamps: np.ndarray) -> int:
-    """Return the least number of frames that covers the exclusion, seconds too."""
+    """Return the least number of frames that covers the exclusion, including its seconds."""
     earliest = np.searchsorted(stamps, stamps - exclusion.seconds, side="right")
     return max(exclusion.frames, int(np.max(np.arange(len(stamps)) - earliest)))
 
 
-def _selection_words(selection: Selection) -> str:
-    words = []
+def _selection_text(selection: Selection) -> str:
+    parts = []
     if selection.start not in (0, "0", "0%") or selection.stop is not None:
-        words.append(f"frames {selection.start} to {'the last' if selection.stop is None else selection.stop}")
+        parts.append(f"frames {selection.start} to {'the last' if selection.stop is None else selection.stop}")
     if selection.stride > 1:
-        words.append(f"every {selection.stride}{ {2: 'nd', 3: 'rd'}.get(selection.stride, 'th') }")
+        parts.append(f"every {selection.stride}{ {2: 'nd', 3: 'rd'}.get(selection.stride, 'th') }")
     if selection.limit is not None:
-        words.append(f"at most {selection.limit}")
-    return f" ({', '.join(words)})" if words else ""
+        parts.append(f"at most {selection.limit}")
+    return f" ({', '.join(parts)})" if parts else ""
 
 
 def _checked(data: DataSet, hard: np.ndarray) -> DataSet:
-    """Say how many loops the exclusion takes away, and refuse a set in which nothing is left to find."""
+    """Note how many loops the exclusion removes, and refuse a set with nothing left to find."""
     if data.reference_images is None:
         whole = int(np.count_nonzero(np.tril(hard, -1)))
         lost = whole - data.truth.positives
@@ -303,6 +303,6 @@ def _checked(data: DataSet, hard: np.ndarray) -> DataSet:
             data.notes.append(f"{lost} of {whole} pairs that show the same place are excluded as too near in time")
     if not data.truth.positives:
         raise InputError(
-            f"{data.name}: no judged pair shows the same place ({data.truth.sentence}); nothing can be found"
+            f"{data.name}: no judged pair shows the same place ({data.truth.description}); nothing can be found"
         )
     return data

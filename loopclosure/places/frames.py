@@ -1,4 +1,4 @@
-"""Where frames come from: folders and lists of images, TUM RGB-D sequences, videos; and which of them are taken."""
+"""Where frames come from: folders and lists of images, TUM RGB-D sequences, videos; and which frames are taken."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import read_rgb_list
+from loopclosure.places.image_list import list_images
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
-STAMP = re.compile(r"\d+(\.\d+)?\s+")
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which of N frames are taken: from ``start`` up to ``stop``, each ``stride``-th, at most ``limit`` of them.
+    """Which of N frames are taken: from ``start`` up to ``stop``, every ``stride``-th, at most ``limit`` of them.
 
     ``start`` and ``stop`` count frames from 0, or are a share such as "60%".
     """
@@ -31,7 +29,7 @@ class Selection:
     limit: int | None = None
 
     def numbers(self, count: int) -> np.ndarray:
-        """Return the numbers of the taken frames of ``count``; InputError where none is left."""
+        """Return the numbers of the frames taken of ``count``; InputError if none is left."""
         if self.stride < 1:
             raise InputError(f"a stride of {self.stride} takes no frame; expected 1 or more")
         if self.limit is not None and self.limit < 1:
@@ -52,58 +50,19 @@ ALL_FRAMES = Selection()
 def _frame_number(position: int | str, count: int) -> int:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*%|(\d+)", str(position).strip())
     if not match:
-        raise InputError(f'"{position}" is no frame; expected a number from 0, or a share of the frames such as 60%')
+        raise InputError(f'"{position}" is not a frame; expected a number from 0, or a share of the frames such as 60%')
     if match[1] is None:
         return int(match[2])
     return round(float(match[1]) / 100 * count)
 
 
-def natural_order(path: Path) -> list[str | int]:
-    """Sort key by which 2.jpg comes before 10.jpg."""
-    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
-
-
 def image_paths(source: str | Path) -> list[Path]:
-    """List the images of a source, in order.
-
-    A TUM RGB-D sequence (a folder with rgb.txt) gives the images listed there, in order of time; any other folder
-    its image files in natural order (2.jpg before 10.jpg), those in a subfolder rgb or images where it has none; a text
-    file the paths in it, one a line, a stamp may stand before, relative to its own folder (# begins a comment).
-    """
-    source = Path(source)
-    if source.is_dir():
-        if (source / "rgb.txt").is_file():
-            return [source / frame.path for frame in read_rgb_list(source / "rgb.txt")]
-        for folder in (source, *(source / name for name in ("rgb", "images", "Images"))):
-            images = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES] if folder.is_dir() else []
-            if images:
-                return sorted(images, key=natural_order)
-        raise InputError(f"holds no image; expected files ending in {', '.join(IMAGE_SUFFIXES)}", source)
-    if source.suffix.lower() in IMAGE_SUFFIXES + VIDEO_SUFFIXES:
-        raise InputError("is a single file; expected a folder of images or a list of them", source)
-    try:
-        lines = source.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            "cannot be read; expected a folder of images, or a text file that lists them", source
-        ) from error
-    images = []
-    for number, line in enumerate(lines, start=1):
-        name = line.partition("#")[0].strip()
-        if name:
-            path = source.parent / name
-            if not path.is_file() and STAMP.match(name):
-                path = source.parent / STAMP.sub("", name)
-            if not path.is_file():
-                raise InputError(f'no such image "{name}" (looked in {source.parent})', source, number, 1)
-            images.append(path)
-    if not images:
-        raise InputError("lists no image", source)
-    return images
+    """Return the images of a folder or of a list, in order (the rule: docs/images.md); InputError if there are none."""
+    return list(list_images(source).paths)
 
 
-def read_image(path: str | Path) -> np.ndarray:
-    """Read an image (H, W, 3) uint8, BGR; InputError where it cannot be read."""
+def read_bgr(path: str | Path) -> np.ndarray:
+    """Read an image (H, W, 3) uint8, BGR; InputError if it cannot be read."""
     # Read by Python, decoded by OpenCV: imread prints a warning of its own for a missing file.
     try:
         data = np.fromfile(path, np.uint8)
@@ -111,7 +70,7 @@ def read_image(path: str | Path) -> np.ndarray:
         raise InputError(f"no such image ({error.strerror})", path) from None
     image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if image is None:
-        raise InputError("is not an image that can be read", path)
+        raise InputError("is not a readable image", path)
     return image
 
 
@@ -119,7 +78,7 @@ def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     """Yield (seconds from the start, image (H, W, 3) uint8 BGR) for each frame of a video file."""
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
-        raise InputError("is not a video that can be read" if Path(path).is_file() else "no such video", path)
+        raise InputError("is not a readable video" if Path(path).is_file() else "no such video", path)
     rate = capture.get(cv2.CAP_PROP_FPS)
     number = 0
     try:
@@ -132,22 +91,22 @@ def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     finally:
         capture.release()
     if not number:
-        raise InputError("holds no frame that can be read", path)
+        raise InputError("has no readable frame", path)
 
 
 def video_length(path: str | Path) -> int | None:
-    """Return the number of frames that a video file says it has, None where it does not say."""
+    """Return the number of frames that a video file says it has, None if it does not say."""
     capture = cv2.VideoCapture(str(path))
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
     capture.release()
     return count if count > 0 else None
 
 
-def grey(image: np.ndarray) -> np.ndarray:
-    """Return an (H, W, 3) BGR or (H, W) grey image, uint8, as (H, W) grey values."""
+def gray(image: np.ndarray) -> np.ndarray:
+    """Return an (H, W, 3) BGR or (H, W) gray image, uint8, as (H, W) gray values."""
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
-def read_grey(path: Path) -> np.ndarray:
-    """Return the picture as (H, W) uint8 grey values; InputError where there is none."""
-    return grey(read_image(path))
+def read_gray(path: Path) -> np.ndarray:
+    """Read an image as (H, W) uint8 gray values; InputError if it cannot be read."""
+    return gray(read_bgr(path))

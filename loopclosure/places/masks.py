@@ -22,17 +22,16 @@ LOSSLESS_SUFFIXES = (".bmp", ".png", ".pgm", ".tif", ".tiff")
 def read_truth_matrix(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Read a mask of loops: (hard, soft), both (Q, R) bool.
 
-    0 is another place, 1 (or 255) the same place; what lies between is soft: near enough to be no mistake, but nothing
-    that must be found (the grey of RTAB-Map's masks). By its ending a file is MATLAB's (.mat, variable ``truth`` or
-    ``GT``, or its only matrix), numpy's (.npy), numbers separated by blanks or commas (.txt, .csv), or a lossless
-    image.
+    0 is another place, 1 (or 255) the same place. Values between are soft: near enough not to be a mistake, but they
+    need not be found (gray in RTAB-Map's masks). The suffix says what the file is: MATLAB (.mat, variable ``truth`` or
+    ``GT``, or its only matrix), numpy (.npy), numbers separated by blanks or commas (.txt, .csv), or a lossless image.
     """
     path = Path(path)
     values = _read_matrix(path, TRUTH_KEYS, "a mask of loops")
     if values.ndim != 2:
         raise InputError(f"has shape {values.shape}; expected a matrix, queries x references", path)
     if not np.all(np.isfinite(values)) or values.min(initial=0) < 0:
-        raise InputError("has a negative or not finite entry; expected 0 = another place, 1 = the same place", path)
+        raise InputError("has a negative or non-finite entry; expected 0 = another place, 1 = the same place", path)
     largest = values.max(initial=0)
     if largest not in (1, 255):
         raise InputError(
@@ -44,14 +43,14 @@ def read_truth_matrix(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 def read_coordinates(path: str | Path) -> np.ndarray:
     """Read where images were taken: (N, 2) x, y, from a .mat (variable ``GPS``), .npy or text file.
 
-    A row of the text has x and y, or the image's name, x and y.
+    A row of a text file has x and y, or the image's name, x and y.
     """
     path = Path(path)
     values = _read_matrix(path, COORDINATE_KEYS, "coordinates", last_columns=2)
     if values.ndim != 2 or values.shape[1] not in (2, 3):
         raise InputError(f"has shape {values.shape}; expected x and y, or number, x and y, in each row", path)
     if not np.all(np.isfinite(values)):
-        raise InputError("has an entry that is not finite; expected metres", path)
+        raise InputError("has a non-finite entry; expected meters", path)
     return values[:, -2:]
 
 
@@ -100,10 +99,10 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
     if suffix in LOSSLESS_SUFFIXES:
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if image is None:
-            raise InputError(f"is not an image that can be read; expected {what}", path)
+            raise InputError(f"is not a readable image; expected {what}", path)
         return image
     raise InputError(
-        f'"{suffix}" is no known kind of file for {what}; known: .mat .npy .txt .csv {" ".join(LOSSLESS_SUFFIXES)}'
+        f'"{suffix}" is not a known suffix for {what}; known: .mat .npy .txt .csv {" ".join(LOSSLESS_SUFFIXES)}'
         + (" (a JPEG has lost the exact values)" if suffix in (".jpg", ".jpeg") else ""),
         path,
     )
@@ -113,8 +112,8 @@ def _read_mat(path: Path, keys: tuple[str, ...], what: str) -> np.ndarray:
     try:
         content: dict[str, Any] = scipy.io.loadmat(str(path))
     except NotImplementedError as error:
-        raise InputError("is a MATLAB 7.3 file; save it anew in MATLAB with -v7", path) from error
-    except Exception as error:  # a broken file makes loadmat raise whatever its bytes lead to
+        raise InputError("is a MATLAB 7.3 file; save it again in MATLAB with -v7", path) from error
+    except Exception as error:  # a broken file can make loadmat raise anything
         raise InputError(f"cannot be read as .mat ({error}); expected {what}", path) from error
     matrices = {}
     for name, value in content.items():
@@ -138,7 +137,7 @@ def _numeric(values: np.ndarray, path: Path) -> np.ndarray:
 
 
 def _read_text(path: Path, what: str, last_columns: int | None) -> np.ndarray:
-    """Read rows of numbers; ``last_columns`` takes only so many from the right, the others may be names."""
+    """Read rows of numbers; only the ``last_columns`` from the right, if given: the others may be names."""
     rows: list[list[float]] = []
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()

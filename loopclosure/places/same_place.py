@@ -1,10 +1,10 @@
-"""The rule, once: when two poses are the same place. It labels training pairs and judges loop closures alike.
+"""The rule that says when two poses are the same place: it labels training pairs, and it judges loop closures.
 
-The paper (section IV): the two cameras are less than 2 m apart and turned by less than 15 degrees against each other.
-Both poses must be in one frame of reference; which sequences share one is for the caller to know.
+The paper (section IV): the two cameras are less than 2 m apart, and the rotation between them is less than 15 degrees.
+Both poses must be in one frame of reference; the caller must know which sequences share one.
 
-Every function works on single poses and on arrays of them, element by element with numpy's broadcasting, and does the
-same arithmetic for a single pair as for a whole matrix, so that a label never depends on how it was computed.
+Every function takes single poses and arrays of them, with numpy's broadcasting, and does the same arithmetic for a
+single pair as for a whole matrix, so that a label never depends on how it was computed.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ MAX_ANGLE_DEG = 15.0
 
 
 def distances_m(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
-    """Distances (...) between the optical centres, in metres."""
+    """Distances (...) between the optical centers, in meters."""
     step = pose_a.positions - pose_b.positions
     return np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2 + step[..., 2] ** 2)
 
 
 def angles_deg(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
-    """Angles (...) of the rotations that turn one camera into the other, in degrees, 0 to 180."""
+    """Angles (...) of the rotations from one camera to the other, in degrees, 0 to 180."""
     a, b = pose_a.quaternions, pose_b.quaternions
     # q and -q are the same rotation: hence the absolute value. Rounding may leave it just above 1.
     cosine = np.abs(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2] + a[..., 3] * b[..., 3])
@@ -35,7 +35,7 @@ def angles_deg(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
 
 
 def view_angles_deg(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
-    """Angles (...) between the viewing axes, in degrees: unlike :func:`angles_deg` blind to a roll about the axis."""
+    """Angles (...) between the viewing axes, in degrees: unlike :func:`angles_deg`, they ignore roll about the axis."""
     a, b = _viewing_axes(pose_a.quaternions), _viewing_axes(pose_b.quaternions)
     cosine = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
@@ -44,14 +44,14 @@ def view_angles_deg(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:
 def same_place(
     pose_a: Posed, pose_b: Posed, max_distance_m: float = MAX_DISTANCE_M, max_angle_deg: float = MAX_ANGLE_DEG
 ) -> NDArray[np.bool_]:
-    """Tell for each pair (...) of poses whether it shows the same place: nearer and less turned than the two limits."""
+    """Return for each pair (...) of poses whether it is the same place: distance and angle below the two limits."""
     return (distances_m(pose_a, pose_b) < max_distance_m) & (angles_deg(pose_a, pose_b) < max_angle_deg)
 
 
 def same_place_matrix(
     pose_a: Posed, pose_b: Posed, max_distance_m: float = MAX_DISTANCE_M, max_angle_deg: float = MAX_ANGLE_DEG
 ) -> NDArray[np.bool_]:
-    """Judge each of N poses against each of M: (N, M), one byte a pair; the working memory stays small."""
+    """Compare each of N poses with each of M: (N, M), one byte per pair; the working memory stays small."""
     truth = np.empty((len(pose_a.positions), len(pose_b.positions)), bool)
     for rows, block in same_place_blocks(pose_a, pose_b, max_distance_m, max_angle_deg):
         truth[rows] = block
@@ -65,7 +65,7 @@ def same_place_blocks(
     max_angle_deg: float = MAX_ANGLE_DEG,
     pairs_at_once: int = 1_000_000,
 ) -> Iterator[tuple[slice, NDArray[np.bool_]]]:
-    """Yield :func:`same_place_matrix` by blocks of rows, where N x M is too much to hold: (rows, (R, M) truth)."""
+    """Yield :func:`same_place_matrix` by blocks of rows, for an N x M too large for memory: (rows, (R, M) truth)."""
     columns = Poses(pose_b.positions[None], pose_b.quaternions[None])
     height = max(1, pairs_at_once // max(1, len(pose_b.positions)))
     for start in range(0, len(pose_a.positions), height):

@@ -1,7 +1,7 @@
 """Where the camera was: the files of the TUM RGB-D benchmark.
 
 A sequence is a folder with ``rgb.txt`` (``timestamp filename``) and ``groundtruth.txt`` (``timestamp tx ty tz qx qy qz
-qw``). A pose is camera-to-world: the position of the optical centre in metres and a unit quaternion with w last; the
+qw``). A pose is camera-to-world: the position of the optical center in meters and a unit quaternion with w last; the
 camera looks along its +z, x to the right, y down. Stamps are in seconds.
 """
 
@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -22,18 +21,18 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 
-# TUM's own associate.py takes 0.02 s; with 30 Hz images and motion capture at 100 Hz a hole of 0.03 s does no harm.
+# TUM's own associate.py takes 0.02 s; with 30 Hz images and motion capture at 100 Hz a gap of 0.03 s does no harm.
 MAX_DIFFERENCE_S = 0.03
-# Four printed decimals leave a norm within 1e-3 of 1. Much further off, the four numbers are no quaternion.
+# Four printed decimals give a norm within 1e-3 of 1. Much further off, the four numbers are not a quaternion.
 NORM_TOLERANCE = 0.05
 
 
 class Posed(Protocol):
-    """Whatever has poses: ``positions`` (..., 3) in metres and ``quaternions`` (..., 4), xyzw, of unit length."""
+    """Anything with poses: ``positions`` (..., 3) in meters and ``quaternions`` (..., 4), xyzw, of unit length."""
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Optical centres (..., 3) in metres."""
+        """Optical centers (..., 3) in meters."""
         ...
 
     @property
@@ -44,7 +43,7 @@ class Posed(Protocol):
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses without a time: ``positions`` (..., 3) in metres, ``quaternions`` (..., 4) xyzw of unit length."""
+    """Poses without a time: ``positions`` (..., 3) in meters, ``quaternions`` (..., 4) xyzw of unit length."""
 
     positions: NDArray[np.float64]
     quaternions: NDArray[np.float64]
@@ -58,7 +57,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses in time: ``stamps`` (N,) in s, rising; ``positions`` (N, 3) in metres; ``quaternions`` (N, 4) xyzw."""
+    """Poses in time: ``stamps`` (N,) in s, ascending; ``positions`` (N, 3) in meters; ``quaternions`` (N, 4) xyzw."""
 
     stamps: NDArray[np.float64]
     positions: NDArray[np.float64]
@@ -82,11 +81,11 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class PosedSequence:
     """The N frames of a sequence that have a pose, in order of time.
 
-    ``stamps`` (N,) in seconds are the frames' own; ``positions`` (N, 3) in metres and ``quaternions`` (N, 4) xyzw are
-    of the nearest pose in time. ``dropped`` counts the frames left out since they have no pose near enough.
+    ``stamps`` (N,) in seconds are the frames' own; ``positions`` (N, 3) in meters and ``quaternions`` (N, 4) xyzw are
+    those of the nearest pose in time. ``dropped`` counts the frames left out because no pose is near enough.
     """
 
     name: str
@@ -108,7 +107,7 @@ class Sequence:
 def read_rgb_list(path: str | os.PathLike[str]) -> list[Frame]:
     """Read ``rgb.txt``: the frames in order of time. Raises InputError (file:line:column) for a broken line."""
     frames = []
-    for number, line in _content_lines(path, 'a list of images, "timestamp filename" a line (TUM RGB-D: rgb.txt)'):
+    for number, line in _content_lines(path, 'a list of images, "timestamp filename" per line (TUM RGB-D: rgb.txt)'):
         fields = list(re.finditer(r"\S+", line))
         if len(fields) != 2:
             raise InputError(
@@ -124,13 +123,13 @@ def read_rgb_list(path: str | os.PathLike[str]) -> list[Frame]:
 
 
 def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
-    """Read ``groundtruth.txt``, in order of time, its quaternions normalised anew (the file has four decimals).
+    """Read ``groundtruth.txt``, in order of time; quaternions are normalized (the file has four decimals).
 
-    Raises InputError (file:line:column) for a line that is not eight numbers or whose quaternion is none.
+    Raises InputError (file:line:column) for a line that is not eight numbers, or whose last four are not a quaternion.
     """
     names = "timestamp tx ty tz qx qy qz qw"
     rows = []
-    for number, line in _content_lines(path, f'a trajectory, "{names}" a line (TUM RGB-D: groundtruth.txt)'):
+    for number, line in _content_lines(path, f'a trajectory, "{names}" per line (TUM RGB-D: groundtruth.txt)'):
         fields = list(re.finditer(r"\S+", line))
         if len(fields) != 8:
             raise InputError(
@@ -154,7 +153,7 @@ def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
     return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), quaternions)
 
 
-def write_rgb_list(path: str | os.PathLike[str], frames: SequenceOf[Frame]) -> None:
+def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame]) -> None:
     """Write ``rgb.txt`` with TUM's three comment lines; stamps with microseconds."""
     lines = ["# color images", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
     lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
@@ -162,7 +161,7 @@ def write_rgb_list(path: str | os.PathLike[str], frames: SequenceOf[Frame]) -> N
 
 
 def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write ``groundtruth.txt`` with TUM's three comment lines; metres and quaternions with six decimals."""
+    """Write ``groundtruth.txt`` with TUM's three comment lines; meters and quaternions with six decimals."""
     lines = [
         "# ground truth trajectory",
         f"# file: '{Path(path).parent.name}'",
@@ -178,7 +177,7 @@ def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> N
 def associate(
     frame_stamps: NDArray[np.float64], trajectory: Trajectory, max_difference: float = MAX_DIFFERENCE_S
 ) -> NDArray[np.intp]:
-    """Find for each frame (N,) the pose nearest in time: its index (N,), -1 where none is within ``max_difference`` s.
+    """Find for each frame (N,) the pose nearest in time: its index (N,), -1 if none is within ``max_difference`` s.
 
     Frames may share a pose, unlike in TUM's associate.py, which pairs one to one: poses come faster than images.
     """
@@ -189,10 +188,10 @@ def associate(
     return np.where(np.abs(stamps[nearest] - frame_stamps) <= max_difference, nearest, -1)
 
 
-def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MAX_DIFFERENCE_S) -> Sequence:
+def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MAX_DIFFERENCE_S) -> PosedSequence:
     """Read a folder in TUM RGB-D layout; frames without a pose within ``max_difference`` s are counted and left out.
 
-    Raises InputError where a file is missing or broken, or where no frame at all has a pose.
+    Raises InputError if a file is missing or broken, or if no frame has a pose.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -208,7 +207,7 @@ def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MA
             f"{stamps[-1]:.3f} s, poses from {trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s",
             folder,
         )
-    return Sequence(
+    return PosedSequence(
         name=folder.resolve().name,
         frames=tuple(frame for frame, kept in zip(frames, posed, strict=True) if kept),
         stamps=stamps[posed],
@@ -224,12 +223,12 @@ def rotation_matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def quaternions_from_matrices(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternions (N, 4) xyzw, w not negative, of rotation matrices (N, 3, 3)."""
+    """Unit quaternions (N, 4) xyzw, w >= 0, of rotation matrices (N, 3, 3)."""
     return Rotation.from_matrix(matrices).as_quat(canonical=True)
 
 
 def _content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines that are neither empty nor a comment, with their numbers from 1."""
+    """Yield the lines that are not empty and not a comment, with their numbers from 1."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -252,5 +251,5 @@ def _number(field: re.Match[str], name: str, path: str | os.PathLike[str], line:
 
 
 def _column_of_count_fault(line: str, fields: list[re.Match[str]], expected: int) -> int:
-    """Return the column (from 1) of the first field too many, or the one where the first missing field should be."""
+    """Return the column (from 1) of the first extra field, or of the place of the first missing one."""
     return fields[expected].start() + 1 if len(fields) > expected else len(line.rstrip()) + 1

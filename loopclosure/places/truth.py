@@ -11,9 +11,9 @@ from loopclosure.errors import InputError
 
 @dataclass(frozen=True)
 class Exclusion:
-    """Pairs of one sequence too near in time to be a loop: |i - j| <= frames, or |t_i - t_j| < seconds.
+    """Pairs of one sequence that are too near in time to be a loop: |i - j| <= frames, or |t_i - t_j| < seconds.
 
-    Such pairs are no candidates, and neither right nor wrong. A frame and itself are always such a pair.
+    Such pairs are not candidates, and neither right nor wrong. A frame with itself is always such a pair.
     """
 
     frames: int = 0
@@ -30,9 +30,9 @@ class Exclusion:
         query_stamps: np.ndarray | None = None,
         reference_stamps: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Tell for each query frame (Q,) and each reference frame (R,), by number, whether the pair is too near.
+        """Return for each query frame (Q,) and each reference frame (R,), by number, whether the pair is too near.
 
-        The stamps (Q,), (R,) in seconds are needed where seconds are excluded. Returns (Q, R) bool.
+        The stamps (Q,), (R,) in seconds are needed if seconds are excluded. Returns (Q, R) bool.
         """
         near = np.abs(np.subtract.outer(queries, references)) <= self.frames
         if self.seconds > 0:
@@ -52,23 +52,23 @@ class Exclusion:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is right for every query and every reference.
+    """The right answer for every query and every reference.
 
     hard      (Q, R) bool: the same place; must be found
-    soft      (Q, R) bool, holds hard: near enough to be no mistake; what is soft alone is ignored when found
-    judged    (Q, R) bool: the pairs that count; all others are no candidates, neither right nor wrong
-    sentence  what makes two frames the same place and what is excluded, to be printed with every figure
+    soft      (Q, R) bool, includes hard: near enough not to be a mistake; a pair that is only soft is ignored if found
+    judged    (Q, R) bool: the pairs that count; all others are not candidates, neither right nor wrong
+    description  what makes two frames the same place and what is excluded; printed with every result
     """
 
     hard: np.ndarray
     soft: np.ndarray
     judged: np.ndarray
-    sentence: str
+    description: str
 
     def __post_init__(self) -> None:
         assert self.hard.shape == self.soft.shape == self.judged.shape
         assert self.hard.dtype == self.soft.dtype == self.judged.dtype == bool
-        assert not np.any(self.hard & ~self.soft), "soft truth holds the hard truth"
+        assert not np.any(self.hard & ~self.soft), "soft truth includes the hard truth"
 
     @property
     def positives(self) -> int:
@@ -77,7 +77,7 @@ class Truth:
 
     @property
     def queries_with_a_loop(self) -> np.ndarray:
-        """Tell for each query (Q,) whether there is anything to find."""
+        """Return for each query (Q,) whether there is a loop to find."""
         return np.any(self.hard & self.judged, axis=1)
 
 
@@ -90,12 +90,12 @@ def sequence_truth(
     stamps: np.ndarray | None = None,
     comparable: np.ndarray | None = None,
 ) -> Truth:
-    """Make the truth of one sequence that meets its own places again: frame i against each earlier frame j < i.
+    """Make the truth of one sequence that visits its own places again: frame i against each earlier frame j < i.
 
     hard, soft   (N, N) bool; only the lower triangle is read
-    rule         the words for what makes two frames the same place
+    rule         text: what makes two frames the same place
     stamps       (N,) seconds
-    comparable   (N, N) bool: pairs that can be judged at all (not, say, a left with a right camera's); all by default
+    comparable   (N, N) bool: pairs that can be judged (not those of a left and a right camera); all by default
     """
     numbers = np.arange(len(hard))
     judged = np.tri(len(hard), k=-1, dtype=bool) & ~exclusion.excludes(numbers, numbers, stamps, stamps)
@@ -103,8 +103,8 @@ def sequence_truth(
         judged &= comparable
     hard = np.asarray(hard, dtype=bool)
     soft = hard if soft is None else np.asarray(soft, dtype=bool) | hard
-    sentence = f"{rule}; each frame against the earlier ones; {exclusion}{_soft_words(hard, soft, judged)}"
-    return Truth(hard, soft, judged, sentence)
+    description = f"{rule}; each frame against the earlier ones; {exclusion}{_soft_text(hard, soft, judged)}"
+    return Truth(hard, soft, judged, description)
 
 
 def traverse_truth(hard: np.ndarray, rule: str, *, soft: np.ndarray | None = None) -> Truth:
@@ -112,10 +112,10 @@ def traverse_truth(hard: np.ndarray, rule: str, *, soft: np.ndarray | None = Non
     hard = np.asarray(hard, dtype=bool)
     soft = hard if soft is None else np.asarray(soft, dtype=bool) | hard
     judged = np.ones(hard.shape, dtype=bool)
-    sentence = f"{rule}; each query against all references; no pair excluded{_soft_words(hard, soft, judged)}"
-    return Truth(hard, soft, judged, sentence)
+    description = f"{rule}; each query against all references; no pair excluded{_soft_text(hard, soft, judged)}"
+    return Truth(hard, soft, judged, description)
 
 
-def _soft_words(hard: np.ndarray, soft: np.ndarray, judged: np.ndarray) -> str:
+def _soft_text(hard: np.ndarray, soft: np.ndarray, judged: np.ndarray) -> str:
     count = int(np.count_nonzero(soft & ~hard & judged))
     return f"; {count} pairs that nearly show the same place are ignored when found" if count else ""

@@ -1,1 +1,1 @@
-"""What came out, as a page, pictures, tables and files."""
+"""The results of an evaluation as a page, pictures, tables and files."""

@@ -1,4 +1,4 @@
-"""The figures of an evaluation as CSV, JSON and text; every file says its convention and what was excluded."""
+"""The results of an evaluation as CSV, JSON and text; every file gives its convention and what was excluded."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome, figures
+from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, PrecisionRecall
 
 EXPLANATION = {
@@ -22,7 +22,7 @@ EXPLANATION = {
 
 def write_files(evaluation: Evaluation, folder: Path, command: str = "") -> None:
     """Write figures.csv, times.csv, report.json, and curve_*.csv and matches_*.csv of each method."""
-    _write_figures_csv(evaluation, folder / "figures.csv")
+    _write_measures_csv(evaluation, folder / "figures.csv")
     _write_times_csv(evaluation, folder / "times.csv")
     slugs = _slugs([outcome.name for outcome in evaluation.outcomes])
     for slug, outcome in zip(slugs, evaluation.outcomes, strict=True):
@@ -33,11 +33,11 @@ def write_files(evaluation: Evaluation, folder: Path, command: str = "") -> None
 
 
 def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
-    """Return the whole evaluation as what JSON can hold; a figure that is not defined is null."""
+    """Return the whole evaluation as JSON values; an undefined measure is null."""
     data, truth = evaluation.data, evaluation.data.truth
     return {
         "data_set": data.name,
-        "truth_and_exclusion": truth.sentence,
+        "truth_and_exclusion": truth.description,
         "queries": len(data.query_images),
         "references": len(data.references),
         "judged_pairs": int(np.count_nonzero(truth.judged)),
@@ -52,13 +52,13 @@ def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
                 "name": outcome.name,
                 "figures": {
                     convention: {name: _number(value) for name, value in values.items()}
-                    for convention, values in figures(outcome).items()
+                    for convention, values in outcome.measures.items()
                 },
                 "seconds": {stage: round(seconds, 6) for stage, seconds in outcome.seconds.items()},
                 "milliseconds_a_frame": {
-                    stage: round(1e3 * seconds / evaluation.images, 6)
+                    stage: round(1e3 * seconds / evaluation.image_count, 6)
                     for stage, seconds in outcome.seconds.items()
-                    if stage not in outcome.once
+                    if stage not in outcome.training_stages
                 },
                 "notes": outcome.notes,
             }
@@ -67,14 +67,14 @@ def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
     }
 
 
-def figures_text(evaluation: Evaluation) -> str:
-    """Return the table of figures for a terminal, with what it was judged by."""
+def measures_text(evaluation: Evaluation) -> str:
+    """Return the table of measures for a terminal, with the description of the truth."""
     heads = ["method", "AP", "R@P=1", "F1", "AP", "R@P=1", "F1", *(f"R@{k}" for k in RECALL_AT), "ms/frame"]
     rows = []
     for outcome in evaluation.outcomes:
-        values = figures(outcome)
+        values = outcome.measures
         cells = [share(v) for v in (*values[ALL_PAIRS].values(), *values[BEST_MATCH].values())]
-        rows.append([outcome.name, *cells, f"{1e3 * outcome.seconds_on_frames / evaluation.images:.2f}"])
+        rows.append([outcome.name, *cells, f"{1e3 * outcome.seconds_on_frames / evaluation.image_count:.2f}"])
     widths = [max(len(row[i]) for row in [heads, *rows]) for i in range(len(heads))]
     lines = [
         "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
@@ -83,15 +83,15 @@ def figures_text(evaluation: Evaluation) -> str:
     pairs_width = sum(widths[1:4]) + 4
     over = f"{'':{widths[0]}}  {ALL_PAIRS:-^{pairs_width}}  {' ' + BEST_MATCH + ' ':-^{sum(widths[4:10]) + 10}}"
     data = evaluation.data
-    return "\n".join([f"{data.name}: {data.truth.sentence}", over, *lines])
+    return "\n".join([f"{data.name}: {data.truth.description}", over, *lines])
 
 
-def _write_figures_csv(evaluation: Evaluation, path: Path) -> None:
+def _write_measures_csv(evaluation: Evaluation, path: Path) -> None:
     rows = [["method", "convention", "figure", "value", "truth and exclusion"]]
     for outcome in evaluation.outcomes:
-        for convention, values in figures(outcome).items():
+        for convention, values in outcome.measures.items():
             for name, value in values.items():
-                rows.append([outcome.name, convention, name, f"{value:.6f}", evaluation.data.truth.sentence])
+                rows.append([outcome.name, convention, name, f"{value:.6f}", evaluation.data.truth.description])
     _write_csv(path, rows)
 
 
@@ -99,18 +99,18 @@ def _write_times_csv(evaluation: Evaluation, path: Path) -> None:
     rows = [["method", "stage", "seconds", "milliseconds a frame", "frames"]]
     for outcome in evaluation.outcomes:
         for stage, seconds in outcome.seconds.items():
-            each = "" if stage in outcome.once else f"{1e3 * seconds / evaluation.images:.6f}"
-            rows.append([outcome.name, stage, f"{seconds:.6f}", each, str(evaluation.images)])
+            each = "" if stage in outcome.training_stages else f"{1e3 * seconds / evaluation.image_count:.6f}"
+            rows.append([outcome.name, stage, f"{seconds:.6f}", each, str(evaluation.image_count)])
     _write_csv(path, rows)
 
 
 def _write_curves_csv(outcome: Outcome, path: Path) -> None:
-    """Write the points at which recall rises, which is all that average precision sums over."""
+    """Write the points at which recall increases: average precision is a sum over these."""
     rows = [["convention", "threshold", "precision", "recall", "truth and exclusion"]]
     for curve in (outcome.pairs, outcome.best):
         for i in _rises(curve):
             values = [f"{v[i]:.9g}" for v in (curve.thresholds, curve.precision, curve.recall)]
-            rows.append([curve.convention, *values, curve.exclusion])
+            rows.append([curve.convention, *values, curve.truth_description])
     _write_csv(path, rows)
 
 
@@ -128,7 +128,7 @@ def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> 
         verdict = "right" if matches.right[query] else "ignored" if matches.ignored[query] else "wrong"
         numbers = [str(query), str(reference), f"{matches.score[query]:.9g}", verdict, str(int(loops[query]))]
         images = [str(data.query_images[query]), str(data.references[reference])]
-        rows.append([*numbers, *images, data.truth.sentence])
+        rows.append([*numbers, *images, data.truth.description])
     _write_csv(path, rows)
 
 
@@ -138,7 +138,7 @@ def _write_csv(path: Path, rows: list[list[str]]) -> None:
 
 
 def _slugs(names: list[str]) -> list[str]:
-    """Return a file name for each method, no two alike."""
+    """Return a different file name for each method."""
     slugs: list[str] = []
     for name in names:
         slug = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") or "method"
@@ -153,5 +153,5 @@ def _number(value: float) -> float | None:
 
 
 def share(value: float) -> str:
-    """Print a share in 0..1; a dash where it is not defined."""
+    """Print a share in 0..1; a dash if it is undefined."""
     return "–" if math.isnan(value) else f"{value:.3f}"

@@ -1,6 +1,6 @@
-"""How well the distance of two descriptors tells same place from other place: the figures of the paper's Table I.
+"""How well the distance of two descriptors separates same places from other places: the paper's Table I.
 
-The paper prints a precision and no threshold. Here the threshold is chosen on the training pairs alone (best
+The paper gives a precision without a threshold. Here the threshold is chosen on the training pairs only (best
 accuracy), and precision, recall, accuracy, F1 and the area under the ROC curve are those of other pairs (validation
 or test). The area needs no threshold.
 """
@@ -17,7 +17,7 @@ from loopclosure.errors import InputError
 
 @dataclass(frozen=True)
 class PairMetrics:
-    """The figures of one set of pairs at one threshold: a pair is called the same place if its distance < threshold.
+    """The metrics of one set of pairs at one threshold: a pair is called the same place if its distance < threshold.
 
     Shares are in 0..1; a share whose denominator is zero (precision when no pair is called the same) is NaN.
     """
@@ -43,7 +43,7 @@ def pair_distances(features_a: np.ndarray, features_b: np.ndarray, metric: str =
     """Return the distance of each row of ``features_a`` to the same row of ``features_b``.
 
     features_a, features_b   (N, D); further axes are flattened
-    metric                   "euclidean", the distance ContrastiveLoss trains, or "cosine": 1 - cosine similarity
+    metric                   "euclidean", the distance that ContrastiveLoss trains, or "cosine": 1 - cosine similarity
     returns                  (N,) float64
     """
     a = np.asarray(features_a, dtype=np.float64)
@@ -55,7 +55,7 @@ def pair_distances(features_a: np.ndarray, features_b: np.ndarray, metric: str =
         return np.linalg.norm(a - b, axis=1)
     if metric == "cosine":
         norms = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-        # A feature of zeros has no direction: it is alike to nothing.
+        # A feature of zeros has no direction: it is similar to nothing.
         return 1.0 - np.divide(np.sum(a * b, axis=1), norms, out=np.zeros(len(a)), where=norms > 0)
     raise InputError(f'unknown metric "{metric}"; known: euclidean, cosine')
 
@@ -63,15 +63,15 @@ def pair_distances(features_a: np.ndarray, features_b: np.ndarray, metric: str =
 def best_threshold(distances: np.ndarray, labels: np.ndarray) -> float:
     """Return the threshold with the best accuracy on these pairs.
 
-    It lies half-way between two neighbouring distances. Of equally good ones the smallest is taken, since a false
-    loop costs a map more than a missed one. It equals the smallest distance where calling no pair the same is best.
+    It is halfway between two neighboring distances. Of equally good thresholds the smallest is taken, since a false
+    loop harms a map more than a missed one. It is the smallest distance if calling no pair the same place is best.
 
     distances   (N,); labels   (N,) 1 or True = same place
     """
     distances, same = _checked(distances, labels)
     order = np.argsort(distances, kind="stable")
     ordered, positive = distances[order], same[order]
-    # correct[k]: pairs judged rightly when exactly the k nearest are called the same place
+    # correct[k]: number of pairs judged correctly if exactly the k nearest are called the same place
     correct = np.concatenate([[0], np.cumsum(np.where(positive, 1, -1))]) + np.count_nonzero(~same)
     cuttable = np.concatenate([[True], ordered[1:] > ordered[:-1], [True]])
     best = int(np.argmax(np.where(cuttable, correct, -1)))
@@ -85,9 +85,9 @@ def best_threshold(distances: np.ndarray, labels: np.ndarray) -> float:
 
 
 def roc_auc(distances: np.ndarray, labels: np.ndarray) -> float:
-    """Return the chance that a pair of one place is nearer than a pair of two places (ties count half).
+    """Return the probability that a pair of one place is nearer than a pair of two places (ties count half).
 
-    NaN where all pairs are of one kind.
+    NaN if all pairs are of one kind.
     """
     distances, same = _checked(distances, labels)
     positives = int(np.count_nonzero(same))
@@ -99,7 +99,7 @@ def roc_auc(distances: np.ndarray, labels: np.ndarray) -> float:
 
 
 def metrics_at(threshold: float, distances: np.ndarray, labels: np.ndarray) -> PairMetrics:
-    """Return the figures of these pairs at a given threshold."""
+    """Return the metrics of these pairs at a given threshold."""
     distances, same = _checked(distances, labels)
     called = distances < threshold
     tp = int(np.count_nonzero(called & same))
@@ -139,9 +139,9 @@ def _checked(distances: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.
     distances = np.asarray(distances, dtype=np.float64).reshape(-1)
     labels = np.asarray(labels).reshape(-1)
     if len(distances) != len(labels):
-        raise InputError(f"{len(distances)} distances but {len(labels)} labels; expected one label a pair")
+        raise InputError(f"{len(distances)} distances but {len(labels)} labels; expected one label per pair")
     if len(distances) == 0:
-        raise InputError("no pairs to judge")
+        raise InputError("there are no pairs to judge")
     if not np.all(np.isfinite(distances)):
         count = int(np.count_nonzero(~np.isfinite(distances)))
         raise InputError(f"{count} of {len(distances)} distances are NaN or infinite; did the training diverge?")

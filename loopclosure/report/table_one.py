@@ -1,7 +1,7 @@
-"""The table that compares nets on labelled pairs (the paper's Table I), as text, CSV and pictures.
+"""The table that compares nets on labeled pairs (the paper's Table I), as text, CSV and pictures.
 
-A run file (JSON) lists the nets; each entry names the .npz files that hold the two descriptors of every training and
-validation pair, the names of the arrays in them, and the validation losses met during training.
+A run file (JSON) lists the nets. Each entry gives the .npz files with the two descriptors of every training and
+validation pair, the names of the arrays in them, and the validation losses during training.
 """
 
 from __future__ import annotations
@@ -13,16 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from loopclosure.errors import InputError
 from loopclosure.report.pair_metrics import PairMetrics, judge_pairs, pair_distances
 
-# Qiu et al., IEEE IV 2018, Table I. The paper says neither the threshold nor the recall.
+# Qiu et al., IEEE IV 2018, Table I. The paper gives neither the threshold nor the recall.
 PAPER = (
     ("Siamese (8)", 0.695),
     ("Siamese (128)", 0.820),
@@ -45,9 +42,9 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Run:
-    """One net, judged: distances (N,) and labels (N,) of its validation pairs, its figures, and what it cost.
+    """The results of one net: distances (N,) and labels (N,) of its validation pairs, metrics and costs.
 
-    ``losses`` are (iteration, validation loss); ``milliseconds`` an image; ``iteration`` of the snapshot judged.
+    ``losses`` are (iteration, validation loss); ``milliseconds`` are per image; ``iteration`` is the judged snapshot's.
     """
 
     name: str
@@ -68,9 +65,9 @@ class Run:
 
 
 def read_runs(path: Path) -> list[Run]:
-    """Read a run file and judge each of its nets: the threshold from the training pairs, the figures of the others.
+    """Read a run file and judge each of its nets: threshold from the training pairs, metrics of the validation pairs.
 
-    Raises InputError where a file or an array is missing.
+    Raises InputError if a file or an array is missing.
     """
     try:
         entries = json.loads(path.read_text())
@@ -113,7 +110,7 @@ def _array(arrays: Any, name: str, path: str) -> np.ndarray:
 
 
 def text_table(runs: Sequence[Run]) -> str:
-    """Return the table as text, with the paper's own beside it."""
+    """Return the table as text, with the paper's precisions below it."""
     rows = [COLUMNS, *(run.cells() for run in runs)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
     lines = [
@@ -146,7 +143,8 @@ def write_report(runs: Sequence[Run], folder: Path) -> list[Path]:
 
 
 def _draw_losses(runs: Sequence[Run], path: Path) -> None:
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
     for run in runs:
         if run.losses:
             line = axes.plot(*zip(*run.losses, strict=True), marker="o", markersize=3, label=run.name)[0]
@@ -162,11 +160,11 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
     axes.grid(alpha=0.3, which="both")
     axes.legend()
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def _draw_distances(runs: Sequence[Run], path: Path) -> None:
-    figure, grid = plt.subplots(1, len(runs), figsize=(3.6 * len(runs) + 0.6, 3.4), layout="constrained", squeeze=False)
+    figure = Figure(figsize=(3.6 * len(runs) + 0.6, 3.4), layout="constrained")
+    grid = figure.subplots(1, len(runs), squeeze=False)
     for axes, run in zip(grid[0], runs, strict=True):
         edges = np.histogram_bin_edges(run.distances, 40)
         axes.hist(run.distances[run.labels], edges, alpha=0.65, color="tab:green", label="same place")
@@ -177,4 +175,3 @@ def _draw_distances(runs: Sequence[Run], path: Path) -> None:
     grid[0][0].set_ylabel("validation pairs")
     grid[0][0].legend(fontsize=8)
     figure.savefig(path, dpi=120)
-    plt.close(figure)

@@ -1,1 +1,1 @@
-"""Visual words, and the methods that are built on them."""
+"""Visual words, and the methods built on them."""

@@ -1,7 +1,7 @@
-"""The Chow-Liu tree: which words come together, each word told by one other (Chow and Liu, 1968; FAB-MAP, IJRR 2008).
+"""The Chow-Liu tree: each word is predicted by one other word (Chow and Liu, 1968; FAB-MAP, IJRR 2008).
 
-Numbers as openFABMAP's: smoothed probabilities, the mutual information from the *unsmoothed* joint frequencies and the
-*smoothed* marginals (slightly off, and kept: its trees are compared with), rounded to float32.
+The numbers are openFABMAP's: smoothed probabilities; the mutual information from the *unsmoothed* joint frequencies and
+the *smoothed* marginals, rounded to float32. That is slightly inaccurate, and kept so that trees can be compared.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ LOWER_BOUND = 0.0005
 
 @dataclass(frozen=True)
 class WordTree:
-    """What is known of v words before any place is seen.
+    """What is known about v words before any place is seen.
 
-    parent         (v,) the word that tells most of each word; the root is its own parent
+    parent         (v,) the word that predicts each word best; the root is its own parent
     marginal       (v,) p(z_q = 1)
     given_present  (v,) p(z_q = 1 | parent present); the root's is its marginal
     given_absent   (v,) p(z_q = 1 | parent absent); the root's is its marginal
@@ -45,8 +45,8 @@ class WordTree:
 def learn_tree(words: np.ndarray, lower_bound: float = LOWER_BOUND) -> WordTree:
     """Learn the tree from the words (n, v) of n training images: counts or presence.
 
-    Pairs with less mutual information than ``lower_bound`` [nat] are no edges; InputError when the rest does not
-    connect all words.
+    Pairs with less mutual information than ``lower_bound`` [nat] cannot be edges. Raises InputError if the others do
+    not connect all words.
     """
     present = np.asarray(words) > 0
     images, size = present.shape
@@ -68,9 +68,9 @@ def learn_tree(words: np.ndarray, lower_bound: float = LOWER_BOUND) -> WordTree:
 
 
 def mutual_information(joint: np.ndarray, frequency: np.ndarray, marginal: np.ndarray, word: int) -> np.ndarray:
-    """Return the information [nat] (v,) float32 that ``word`` and each word have of each other.
+    """Return the mutual information [nat] (v,) float32 of ``word`` and each word.
 
-    joint (v,) how often both are present, frequency (v,) how often each is, marginal (v,) the same smoothed.
+    joint (v,) how often both are present, frequency (v,) how often each is, marginal (v,) the same, smoothed.
     """
     one, other = frequency[word], frequency
     p_one, p_other = marginal[word], marginal
@@ -79,7 +79,7 @@ def mutual_information(joint: np.ndarray, frequency: np.ndarray, marginal: np.nd
         both = np.maximum(both, 0.0)
         return xlogy(both, both / independent)
 
-    # Grouped so that exchanging the two words gives the same bits: ties are then told apart by the words' order alone.
+    # Grouped so that exchanging the two words gives the same bits: ties are then decided by the order of the words.
     same = term(joint, p_one * p_other) + term(1.0 - one - other + joint, (1.0 - p_one) * (1.0 - p_other))
     apart = term(one - joint, p_one * (1.0 - p_other)) + term(other - joint, (1.0 - p_one) * p_other)
     return (same + apart).astype(np.float32)
@@ -92,14 +92,14 @@ def _smoothed_share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
 def _strongest_tree(
     together: np.ndarray, images: int, marginal: np.ndarray, lower_bound: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (neighbour (v,), information (v,)): each word but word 0 and the edge that ties it to the tree.
+    """Return (neighbor (v,), information (v,)): each word but word 0, and the edge that connects it to the tree.
 
-    Prim's algorithm, which needs one row of information at a time. Of equally strong edges the one that comes first in
-    the order (lower word, higher word) wins: the tree of Kruskal's algorithm on stably sorted edges.
+    Prim's algorithm, which needs one row of information at a time. Of equally strong edges the first in the
+    order (lower word, higher word) wins: the tree of Kruskal's algorithm on stably sorted edges.
     """
     size = len(together)
     frequency = np.diag(together).astype(np.float64) / images
-    neighbour = np.zeros(size, np.intp)
+    neighbor = np.zeros(size, np.intp)
     information = np.full(size, -np.inf, np.float32)
     order = np.full(size, np.iinfo(np.int64).max)
     outside = np.ones(size, bool)
@@ -110,7 +110,7 @@ def _strongest_tree(
         row = mutual_information(together[word].astype(np.float64) / images, frequency, marginal, word)
         rank = np.minimum(words, word) * size + np.maximum(words, word)
         better = outside & ((row > information) | ((row == information) & (rank < order)))
-        neighbour[better], information[better], order[better] = word, row[better], rank[better]
+        neighbor[better], information[better], order[better] = word, row[better], rank[better]
         left = np.flatnonzero(outside)
         best = left[information[left] == information[left].max()]
         word = int(best[np.argmin(order[best])])
@@ -119,15 +119,15 @@ def _strongest_tree(
                 f"{len(left)} of {size} words, word {word} among them, share less than {lower_bound:g} nat with the "
                 "others, so no tree spans them; take more training images, fewer words or a lower bound"
             )
-    return neighbour, information
+    return neighbor, information
 
 
-def _rooted(neighbour: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Return the parents (v,) when the tree hangs from the lower word of its strongest edge."""
-    parent = neighbour.copy()
+def _rooted(neighbor: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Return the parents (v,) with the lower word of the strongest edge as the root."""
+    parent = neighbor.copy()
     strongest = np.flatnonzero(information == information.max())
     root = min((min(int(word), int(parent[word])), max(int(word), int(parent[word]))) for word in strongest)[0]
-    # The edges point to word 0; those between it and the root are turned round.
+    # The edges point to word 0; those between it and the root are reversed.
     child = word = root
     while word != 0:
         parent[word], child, word = child, word, int(parent[word])

@@ -1,10 +1,12 @@
-"""FAB-MAP 1 and 2: the probability of having been here before, from the words that an image shows.
+"""FAB-MAP 1 and 2: the probability that an image was taken at a known place, from the words that it shows.
 
 Cummins and Newman, IJRR 2008 (FAB-MAP 1) and IJRR 2011 (FAB-MAP 2.0), with the choices of openFABMAP, the public
-baseline: a place is one image; the place's belief in a word ignores the tree; the prior of a word's cause is the word's
-marginal. Numbers agree with it. All observations are words (v,) as counts or presence: only presence matters.
+baseline: a place is one image; the belief in the cause of a word at a place ignores the tree; the prior of that cause
+is the word's marginal. The numbers agree with openFABMAP's. Observations are words (v,) as counts or presence: only
+presence matters.
 
-z is what the image shows of a word, L what the place's image showed of it, a what the image shows of the word's parent.
+Notation: z = 1 if the image shows a word, L = 1 if the place's image showed it, a = 1 if the image shows the word's
+parent.
 """
 
 from __future__ import annotations
@@ -20,26 +22,27 @@ from scipy.special import logsumexp
 from loopclosure.errors import InputError
 from loopclosure.words.chow_liu import WordTree
 
-# Query rows at a time offline: 256 x 5000 words are 10 MB a matrix.
+# Query rows at a time offline: 256 x 5000 words are 10 MB per matrix.
 BLOCK_ROWS = 256
 
 
 @dataclass(frozen=True)
 class FabMapSettings:
-    """What FAB-MAP may be told; the defaults are openFABMAP's.
+    """Settings of FAB-MAP; the defaults are openFABMAP's.
 
     version      2: inverted index, the new place sampled over all training images. 1: every word of every place
     hit          p(word seen | its cause is there), PzGe
     false_alarm  p(word seen | its cause is not there), PzGNe; the Oxford model has 0.005
     new_place    "sampled" from training images, or "mean_field": the average place (version 1 only)
-    samples      of version 1: training images drawn a query, with replacement; 0 takes each of them once
-    naive        words independent, without the tree
-    motion       the previous posterior, moved by one place forward or back, is the prior
-    recent       the last so many images are not on the map yet: in one sequence they all look like the present one
+    samples      of version 1: training images drawn per query, with replacement; 0 takes each image once
+    naive        words are independent, without the tree
+    motion       the prior is the previous posterior, moved by one place forward or back
+    recent       how many of the last images are not on the map yet: in one sequence they all look like the query
     smoothing    share of the posterior that is kept; the rest is spread evenly
     p_new        of the motion model: prior of a new place
-    bias         of the motion model: share of the neighbours' weight that the next place gets, the rest the one before
-    seed         of the draws
+    bias         of the motion model: share of the neighbors' weight that the next place gets; the previous one gets
+                 the rest
+    seed         of the random draws
     """
 
     version: int = 2
@@ -61,7 +64,9 @@ class FabMapSettings:
         if self.new_place not in ("sampled", "mean_field"):
             raise InputError(f'new_place is "sampled" or "mean_field", not "{self.new_place}"')
         if self.version == 2 and self.new_place == "mean_field":
-            raise InputError("FAB-MAP 2 knows likelihoods only up to a common factor, so it has no mean field; sample")
+            raise InputError(
+                "FAB-MAP 2 knows likelihoods only up to a common factor, so it has no mean field; use sampled"
+            )
         if not 0.0 <= self.false_alarm < self.hit < 1.0:
             raise InputError(f"need 0 <= false_alarm < hit < 1, got {self.false_alarm:g} and {self.hit:g}")
         if self.samples < 0:
@@ -77,7 +82,7 @@ class Location:
     new          posterior probability of a new place
     places       (n,) posterior probabilities of the places; with ``new`` they sum to 1
     loglik       (n,) log-likelihoods of the image given each place [nat]; version 2: up to a term common to all
-    loglik_new   the same given a new place
+    loglik_new   the same for a new place
     """
 
     new: float
@@ -87,12 +92,12 @@ class Location:
 
     @property
     def log_odds(self) -> np.ndarray:
-        """Evidence of each place against a new one [nat] (n,): not saturated as the posterior is, the better score."""
+        """Evidence for each place against a new one [nat] (n,): a better score, since the posterior saturates."""
         return self.loglik - self.loglik_new
 
     @property
     def best(self) -> int:
-        """The most probable place, -1 for a new one."""
+        """The most probable place, -1 for a new place."""
         if self.places.size == 0 or self.new >= self.places.max():
             return -1
         return int(np.argmax(self.places))
@@ -104,7 +109,7 @@ def place_table(tree: WordTree, settings: FabMapSettings) -> np.ndarray:
 
 
 def mean_field_table(tree: WordTree, settings: FabMapSettings) -> np.ndarray:
-    """Return p(z | a) at the average place as (v, 2, 2), indexed [word, z, a]."""
+    """Return p(z | a) for the average place as (v, 2, 2), indexed [word, z, a]."""
     return _mix(tree, settings, tree.marginal[:, None])[:, 0]
 
 
@@ -139,10 +144,10 @@ def _mix(tree: WordTree, settings: FabMapSettings, belief: np.ndarray) -> np.nda
 
 
 class FabMapModel:
-    """What FAB-MAP computes from words alone: likelihoods of images under places and under a new place.
+    """What FAB-MAP computes from words alone: likelihoods of images at known places and at a new place.
 
     tree      of the words
-    training  (n, v) words of the training images, which a sampled new place needs; they must not be test images
+    training  (n, v) words of the training images, needed for a sampled new place; they must not be test images
     """
 
     def __init__(self, tree: WordTree, training: np.ndarray | None, settings: FabMapSettings | None = None) -> None:
@@ -157,7 +162,7 @@ class FabMapModel:
             raise InputError("a sampled new place needs the words of training images")
 
     def likelihoods(self, queries: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Return ln p(query | place) as (Q, P) for words (Q, v) and (P, v): one matrix product a block of queries."""
+        """Return ln p(query | place) as (Q, P) for words (Q, v) and (P, v): one matrix product per block of queries."""
         seen = np.asarray(queries) > 0
         known = (np.asarray(places) > 0).astype(np.float64).T
         result = np.empty((len(seen), known.shape[1]))
@@ -167,7 +172,7 @@ class FabMapModel:
         return result
 
     def draws(self) -> np.random.Generator:
-        """Return the source of a run's draws, from the seed."""
+        """Return the random generator of one run, from the seed."""
         return np.random.default_rng(self.settings.seed)
 
     def new_place(self, queries: np.ndarray, draws: np.random.Generator) -> np.ndarray:
@@ -179,7 +184,7 @@ class FabMapModel:
         return self.log_mean_field[np.arange(len(self.tree)), seen.astype(int), parent_seen.astype(int)].sum(axis=1)
 
     def mean_over_samples(self, loglik: np.ndarray, draws: np.random.Generator) -> np.ndarray:
-        """Return the log of the mean likelihood (Q,) over sampled training images, from those of all (Q, n)."""
+        """Return the log of the mean likelihood (Q,) over sampled training images, given those of all (Q, n)."""
         images, samples = len(self.training), self.settings.samples
         if self.settings.version == 2 or samples == 0:
             return logsumexp(loglik, axis=1) - np.log(images)
@@ -189,13 +194,13 @@ class FabMapModel:
     def posterior(self, loglik: np.ndarray, loglik_new: float, previous: np.ndarray | None = None) -> np.ndarray:
         """Return the distribution (1 + n,) over a new place (entry 0) and n places.
 
-        ``previous`` is the posterior (1 + m,), m <= n, of the image before, which only the motion model looks at.
+        ``previous`` is the posterior (1 + m,), m <= n, of the previous image; only the motion model uses it.
         """
         settings = self.settings
         log_p = np.concatenate([[loglik_new], loglik])
         if settings.motion:
             log_p[0] += np.log(settings.p_new)
-            # openFABMAP: no prior before three entries are known, and none for places that are newer than it.
+            # openFABMAP: no prior before three entries are known, and none for newer places.
             if previous is not None and len(previous) > 2:
                 here = previous[1:]
                 before, after = np.r_[here[0], here[:-1]], np.r_[here[1:], here[-1]]
@@ -213,7 +218,7 @@ class FabMapModel:
 
 
 class _AllWords:
-    """The places of FAB-MAP 1: the words of each, all of them weighed for every query."""
+    """The places of FAB-MAP 1: the words of each place, all of them evaluated for every query."""
 
     def __init__(self, model: FabMapModel) -> None:
         self._model = model
@@ -235,17 +240,17 @@ class _AllWords:
 
 
 class _InvertedIndex:
-    """The places of FAB-MAP 2: for each word the places that have it, so that a query touches only its own words.
+    """The places of FAB-MAP 2: for each word the places that have it, so that a query reads only its own words.
 
-    Log-likelihoods are relative to a place without words: what that drops is common to all places.
+    Log-likelihoods are relative to a place without words: the omitted term is common to all places.
     """
 
     def __init__(self, model: FabMapModel) -> None:
         self._parent = model.tree.parent
         gain = model.log_table[:, 1] - model.log_table[:, 0]  # what L = 1 adds [word, z, a]
-        self._default = gain[:, 0, 0]  # nothing seen: nor the word, nor its parent
+        self._default = gain[:, 0, 0]  # neither the word nor its parent is seen
         self._seen = gain[:, 1] - self._default[:, None]  # [word, a]
-        self._orphan = gain[:, 0, 1] - self._default  # the parent seen, the word not
+        self._orphan = gain[:, 0, 1] - self._default  # the parent is seen, the word is not
         self._defaults = array("d")
         self._places_with = [array("q") for _ in range(len(model.tree))]
 
@@ -275,8 +280,8 @@ class _InvertedIndex:
 class FabMap:
     """FAB-MAP online, image by image.
 
-    ``add(words)`` tells where an image is and puts it on the map; ``locate(words)`` only tells. ``images`` holds, for
-    each place of the map, the number of the image (counting every call from 0) that founded it.
+    ``add(words)`` locates an image and puts it on the map; ``locate(words)`` only locates it. ``images`` has, for each
+    place of the map, the number of its image (every call is counted, from 0).
     """
 
     def __init__(self, tree: WordTree, training: np.ndarray | None, settings: FabMapSettings | None = None) -> None:
@@ -294,7 +299,7 @@ class FabMap:
                 self._samples.add(seen)
 
     def locate(self, words: np.ndarray) -> Location:
-        """Return where the image with the words (v,) is; the map stays as it is, the motion model moves on."""
+        """Locate the image with the words (v,); the map does not change, the state of the motion model does."""
         seen = np.asarray(words) > 0
         if seen.shape != (len(self.model.tree),):
             raise InputError(f"words have shape {seen.shape}, the vocabulary {len(self.model.tree)} words")
@@ -313,9 +318,9 @@ class FabMap:
         return Location(float(p[0]), p[1:], loglik, float(loglik_new[0]))
 
     def add(self, words: np.ndarray, only_new: bool = False) -> Location:
-        """Return where the image with the words (v,) is, then make it a place.
+        """Locate the image with the words (v,), then make it a place.
 
-        ``only_new``: only if a new place is the most probable (openFABMAP's NewMaximumOnly), else always ("All").
+        ``only_new``: only if a new place is the most probable (openFABMAP's NewMaximumOnly); otherwise always ("All").
         """
         location = self.locate(words)
         if not only_new or location.best == -1:
@@ -325,11 +330,11 @@ class FabMap:
 
 @dataclass(frozen=True)
 class PlaceScores:
-    """What FAB-MAP says of Q images and P places.
+    """The result of FAB-MAP for Q images and P places.
 
     posterior  (Q, P) probabilities
     new        (Q,) probability of a new place
-    log_odds   (Q, P) evidence of each place against a new one [nat]
+    log_odds   (Q, P) evidence for each place against a new one [nat]
     """
 
     posterior: np.ndarray
@@ -337,10 +342,10 @@ class PlaceScores:
     log_odds: np.ndarray
 
     def openfabmap_matrix(self) -> np.ndarray:
-        """Return the matrix that openFABMAP's program writes for one sequence.
+        """Return the matrix (n, n) that openFABMAP's program writes for one sequence.
 
-        (n, n): row i has the posterior of the images before i, the probability of a new place on the diagonal, and 0
-        above it. An image that was not made a place has a column of zeros below its diagonal.
+        Row i has the posterior of the images before i, the probability of a new place on the diagonal, and 0 above it.
+        An image that was not made a place has a column of zeros below the diagonal.
         """
         matrix = np.nan_to_num(np.tril(self.posterior, -1), nan=0.0)
         np.fill_diagonal(matrix, self.new)
@@ -348,7 +353,7 @@ class PlaceScores:
 
 
 def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> PlaceScores:
-    """Score the queries' words (Q, v) on a finished map with the words (P, v): two traverses."""
+    """Score the queries' words (Q, v) on a finished map with the words (P, v), for two traverses."""
     loglik, loglik_new = model.likelihoods(queries, places), model.new_place(queries, model.draws())
     posterior, new = np.empty_like(loglik), np.empty(len(loglik))
     previous = None
@@ -359,10 +364,10 @@ def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> P
 
 
 def score_sequence(model: FabMapModel, words: np.ndarray, only_new: bool = False) -> PlaceScores:
-    """Score each image of a sequence, words (n, v), on the map of the images before it: what :class:`FabMap` says.
+    """Score each image of a sequence, words (n, v), on the map of the images before it, as :class:`FabMap` does.
 
-    Pairs that are none (the upper triangle with the diagonal; with ``only_new``, images that founded no place) are NaN.
-    So is the posterior of images too recent to be on the map; their log-odds are there all the same.
+    The upper triangle with the diagonal is NaN, and with ``only_new`` the columns of images that were not made places.
+    The posterior of images too recent to be on the map is NaN as well; their log-odds are not.
     """
     loglik, loglik_new = model.likelihoods(words, words), model.new_place(words, model.draws())
     posterior, log_odds = np.full_like(loglik, np.nan), np.full_like(loglik, np.nan)

@@ -1,8 +1,8 @@
-"""Visual words: local features of an image, the vocabulary they are sorted into, and how often each word occurs.
+"""Visual words: local features of an image, the vocabulary that quantizes them, and how often each word occurs.
 
-A descriptor is a unit vector: SIFT (or, with ``root``, RootSIFT: the square roots of the histogram's shares,
-Arandjelovic and Zisserman, CVPR 2012), or the 256 bits of ORB as floats. An image without a single feature has no
-words; it is a place like any other.
+A descriptor is a unit vector of SIFT (or, with ``root``, RootSIFT: the square roots of the histogram's shares,
+Arandjelovic and Zisserman, CVPR 2012), or the 256 bits of ORB as floats. An image without features has no words, and
+can be a place like any other.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from loopclosure.descriptors.similarity import squared_distances
 from loopclosure.errors import InputError
-from loopclosure.places.frames import grey
+from loopclosure.places.frames import gray
 
-# Rows at a time where a matrix of distances to all centres is needed: 4096 x 5000 words are 80 MB.
+# Rows at a time where a matrix of distances to all centers is needed: 4096 x 5000 words are 80 MB.
 BLOCK_ROWS = 4096
 KINDS = {"sift": 128, "orb": 256}
 
@@ -32,12 +33,12 @@ def _detector(kind: str, max_features: int, contrast: float) -> Any:
 
 @dataclass(frozen=True)
 class Extractor:
-    """Local features of a grey image.
+    """Local features of a gray image.
 
     kind          "sift" or "orb"
-    max_features  the strongest so many of an image are kept
+    max_features  how many of the strongest are kept per image
     root          RootSIFT instead of SIFT
-    contrast      SIFT's contrast threshold (OpenCV's default); lower finds more in flat images
+    contrast      SIFT's contrast threshold (OpenCV's default); lower finds more in images of low contrast
     """
 
     kind: str = "sift"
@@ -49,19 +50,19 @@ class Extractor:
         if self.kind not in KINDS:
             raise InputError(f'unknown kind of features "{self.kind}"; known: {", ".join(KINDS)}')
         if self.max_features < 1:
-            raise InputError(f"max_features is {self.max_features}; at least one feature an image is needed")
+            raise InputError(f"max_features is {self.max_features}; at least one feature per image is needed")
 
     @property
     def size(self) -> int:
-        """Numbers in a descriptor."""
+        """Length of a descriptor."""
         return KINDS[self.kind]
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the descriptors (n, size) float32 of an (H, W) or (H, W, 3) uint8 image; n may be 0."""
-        _, found = _detector(self.kind, self.max_features, self.contrast).detectAndCompute(grey(image), None)
+        _, found = _detector(self.kind, self.max_features, self.contrast).detectAndCompute(gray(image), None)
         if found is None or len(found) == 0:
             return np.zeros((0, self.size), np.float32)
-        found = found[: self.max_features]  # SIFT returns more where the weakest have equal strength
+        found = found[: self.max_features]  # SIFT returns more if the weakest have equal strength
         if self.kind == "orb":
             return np.unpackbits(found, axis=1).astype(np.float32)
         tiny = np.float32(1e-12)
@@ -72,18 +73,18 @@ class Extractor:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """The words: ``centres`` (v, d) float32, the extractor whose descriptors they sort, and how they were ``made``."""
+    """The words: ``centers`` (v, d) float32, the extractor of the descriptors, and how the centers were ``made``."""
 
-    centres: np.ndarray
+    centers: np.ndarray
     extractor: Extractor
     made: str = ""
 
     def __len__(self) -> int:
-        return len(self.centres)
+        return len(self.centers)
 
     def nearest(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the word (n,) of each descriptor (n, d): its nearest centre."""
-        return nearest_centres(descriptors, self.centres)
+        """Return the word (n,) of each descriptor (n, d): its nearest center."""
+        return nearest_centers(descriptors, self.centers)
 
     def count(self, image: np.ndarray) -> np.ndarray:
         """Return how often each word occurs in an (H, W) or (H, W, 3) uint8 image: (v,) int32."""
@@ -94,18 +95,18 @@ class Vocabulary:
         return np.bincount(self.nearest(descriptors), minlength=len(self)).astype(np.int32)
 
 
-def nearest_centres(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the index (n,) of the centre (k, d) nearest to each descriptor (n, d) in Euclidean distance."""
-    half_norms = 0.5 * np.einsum("kd,kd->k", centres, centres)
+def nearest_centers(descriptors: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """Return the index (n,) of the center (k, d) nearest to each descriptor (n, d) in Euclidean distance."""
+    squares = np.einsum("kd,kd->k", centers, centers)
     nearest = np.empty(len(descriptors), np.intp)
     for start in range(0, len(descriptors), BLOCK_ROWS):
         block = descriptors[start : start + BLOCK_ROWS]
-        nearest[start : start + len(block)] = np.argmax(block @ centres.T - half_norms, axis=1)
+        nearest[start : start + len(block)] = np.argmin(squared_distances(block, centers, 0, squares), axis=1)
     return nearest
 
 
 def kmeans(descriptors: np.ndarray, words: int, seed: int = 0) -> np.ndarray:
-    """Return ``words`` centres (words, d) float32 of the descriptors (n, d) by mini-batch k-means."""
+    """Return ``words`` centers (words, d) float32 of the descriptors (n, d) by mini-batch k-means."""
     from sklearn.cluster import MiniBatchKMeans
 
     if len(descriptors) < words:
@@ -119,30 +120,30 @@ def kmeans(descriptors: np.ndarray, words: int, seed: int = 0) -> np.ndarray:
 
 
 def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:
-    """Return the indices of the descriptors (n, d) that found a cluster: first pass of the sequential clustering.
+    """Return the indices of the descriptors (n, d) that start a cluster: first pass of the sequential clustering.
 
-    In their order, each descriptor farther than ``radius`` from all founders before it becomes one.
+    In their order, each descriptor farther than ``radius`` from all founders before it becomes a founder.
     """
     chosen: list[int] = []
-    centres = np.empty((0, descriptors.shape[1]), descriptors.dtype)
+    centers = np.empty((0, descriptors.shape[1]), descriptors.dtype)
     for start in range(0, len(descriptors), BLOCK_ROWS):
         block = descriptors[start : start + BLOCK_ROWS]
-        far = np.flatnonzero(_squared_distance_to_nearest(block, centres) > radius**2)
+        far = np.flatnonzero(_squared_distance_to_nearest(block, centers) > radius**2)
         fresh: list[int] = []
-        while far.size:  # the first of those left founds a cluster and takes its neighbours with it
+        while far.size:  # the first of those left starts a cluster and removes its neighbors
             fresh.append(int(far[0]))
             gaps = block[far] - block[far[0]]
             far = far[np.einsum("nd,nd->n", gaps, gaps) > radius**2]
         chosen += [start + index for index in fresh]
-        centres = np.concatenate([centres, block[fresh]])
+        centers = np.concatenate([centers, block[fresh]])
     return np.array(chosen, np.intp)
 
 
 def sequential_clusters(descriptors: np.ndarray, radius: float, seed: int | None = 0) -> np.ndarray:
-    """Return the centres (k, d) float32 of the modified sequential clustering (openFABMAP's BOWMSCTrainer).
+    """Return the centers (k, d) float32 of the modified sequential clustering (openFABMAP's BOWMSCTrainer).
 
-    The founders (see :func:`founders`) gather their nearest descriptors, and the means are the words. The outcome
-    depends on the order, so it is shuffled with ``seed``; None keeps the order given. Useful radii: 0.55 to 0.6 for
+    Each descriptor is assigned to its nearest founder (see :func:`founders`), and the means are the words. The result
+    depends on the order, which is shuffled with ``seed``; None keeps the given order. Useful radii: 0.55 to 0.6 for
     RootSIFT, 0.7 to 0.75 for SIFT, the root of the Hamming distance for ORB.
     """
     if len(descriptors) == 0:
@@ -151,15 +152,15 @@ def sequential_clusters(descriptors: np.ndarray, radius: float, seed: int | None
         raise InputError(f"the radius of a cluster is {radius:g}; it must be positive")
     if seed is not None:
         descriptors = descriptors[np.random.default_rng(seed).permutation(len(descriptors))]
-    centres = descriptors[founders(descriptors, radius)]
-    nearest = nearest_centres(descriptors, centres)
-    sums = np.zeros(centres.shape, np.float64)
+    centers = descriptors[founders(descriptors, radius)]
+    nearest = nearest_centers(descriptors, centers)
+    sums = np.zeros(centers.shape, np.float64)
     np.add.at(sums, nearest, descriptors)
-    return (sums / np.bincount(nearest, minlength=len(centres))[:, None]).astype(np.float32)
+    return (sums / np.bincount(nearest, minlength=len(centers))[:, None]).astype(np.float32)
 
 
-def _squared_distance_to_nearest(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    if len(centres) == 0:
+def _squared_distance_to_nearest(descriptors: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    if len(centers) == 0:
         return np.full(len(descriptors), np.inf)
-    gaps = descriptors - centres[nearest_centres(descriptors, centres)]
+    gaps = descriptors - centers[nearest_centers(descriptors, centers)]
     return np.einsum("nd,nd->n", gaps, gaps)

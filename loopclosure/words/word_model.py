@@ -1,7 +1,7 @@
-"""What FAB-MAP and the bag of words learn beforehand, from images that are not tested, in one file to keep.
+"""What FAB-MAP and the bag of words learn from training images, in one file.
 
-A model file (.npz) holds the vocabulary, the words of the training images (FAB-MAP 2 samples its new place from them;
-the bag of words weighs words by them), the Chow-Liu tree, the extractor's settings and the training images' paths.
+A model file (.npz) has the vocabulary, the words of the training images (FAB-MAP 2 samples its new place from them; the
+bag of words takes its weights from them), the Chow-Liu tree, the extractor's settings and the training images' paths.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_grey
+from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
 from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
 
 FORMAT = 1
-# The stages of ``train``: done once, whatever the number of tested images.
+# The stages of ``train``: done once, for any number of tested images.
 TRAINING_STAGES = ("training features", "vocabulary", "training words", "tree")
 
 
@@ -33,7 +33,7 @@ class WordModel:
     training_images: list[Path]
     tree: WordTree
 
-    def words(
+    def count_words(
         self, images: list[Path], progress: Progress = silent, seconds: dict[str, float] | None = None
     ) -> np.ndarray:
         """Return how often each word occurs in each image: (n, v) int32."""
@@ -41,7 +41,7 @@ class WordModel:
         counts = np.zeros((len(images), len(self.vocabulary)), np.int32)
         for i, path in enumerate(progress(images, "features", len(images))):
             with timed(seconds, "features"):
-                descriptors = self.vocabulary.extractor(read_grey(path))
+                descriptors = self.vocabulary.extractor(read_gray(path))
             with timed(seconds, "words"):
                 counts[i] = self.vocabulary.count_descriptors(descriptors)
         return counts
@@ -53,7 +53,7 @@ class WordModel:
             np.savez_compressed(
                 file,
                 settings=json.dumps(settings),
-                centres=self.vocabulary.centres,
+                centres=self.vocabulary.centers,
                 training_words=self.training_words,
                 training_images=np.array([str(image) for image in self.training_images], str),
                 parent=self.tree.parent,
@@ -79,18 +79,18 @@ class WordModel:
         except OSError as error:
             raise InputError(f"cannot read the word model: {error.strerror or error}", path) from None
         except (KeyError, TypeError, ValueError):
-            raise InputError("not a word model; make one by training", path) from None
+            raise InputError("not a word model; give another name, and a new one is written there", path) from None
 
 
 @dataclass(frozen=True)
 class Training:
     """How a word model is made.
 
-    words            of k-means; 0 clusters by ``radius`` instead
+    words            how many, by k-means; 0: clusters by ``radius`` instead
     radius           of the modified sequential clustering, see :func:`sequential_clusters`
-    max_descriptors  so many of all images' descriptors are clustered, the same number of each image at most
+    max_descriptors  how many descriptors of all images are clustered, with the same limit for each image
     lower_bound      see :func:`learn_tree`
-    seed             of everything drawn by lot
+    seed             of all random numbers
     """
 
     extractor: Extractor = field(default_factory=Extractor)
@@ -109,29 +109,29 @@ def train(
 ) -> WordModel:
     """Learn the words and their tree from images that will not be tested.
 
-    ``seconds`` gets the time of each stage. Without images, or without features in them: InputError.
+    ``seconds`` receives the time of each stage. Raises InputError without images or without features in them.
     """
     training = training or Training()
     seconds = {} if seconds is None else seconds
     paths = [Path(image).resolve() for image in images]
     if not paths:
-        raise InputError("a vocabulary needs training images (of other places than the tested ones), got none")
+        raise InputError("a vocabulary needs training images, of other places than the tested ones; none are given")
     rng = np.random.default_rng(training.seed)
     share = max(1, training.max_descriptors // len(paths))
     found = []
     for path in progress(paths, "training features", len(paths)):
         with timed(seconds, "training features"):
-            found.append(training.extractor(read_grey(path)))
+            found.append(training.extractor(read_gray(path)))
     with timed(seconds, "vocabulary"):
         sample = np.concatenate([d if len(d) <= share else rng.choice(d, share, replace=False) for d in found])
         if training.words:
-            centres = kmeans(sample, training.words, training.seed)
-            how = f"k-means, {len(centres)} words"
+            centers = kmeans(sample, training.words, training.seed)
+            how = f"k-means, {len(centers)} words"
         else:
-            centres = sequential_clusters(sample, training.radius, training.seed)
-            how = f"sequential clustering, radius {training.radius:g}, {len(centres)} words"
+            centers = sequential_clusters(sample, training.radius, training.seed)
+            how = f"sequential clustering, radius {training.radius:g}, {len(centers)} words"
     made = f"{how} of {len(sample)} descriptors of {len(paths)} training images, seed {training.seed}"
-    vocabulary = Vocabulary(centres, training.extractor, made)
+    vocabulary = Vocabulary(centers, training.extractor, made)
     with timed(seconds, "training words"):
         words = np.stack([vocabulary.count_descriptors(descriptors) for descriptors in found])
     with timed(seconds, "tree"):

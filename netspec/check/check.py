@@ -1,29 +1,39 @@
-"""What a file builds, without opening any data: shapes, parameters, memory, multiply-adds; and every fault at once."""
+"""What a file builds: shapes, parameters, memory, multiply-adds; and all that is wrong with it, at once.
+
+Whatever a training would refuse before its first iteration is found here, without writing anything and, unless asked,
+without opening data. Of one text file that cannot be read the first fault is reported, of one layer's own settings too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from netspec import log
 from netspec.check.lint import missing_data, net_advice, solver_advice
 from netspec.errors import SpecError, Where, did_you_mean
-from netspec.graph.filter import with_state
+from netspec.graph.filter import with_state, with_train_state
 from netspec.layers.base import Shape
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
+from netspec.net.weights import load_weights
+from netspec.proto.schema import TEST, NetParameter, PhaseValue, SolverParameter
+from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import parse_net, parse_solver
+from netspec.solver.checks import check_prefix, check_settings
+from netspec.solver.nets import TRAIN_NET, seed_of, solver_nets
+from netspec.solver.solver import choose_device
 
 
 @dataclass
 class Checked:
     """One net of the file: ``label`` says which; ``advice`` is about what is legal but likely wrong.
 
-    A solver whose settings are faulty comes first, under its own path and without a net.
+    A solver comes first, under its own path and without a net.
     """
 
     label: str
@@ -32,53 +42,101 @@ class Checked:
     advice: list[str] = field(default_factory=list)
 
 
-def is_solver(path: str | Path) -> bool:
-    """Return whether a file is a solver's rather than a net's: whichever reads further into it."""
-    try:
-        parse_net(path)
-        return False
-    except SpecError as as_net:
-        try:
-            parse_solver(path)
-            return True
-        except SpecError as as_solver:
-            return _reach(as_solver) > _reach(as_net)
-
-
-def _reach(fault: SpecError) -> tuple[int, int]:
-    return (fault.where.line, fault.where.column) if fault.where else (0, 0)
-
-
-def check_net(net: Any, source: Any, label: str, shapes: Mapping[str, Shape], allow_python: bool = False) -> Checked:
-    """Build a net (its ``state`` set) on no device and collect its faults."""
-    faults: list[SpecError] = []
-    options = BuildOptions(
-        torch.device("meta"), 0, open_data=False, given_shapes=shapes, report=faults.append, allow_python=allow_python
-    )
-    built = build_net(net, source, options)
-    advice = [*missing_data(net, built.param, source), *(() if faults else net_advice(built))]
-    return Checked(label, built, faults, advice)
+@dataclass(frozen=True)
+class _Manner:
+    shapes: Mapping[str, Shape]
+    open_data: bool
+    allow_python: bool
 
 
 def check_file(
     path: str | Path,
-    phase: int,
+    phase: PhaseValue = TEST,
     level: int = 0,
-    stages: Iterable[str] = (),
+    stages: Sequence[str] = (),
     shapes: Mapping[str, Shape] | None = None,
+    open_data: bool = False,
+    weights: str | None = None,
     allow_python: bool = False,
 ) -> list[Checked]:
-    """Check a net for a phase, level and stages, or all nets of a solver."""
-    given = shapes or {}
-    if is_solver(path):
-        return _check_solver(path, level, stages, given, allow_python)
-    net, source = parse_net(path)
-    checked = check_net(with_state(net, phase, level, stages), source, str(path), given, allow_python)
-    checked.faults.extend(_not_to_be_given(given, [net], path))
+    """Check a net for a phase, level and stages, or a solver, whose training net gets these, and all its nets.
+
+    ``shapes`` are those of data layers' tops; the data of the others is opened with ``open_data``. ``weights``, paths
+    separated by commas, are what a training would begin with, in the place of a solver's own. Raises SpecError where
+    the file itself cannot be read.
+    """
+    manner = _Manner(shapes or {}, open_data, allow_python)
+    given = [weights] if weights else []
+    try:
+        net, source = parse_net(path)
+    except SpecError as as_net:
+        try:
+            solver, node = parse_solver(path)
+        except SpecError as as_solver:
+            raise max(as_net, as_solver, key=_reach) from None
+        solver = with_train_state(solver, level, stages)
+        return _check_solver(solver, node, path, given or solver.weights, manner)
+    checked = _check_net(with_state(net, phase, level, stages), source, str(path), given, manner)
+    checked.faults += _not_to_be_given(manner.shapes, [net], path)
     return [checked]
 
 
-def _not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[Any], path: str | Path) -> list[SpecError]:
+def _reach(fault: SpecError) -> tuple[int, int]:
+    """Return how far into a file a reader came: further as a net or as a solver tells which of them it is."""
+    return (fault.where.line, fault.where.column) if fault.where else (0, 0)
+
+
+def _check_net(
+    net: NetParameter, source: SourceMap, label: str, weights: Iterable[str], manner: _Manner, seed: int = 0
+) -> Checked:
+    """Build a net (its ``state`` set) on no device, hold weights against it, and collect the faults."""
+    faults: list[SpecError] = []
+    options = BuildOptions(
+        torch.device("meta"),
+        seed,
+        open_data=manner.open_data,
+        given_shapes=manner.shapes,
+        report=faults.append,
+        allow_python=manner.allow_python,
+    )
+    built = build_net(net, source, options)
+    for path in (path.strip() for paths in weights for path in paths.split(",")):
+        load_weights(built, path, report=faults.append)
+    advice = [*missing_data(net, built.param, source), *(() if faults else net_advice(built))]
+    return Checked(label, built, faults, advice)
+
+
+def _check_solver(
+    solver: SolverParameter, node: Place, path: str | Path, weights: Iterable[str], manner: _Manner
+) -> list[Checked]:
+    faults: list[SpecError] = []
+    check_settings(solver, node, faults.append)
+    if (solver.snapshot > 0 and solver.snapshot_prefix) or solver.snapshot_after_train:
+        check_prefix(solver, node, faults.append, try_it=False)
+    try:
+        with log.silent():
+            choose_device(solver, node)
+    except SpecError as fault:
+        faults.append(fault)
+    described = solver_nets(solver, node, faults.append)
+    faults += _not_to_be_given(manner.shapes, [part.net for part in described], path)
+    parts = [
+        _check_net(part.net, part.source, part.label, weights, manner, seed_of(max(solver.random_seed, 0), part.label))
+        for part in described
+    ]
+    nets = [part.net for part in parts if part.net is not None]
+    if described and described[0].label == TRAIN_NET:
+        for net, part in zip(nets[1:], parts[1:], strict=True):
+            net.share_weights_with(nets[0], part.faults.append)
+    for net, part in zip(nets, parts, strict=True):
+        part.faults += net.missing_inputs()
+    advice = []
+    if not faults and not any(part.faults for part in parts):
+        advice = list(solver_advice(solver, node, nets))
+    return [Checked(str(path), None, faults, advice), *parts]
+
+
+def _not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
     """Return a fault for each given shape of a blob that no data layer (or Python layer) makes."""
     makers = [layer for net in nets for layer in net.layer if not layer.bottom or layer.type == "Python"]
     blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
@@ -91,28 +149,3 @@ def _not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[Any], path: str
         for name in shapes
         if name not in blobs
     ]
-
-
-def _check_solver(
-    path: str | Path, level: int, stages: Iterable[str], shapes: Mapping[str, Shape], allow_python: bool
-) -> list[Checked]:
-    from netspec.solver.checks import check_settings
-    from netspec.solver.nets import solver_nets, with_train_state
-
-    solver, node = parse_solver(path)
-    faults: list[SpecError] = []
-    check_settings(solver, node, faults.append)
-    try:
-        described = solver_nets(with_train_state(solver, level, stages), node)
-    except SpecError as fault:
-        faults.append(fault)
-        described = []
-    checked = [check_net(part.net, part.source, part.label, shapes, allow_python) for part in described]
-    if described:
-        faults += _not_to_be_given(shapes, [part.net for part in described], path)
-    if faults:
-        return [Checked(str(path), None, faults), *checked]
-    nets = [part.net for part in checked if part.net is not None and not part.faults]
-    if len(nets) == len(checked):
-        checked[0].advice.extend(solver_advice(solver, node, nets))
-    return checked

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from netspec.data.database import open_reader
-from netspec.errors import SpecError, Where
+from netspec.errors import Where
 from netspec.net.net import Net
 from netspec.proto.schema import TRAIN
 from netspec.proto.source_map import Place
 
-LMDB = 1  # caffe.proto: DataParameter.DB
 FAR = 0.1  # of the records may be missed, or met twice, by a test
 #: What of the settings of a rate policy, and of an update rule, each reads.
 POLICY_SETTINGS = {
@@ -138,21 +136,16 @@ def _namesakes(net: Net) -> Iterator[str]:
 
 
 def _test_size(iterations: int, where: Where, net: Net) -> Iterator[str]:
-    """Compare the records that a test reads with those there are, where the database is at hand."""
+    """Compare the records that a test reads with those there are, where the data is open."""
     for layer in net.layers:
-        source = layer.param.data_param.source
-        if not source:
-            continue
-        try:
-            backend = "lmdb" if layer.param.data_param.backend == LMDB else "leveldb"
-            reader = open_reader(source, backend, where)
-        except SpecError:
+        records = getattr(layer, "num_records", 0)
+        if records:
+            batch = layer.top_shapes[0][0]
+            read = iterations * batch
+            if abs(read - records) > FAR * records:
+                there = f'layer "{layer.param.name}" has {records} records'
+                yield f"{where}: test_iter {iterations} x batch {batch} = {read}, but {there}"
             return
-        batch = layer.param.data_param.batch_size
-        records, read = len(reader), iterations * batch
-        if abs(read - records) > FAR * records:
-            yield f'{where}: test_iter {iterations} x batch {batch} = {read}, but "{source}" has {records} records'
-        return
 
 
 def _place(net: Net, i: int) -> Where:

@@ -8,32 +8,22 @@ import torch
 
 from netspec.log import info, number
 from netspec.net.net import Net
+from netspec.solver.tally import Outputs, Tally, score_lines
 
 
-def test_net(net: Net, iterations: int) -> dict[str, list[float]]:
-    """Run ``iterations`` batches; log each batch's outputs, and the means of their elements; return the means."""
+def test_net(net: Net, iterations: int) -> Outputs:
+    """Run ``iterations`` batches; log each batch's outputs and their means, and return the means by output blob."""
     info("caffe.cpp:281", f"Running for {iterations} iterations.")
-    totals: dict[str, list[float]] = {}
-    total_loss = 0.0
+    tally = Tally()
     with torch.no_grad():
         for batch in range(iterations):
-            loss, outputs = net.forward_loss()
-            total_loss += loss.item()
-            for name, blob in outputs.items():
-                scores = [float(score) for score in blob.reshape(-1).tolist()]
-                sums = totals.setdefault(name, [0.0] * len(scores))
-                for k, score in enumerate(scores):
-                    sums[k] += score
-                    info("caffe.cpp:304", f"Batch {batch}, {name} = {number(score)}")
-    info("caffe.cpp:309", f"Loss: {number(total_loss / iterations)}")
-    means: dict[str, list[float]] = {}
-    for name, sums in totals.items():
-        weight = net.output_loss_weights[name]
-        means[name] = [value / iterations for value in sums]
-        for mean in means[name]:
-            ending = f" (* {number(weight)} = {number(weight * mean)} loss)" if weight else ""
-            info("caffe.cpp:321", f"{name} = {number(mean)}{ending}")
-    return means
+            for name, values in tally.add(*net.forward_loss()).items():
+                for value in values:
+                    info("caffe.cpp:304", f"Batch {batch}, {name} = {number(value)}")
+    info("caffe.cpp:309", f"Loss: {number(tally.loss)}")
+    for line in score_lines(tally.scores, net.output_loss_weights):
+        info("caffe.cpp:321", line)
+    return tally.scores
 
 
 def time_net(net: Net, iterations: int) -> None:

@@ -39,7 +39,7 @@ def add_to(commands: Commands) -> None:
         p.add_argument("input", metavar="IN")
         p.add_argument("output", metavar="OUT")
 
-    commands.add("layers", _layers, "print the layers it knows, from their own descriptions")
+    commands.add("layers", _layers, "print the layers it knows, from their own descriptions", quiet=True)
 
 
 def _extract_features(arguments: argparse.Namespace) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import sys
 
 from netspec.cli.arguments import add_python, add_state, shape, stages
@@ -14,8 +13,9 @@ from netspec.proto.schema import PHASES
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add("check", _check, "build a net, or a solver's nets, without opening data; report every fault")
-    p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
+    p = commands.add(
+        "check", _check, "build a net, or a solver's nets, and report every fault; nothing is written", True
+    )
     p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
     add_state(p, phase="TEST")
     p.add_argument(
@@ -24,24 +24,27 @@ def add_to(commands: Commands) -> None:
         default=[],
         type=shape,
         metavar="BLOB=N,C,H,W",
-        help="the shape of a data layer's top",
+        help="the shape of a data layer's top, whose data then is not opened",
     )
+    p.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
+    p.add_argument("--weights", help="weights that must fit, several separated by commas")
     p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")
     add_python(p)
 
 
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.check.check import check_file
-    from netspec.check.table import as_json, table
+    from netspec.net.table import as_json, table
 
-    shapes = dict(arguments.shape)
     checked = check_file(
         arguments.file,
-        PHASES[arguments.phase],
-        arguments.level,
-        stages(arguments),
-        shapes,
-        arguments.allow_python_layers,
+        phase=PHASES[arguments.phase],
+        level=arguments.level,
+        stages=stages(arguments),
+        shapes=dict(arguments.shape),
+        open_data=arguments.data,
+        weights=arguments.weights,
+        allow_python=arguments.allow_python_layers,
     )
     for line in dict.fromkeys(line for part in checked for line in part.advice):
         print(f"warning: {line}", file=sys.stderr)

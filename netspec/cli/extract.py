@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from netspec import log
 from netspec.cli.arguments import (
@@ -21,12 +23,15 @@ from netspec.cli.arguments import (
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
 from netspec.errors import SpecError
+from netspec.features.views import read_zooms
 from netspec.proto.schema import PHASES
+from netspec.whole_file import whole_file, why_unwritable
 
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add("extract", _extract, "write blobs, over the records of a data layer or over images, to an .npz")
+    summary = "write blobs, over the records of a data layer or over images, to an .npz"
+    p = commands.add("extract", _extract, summary, quiet=True)
     p.add_argument("--model", required=True, help="the net's prototxt")
     p.add_argument("--weights", help="the trained weights; without, random ones")
     p.add_argument("--blob", required=True, nargs="+", action="extend", help="the blobs to write")
@@ -38,7 +43,6 @@ def add_to(commands: Commands) -> None:
     p.add_argument(
         "--zooms",
         type=_zooms,
-        default=(),
         metavar="1,0.7",
         help="of each image the whole and its middle 0.7, one descriptor each",
     )
@@ -54,51 +58,71 @@ def add_to(commands: Commands) -> None:
 def _extract(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from netspec.features.image_list import read_image_list
-    from netspec.features.images import extract_images, image_net
+    out = Path(arguments.out)
+    if reason := why_unwritable(out):
+        raise SpecError(f"--out {out}: cannot be written: {reason}")
+    if not arguments.weights:
+        log.logger.warning("no --weights: the net has random ones")
+    arrays = _over_images(arguments) if arguments.images else _over_records(arguments)
+    with whole_file(out) as unfinished, unfinished.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+    _tell(out, arrays)
+
+
+def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
+    from netspec.features.image_list import list_images
+    from netspec.features.images import ImageNet, extract_images
+
+    if len(arguments.blob) != 1:
+        raise WrongUsage(f"--images takes one --blob, found {len(arguments.blob)}")
+    if arguments.shape and arguments.shape[0] != arguments.input:
+        raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
+    images = list_images(arguments.images)
+    weights = [path.strip() for path in arguments.weights.split(",")] if arguments.weights else []
+    given = arguments.shape[1] if arguments.shape else None
+    (blob,) = arguments.blob
+    zooms, chosen = arguments.zooms or (1.0,), device(arguments.gpu)
+    net = ImageNet(arguments.model, weights, blob, arguments.input, chosen, given, zooms, arguments.exact)
+    size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "BGR"
+    print(f"{arguments.model}: {blob} of {len(images.paths)} images from {arguments.images}")
+    print(f"{arguments.input} ({size}): {kind}, {net.scaling}")
+    return extract_images(net, images, bar("extract", "batch"))
+
+
+def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.features.records import extract_records, with_sources
     from netspec.graph.filter import with_state
     from netspec.net.build import build_net
     from netspec.net.options import BuildOptions
     from netspec.proto.text import parse_net
 
-    chosen = device(arguments.gpu)
-    out = Path(arguments.out)
-    if not out.parent.is_dir():
-        raise SpecError(f"--out {out}: there is no folder {out.parent}; make it first")
-    if not arguments.weights:
-        log.warning("extract_features.cpp:62", "no --weights: the net has random ones")
-    if arguments.images:
-        if len(arguments.blob) != 1:
-            raise WrongUsage(f"--images takes one --blob, found {len(arguments.blob)}")
-        (blob,) = arguments.blob
-        if arguments.shape and arguments.shape[0] != arguments.input:
-            raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
-        images = read_image_list(Path(arguments.images))
-        given = arguments.shape[1] if arguments.shape else None
-        net, scaling = image_net(arguments.model, blob, arguments.input, given, chosen, arguments.exact)
-        load_weights(net, arguments.weights)
-        arrays = extract_images(net, scaling, blob, images, progress=bar("extract", "batch"), zooms=arguments.zooms)
-    elif arguments.zooms:
+    if arguments.zooms:
         raise WrongUsage("--zooms are of --images; a data layer's records have their own transform_param")
-    else:
-        message, source = parse_net(arguments.model)
-        stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
-        stated = with_sources(stated, source, dict(arguments.source))
-        options = BuildOptions(chosen, allow_python=arguments.allow_python_layers, exact=arguments.exact)
-        net = build_net(stated, source, options)
-        load_weights(net, arguments.weights)
-        arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))
+    message, source = parse_net(arguments.model)
+    stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
+    stated = with_sources(stated, source, dict(arguments.source))
+    python, exact = arguments.allow_python_layers, arguments.exact
+    options = BuildOptions(device(arguments.gpu), allow_python=python, exact=exact)
+    net = build_net(stated, source, options)
+    load_weights(net, arguments.weights)
+    arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))
     net.close()
-    with out.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    print(f"{arguments.model}: {', '.join(arguments.blob)} of {len(arrays['keys'])} records")
+    return arrays
+
+
+def _tell(out: Path, arrays: Mapping[str, Any]) -> None:
+    shapes = ", ".join(f"{name} {values.shape}" for name, values in arrays.items() if values.ndim)
+    (seconds,) = (name for name in arrays if name.startswith("seconds_per_"))
+    what = seconds.removeprefix("seconds_per_")
+    print(f"{out}: {shapes}; {arrays[seconds] * 1e3:.3g} ms per {what}")
 
 
 def _zooms(text: str) -> tuple[float, ...]:
     try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers with commas between, e.g. 1,0.7") from None
+        return read_zooms(text)
+    except SpecError as fault:
+        raise argparse.ArgumentTypeError(str(fault)) from None
 
 
 def _source(text: str) -> tuple[str, str]:

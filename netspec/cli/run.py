@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
-from netspec import command_line
+from netspec import command_line, log
 from netspec.dialects import use_dialect
 
 
@@ -15,9 +17,12 @@ class Commands(command_line.Commands):
     """Commands that know the dialects of ``--plugin`` when they run."""
 
     def add(
-        self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str
+        self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str, quiet: bool = False
     ) -> argparse.ArgumentParser:
-        """Return the parser of a new command that runs ``function``, to add its own arguments to."""
+        """Return the parser of a new command that runs ``function``, to add its own arguments to.
+
+        A command of Caffe's has Caffe's log. A ``quiet`` one shows warnings only, and with ``-v`` the log.
+        """
 
         def with_dialects(arguments: argparse.Namespace) -> int | None:
             for plugin in arguments.plugin:
@@ -25,9 +30,19 @@ class Commands(command_line.Commands):
             return function(arguments)
 
         added = super().add(name, with_dialects, summary)
+        if quiet:
+            added.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
+            added.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
         plugin = "a dialect: a fork's layers, by the name they come under or by a file of one's own; may be repeated"
         added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=plugin)
         return added
+
+
+class _Verbose(argparse.Action):
+    """Show the whole log, as the commands that Caffe has do."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        namespace.log_level, namespace.log_form = logging.INFO, log.GlogFormatter()
 
 
 @contextmanager

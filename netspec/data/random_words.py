@@ -20,6 +20,16 @@ def words(seed: int, stream: str, first: int, count: int) -> np.ndarray:
     return generator.random_raw(WORDS * count).reshape(count, WORDS)
 
 
+def words_at(seed: int, stream: str, records: range) -> np.ndarray:
+    """Return the words of these records, which may be each n-th one only: uint64 (len(records), 4)."""
+    return words(seed, stream, records.start, len(range(records.start, records.stop)))[:: records.step]
+
+
+def derived(seed: int, name: str) -> int:
+    """Return a seed, below 2^32, for one of several parts of what ``seed`` is for."""
+    return int.from_bytes(hashlib.blake2b(f"{seed}:{name}".encode(), digest_size=4).digest(), "little")
+
+
 def permutation(seed: int, stream: str, count: int) -> np.ndarray:
     """Return the numbers 0 to ``count - 1`` in random order: int64 (count,)."""
     blocks = -(-count // WORDS)

@@ -27,7 +27,7 @@ class Cursor:
 
     ``skip`` records are passed over at the very start. With ``shuffle`` each epoch has an order of its own, which
     follows from ``seed``, ``stream`` and the epoch's number. Of the ``ranks`` nets that read the same data side by
-    side, this one, ``rank``, takes each ``ranks``-th record (Caffe: DataLayer::Skip).
+    side, this one, ``rank``, takes each ``ranks``-th record (Caffe: DataLayer::Skip); all must have one ``seed``.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class _ImageSource:
         if len(items) > 1:
             for item in items:
                 self._check_shape(item)
-        data = self._transform([item.image for item in items], iteration * self.cursor.batch_size)
+        data = self._transform([item.image for item in items], self.cursor.positions(iteration))
         return data, np.array([item.label for item in items], np.float32)
 
     def _check_shape(self, item: _Item) -> None:

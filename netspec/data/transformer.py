@@ -5,7 +5,7 @@ Caffe: src/caffe/data_transformer.cpp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,22 @@ from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import datum_to_array, times
 from netspec.data.mean import read_mean
-from netspec.data.random_words import words
+from netspec.data.random_words import words_at
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import TRAIN
+
+
+def contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
+    """Yield a SpecError for each two settings of a transform_param that exclude each other."""
+    if param.force_color and param.force_gray:
+        yield SpecError("force_color and force_gray exclude each other", at("transform_param", "force_gray"))
+    yield from mean_contradictions(param, at)
+
+
+def mean_contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
+    """Yield a SpecError where a transform_param has two kinds of mean."""
+    if param.HasField("mean_file") and param.mean_value:
+        yield SpecError("mean_file and mean_value exclude each other", at("transform_param", "mean_value"))
 
 
 class Transformer:
@@ -34,11 +47,9 @@ class Transformer:
         self.crop_size: int = param.crop_size
         self.mirror: bool = param.mirror
         self.scale = np.float32(param.scale)
-        if param.force_color and param.force_gray:
-            raise self._error("force_color and force_gray exclude each other", "force_gray")
+        for fault in contradictions(param, at):
+            raise fault
         self.color: bool | None = True if param.force_color else False if param.force_gray else None
-        if param.HasField("mean_file") and param.mean_value:
-            raise self._error("mean_file and mean_value exclude each other", "mean_value")
         self.mean_values = np.array(param.mean_value, np.float32)
         self._mean_file = param.mean_file
         self._mean = read_mean(param.mean_file, at("transform_param", "mean_file")) if param.mean_file else None
@@ -67,13 +78,13 @@ class Transformer:
             raise self._error(message, "mean_value")
         return (channels, self.crop_size, self.crop_size) if self.crop_size else shape
 
-    def __call__(self, images: Sequence[np.ndarray], first: int) -> np.ndarray:
+    def __call__(self, images: Sequence[np.ndarray], positions: range) -> np.ndarray:
         """Return the images, uint8 or float32 (C, H, W), as one batch: float32 (N, C, H', W').
 
-        ``first`` is the number of the first image in the sequence of all records read, which the draws follow.
+        ``positions`` are the images' numbers in the sequence of all records read, which the draws follow.
         """
         batch = np.empty((len(images), *self.output_shape(images[0].shape)), np.float32)
-        draws = words(self._seed, self._stream, first, len(images)).tolist()
+        draws = words_at(self._seed, self._stream, positions).tolist()
         for image, out, (mirror, h_off, w_off, _) in zip(images, batch, draws, strict=True):
             self._transform(image, out, mirror, h_off, w_off)
         if self.scale != 1:

@@ -6,7 +6,7 @@ Caffe: src/caffe/layers/window_data_layer.cpp
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,8 +18,9 @@ import numpy as np
 from netspec import log
 from netspec.data.datum import decode_pixels, planar
 from netspec.data.mean import read_mean
-from netspec.data.random_words import words
+from netspec.data.random_words import words_at
 from netspec.data.sources import Arrays, Cursor, Shape
+from netspec.data.transformer import mean_contradictions
 from netspec.errors import SpecError, Where
 
 CHANNELS = 3  # images are always read in colour
@@ -46,12 +47,13 @@ class WindowFile:
     background: list[Window]
 
 
-def read_window_file(path: str, root: str, fg_threshold: float, bg_threshold: float, where: Where | None) -> WindowFile:
-    """Read a list of images, each with its windows, a line for each item.
+def read_window_file(param: Any, where: Where | None) -> WindowFile:
+    """Read the list of images, each with its windows, that a window_data_param names, a line for each item.
 
     For each image: ``# index``, path, channels, height, width, number of windows; then ``label overlap x1 y1 x2 y2``.
     A window is foreground from ``fg_threshold`` overlap on, background below ``bg_threshold``, else left out.
     """
+    path: str = param.source
     try:
         lines = [(number, line.strip()) for number, line in enumerate(Path(path).read_text().splitlines(), 1)]
     except (OSError, UnicodeDecodeError) as fault:
@@ -77,17 +79,17 @@ def read_window_file(path: str, root: str, fg_threshold: float, bg_threshold: fl
         if line.split() != ["#", str(len(found.images))]:
             raise SpecError(f'found "{line}", expected "# {len(found.images)}", the number of the next image', place)
         image = len(found.images)
-        found.images.append(root + next(remaining, (number, ""))[1])
+        found.images.append(param.root_folder + next(remaining, (number, ""))[1])
         for what in ("the image's channels", "its height", "its width"):
             numbers(1, what)
         for _ in range(int(numbers(1, "the number of windows")[0])):
             label, overlap, *corners = numbers(6, "label overlap x1 y1 x2 y2")
             x1, y1, x2, y2 = map(int, corners)
-            if overlap >= fg_threshold:
+            if overlap >= param.fg_threshold:
                 if label <= 0:
                     raise SpecError(f"found label {label:g} for a foreground window, expected one above 0", place)
                 found.foreground.append(Window(image, int(label), x1, y1, x2, y2))
-            elif overlap < bg_threshold:
+            elif overlap < param.bg_threshold:
                 found.background.append(Window(image, 0, x1, y1, x2, y2))
     if not found.images:
         raise SpecError(f'the window file "{path}" is empty', where or Where(path))
@@ -98,25 +100,37 @@ def read_window_file(path: str, root: str, fg_threshold: float, bg_threshold: fl
 class WindowSource:
     """Batches of windows, background first, each warped to ``crop_size`` x ``crop_size`` with some context around.
 
-    As in Caffe, ``transform_param.scale`` plays no part, and what lies outside of the image is 0 after the mean.
+    ``file`` is what :func:`read_window_file` returns, ``mean`` what :func:`window_mean` does. As in Caffe,
+    ``transform_param.scale`` plays no part, and what lies outside of the image is 0 after the mean.
     """
 
-    def __init__(self, param: Any, transform: Any, at: Callable[..., Where], seed: int, stream: str) -> None:
+    def __init__(
+        self,
+        param: Any,
+        transform: Any,
+        file: WindowFile,
+        mean: np.ndarray,
+        at: Callable[..., Where],
+        seed: int,
+        stream: str,
+        rank: int = 0,
+        ranks: int = 1,
+    ) -> None:
         self._crop: int = transform.crop_size
         self._mirror: bool = transform.mirror
         self._pad: int = param.context_pad
         self._square = param.crop_mode == "square"
         self._scale = np.float32(param.scale)
         where = at("window_data_param", "source")
-        self._file = read_window_file(param.source, param.root_folder, param.fg_threshold, param.bg_threshold, where)
+        self._file, self._mean = file, mean
         foreground = int(np.float32(param.batch_size) * np.float32(param.fg_fraction))
         self._kinds = [self._file.background] * (param.batch_size - foreground) + [self._file.foreground] * foreground
         for kind, name in ((self._file.background, "background"), (self._file.foreground, "foreground")):
             if not kind and any(wanted is kind for wanted in self._kinds):
                 raise SpecError(f'"{param.source}" has no {name} windows, of which each batch needs some', where)
-        self._mean = _mean(transform, self._crop, at)
         self._seed, self._stream, self._where = seed, stream, where
-        self.cursor = Cursor(len(self._file.foreground) + len(self._file.background), param.batch_size)
+        count = len(self._file.foreground) + len(self._file.background)
+        self.cursor = Cursor(count, param.batch_size, rank=rank, ranks=ranks)
         self._bytes = lru_cache(maxsize=None if param.cache_images else 0)(lambda path: Path(path).read_bytes())
 
     @property
@@ -138,8 +152,7 @@ class WindowSource:
         return [f"{self._file.images[w.image]}:{w.x1},{w.y1},{w.x2},{w.y2}" for w, _ in self._draw(iteration)]
 
     def _draw(self, iteration: int) -> list[tuple[Window, bool]]:
-        size = self.cursor.batch_size
-        draws = words(self._seed, self._stream, iteration * size, size).tolist()
+        draws = words_at(self._seed, self._stream, self.cursor.positions(iteration)).tolist()
         return [
             (kind[index % len(kind)], self._mirror and mirror % 2 == 1)
             for kind, (index, mirror, *_) in zip(self._kinds, draws, strict=True)
@@ -190,10 +203,17 @@ class WindowSource:
         return box, (top, left), (height, width)
 
 
-def _mean(transform: Any, crop: int, at: Callable[..., Where]) -> np.ndarray:
+def wrong_means(transform: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
+    """Yield what is wrong with the mean of a transform_param, its file aside."""
+    yield from mean_contradictions(transform, at)
+    if len(transform.mean_value) not in (0, 1, CHANNELS):
+        message = f"found {len(transform.mean_value)} mean_value, expected 1 or {CHANNELS}"
+        yield SpecError(message, at("transform_param", "mean_value"))
+
+
+def window_mean(transform: Any, at: Callable[..., Where]) -> np.ndarray:
     """Return the mean to subtract, float32 (3, crop, crop) or, from mean_value, (3, 1, 1) spread to it."""
-    if transform.HasField("mean_file") and transform.mean_value:
-        raise SpecError("mean_file and mean_value exclude each other", at("transform_param", "mean_value"))
+    crop: int = transform.crop_size
     if transform.mean_file:
         where = at("transform_param", "mean_file")
         mean = read_mean(transform.mean_file, where)
@@ -203,9 +223,6 @@ def _mean(transform: Any, crop: int, at: Callable[..., Where]) -> np.ndarray:
             raise SpecError(message, where)
         return mean[:, offset : offset + crop, offset : offset + crop]
     values = np.array(transform.mean_value or [0.0], np.float32)
-    if len(values) not in (1, CHANNELS):
-        message = f"found {len(values)} mean_value, expected 1 or {CHANNELS}"
-        raise SpecError(message, at("transform_param", "mean_value"))
     return np.broadcast_to(values[:, None, None], (CHANNELS, crop, crop))
 
 

@@ -14,6 +14,7 @@ from netspec import log
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError, Where
+from netspec.graph import check_blobs
 from netspec.net.net import Net
 
 COMMITTED = 1000  # records between two commits, each of which is told
@@ -28,9 +29,8 @@ def extract_features(net: Net, blobs: Sequence[str], databases: Sequence[str], b
     where = Where(net.plan.source.file)
     if len(blobs) != len(databases):
         raise SpecError(f"found {len(blobs)} blob names and {len(databases)} databases, expected as many", where)
+    check_blobs(blobs, net.shapes, net.plan.source.file)
     for name in blobs:
-        if name not in net.shapes:
-            raise SpecError(f'no blob "{name}" in this net; it has: {", ".join(net.shapes)}', where)
         if not 1 <= len(net.shapes[name]) <= 4:
             raise SpecError(f'blob "{name}" has shape {net.shapes[name]}, expected 1 to 4 axes', where)
     net.keep = list(blobs)

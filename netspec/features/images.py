@@ -1,4 +1,4 @@
-"""A blob of a net over image files: what Caffe's users wrote around pycaffe."""
+"""A blob of a net over image files: what Caffe's users wrote around pycaffe. The file it makes: docs/features.md."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import torch
 
@@ -20,76 +21,98 @@ from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.features.image_list import ImageList
 from netspec.features.records import Progress
+from netspec.features.views import middle
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
-from netspec.net.build import build_net
-from netspec.net.net import Net
+from netspec.net.build import build_filtered
 from netspec.net.options import BuildOptions
-from netspec.proto.schema import TEST
-from netspec.proto.text import parse_net
+from netspec.net.weights import load_weights
+from netspec.proto.binary import read_net_binary
+from netspec.proto.schema import TEST, LayerParameter, NetParameter
+from netspec.proto.source_map import SourceMap
+from netspec.proto.text import parse_net, write_text
+
+BATCH = 16  # images at once
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """(x - mean) * scale; ``mean`` broadcasts against (C, H, W)."""
+    """(x - mean) * scale; ``mean`` broadcasts against (C, H, W). ``layer`` is whose transform_param says so, if any."""
 
     mean: np.ndarray
     scale: float
+    layer: str = ""
+
+    def __str__(self) -> str:
+        if not self.layer:
+            return "0 to 255, since no transform_param says otherwise"
+        values = self.mean.reshape(-1)
+        channels = values[:1] if np.all(values == values[0]) else values
+        told = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
+        mean = f", minus {told}" if np.any(values) else ""
+        scale = f", times {self.scale:g}" if self.scale != 1 else ""
+        return f'0 to 255{mean}{scale}, as the transform_param of layer "{self.layer}" says'
 
 
-def image_net(
-    model: str, blob: str, input_blob: str, shape: Shape | None, device: torch.device, exact: str = SMALL
-) -> tuple[Net, Scaling]:
-    """Return the part of a net that computes ``blob`` from ``input_blob``, and what its data layer does to pixels.
+class ImageNet:
+    """The part of a net that computes ``blob`` from images in ``input_blob``, and what its data layer does to pixels.
 
-    ``shape`` (N, C, H, W) of the input is read off the net where it is None: from its Input layer, or from the first
-    record of its data layer.
+    The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
+    None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning.
+    Raises SpecError for faults of the files; warns where the weights were trained on other pixels.
     """
-    net, source = parse_net(model)
-    net, source = filter_net(with_state(net, TEST), source)
-    if shape is None:
-        head, head_source = prune(net, source, [input_blob], {})
-        probe = build_net(head, head_source, BuildOptions(torch.device("meta"), seed=0))
-        shape = probe.shapes[input_blob]
-        probe.close()
-    if len(shape) != 4 or shape[1] not in (1, 3):
-        message = f'input blob "{input_blob}" has shape {tuple(shape)}, expected N x 1 or 3 x H x W for images'
-        raise SpecError(message, Where(source.file))
-    readers = [layer for layer in net.layer if layer.HasField("transform_param")]
-    body, body_source = prune(net, source, [blob], {input_blob: shape})
-    built = build_net(body, body_source, BuildOptions(device, seed=0, exact=exact))
-    if not readers:
-        log.warning("extract.py:1", f"{model} has no data layer with a transform_param: images go in as 0 to 255")
-    return built, _scaling(readers[0], shape, source.file) if readers else Scaling(np.zeros(1, np.float32), 1.0)
+
+    def __init__(
+        self,
+        model: str | Path,
+        weights: Sequence[str | Path],
+        blob: str,
+        input_blob: str,
+        device: torch.device | None = None,
+        shape: Shape | None = None,
+        zooms: Sequence[float] = (1.0,),
+        exact: str = SMALL,
+    ) -> None:
+        net, source = parse_net(model)
+        net, source = filter_net(with_state(net, TEST), source)
+        before, before_source = prune(net, source, [input_blob], {})
+        shape = shape or _shape_of(input_blob, before, before_source)
+        if len(shape) != 4 or shape[1] not in (1, 3):
+            message = f'input blob "{input_blob}" has shape {tuple(shape)}, expected N x 1 or 3 x H x W for images'
+            raise SpecError(message, Where(source.file))
+        self.blob, self.input = blob, input_blob
+        self.shape: Shape = tuple(shape[1:])
+        self.zooms = tuple(zooms)
+        transforming = [layer for layer in before.layer if layer.HasField("transform_param")]
+        self.scaling = _scaling(transforming[0], self.shape, source.file) if transforming else Scaling(np.zeros(1), 1.0)
+        after, after_source = prune(net, source, [blob], {input_blob: shape})
+        options = BuildOptions(device or torch.device("cpu"), seed=0, exact=exact)
+        self.net = build_filtered(after, after_source, options)
+        self.net.keep = [blob]
+        for path in weights:
+            load_weights(self.net, path)
+            if not transforming:
+                readers = [layer.name for layer in after.layer if input_blob in layer.bottom]
+                _warn_of_other_pixels(path, model, readers)
+
+    def __call__(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the blob (N, V D) float32, view after view, of images (H, W, 3) or (H, W), uint8, BGR, any sizes."""
+        views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
+        pixels = (np.stack(views) - self.scaling.mean) * self.scaling.scale
+        with torch.no_grad():
+            self.net(**{self.input: pixels})
+        return self.net.blobs[self.blob].reshape(len(images), -1).cpu().numpy()
 
 
-def extract_images(
-    net: Net,
-    scaling: Scaling,
-    blob: str,
-    images: ImageList,
-    batch: int = 16,
-    progress: Progress = iter,
-    zooms: Sequence[float] = (),
-) -> dict[str, np.ndarray]:
-    """Return ``features`` (N, D) float32, ``names`` (N,), ``stamps`` (N,) [s] where known, ``seconds_per_image`` ().
+def extract_images(describe: ImageNet, images: ImageList, progress: Progress = iter) -> dict[str, np.ndarray]:
+    """Return the arrays of a features.npz: features, names, seconds_per_image; stamps and zooms where there are any.
 
-    The seconds are the whole way from file to feature: reading, resizing, the net. With ``zooms`` each image has as
-    many views, all of one size for the net: for 0.7, what is in the middle 0.7 of its width and height, as a camera
-    further ahead would see it. ``features`` are then (N, V D), view after view, and ``zooms`` (V,) is there too.
+    The seconds are the whole way from file to feature: reading, resizing, the net.
     """
-    views = check_zooms(zooms)
-    (name,) = net.inputs
-    shape = net.shapes[name][1:]
-    net.keep = [blob]
     parts = []
     begin = time.perf_counter()
-    with torch.no_grad():
-        for start in progress(range(0, len(images.paths), batch)):
-            read = [_read(path, shape[0]) for path in images.paths[start : start + batch]]
-            stack = [fitted(middle(image, zoom), shape) for image in read for zoom in views]
-            net(**{name: (np.stack(stack) - scaling.mean) * scaling.scale})
-            parts.append(net.blobs[blob].reshape(len(read), -1).cpu().numpy())
+    for start in progress(range(0, len(images.paths), BATCH)):
+        parts.append(describe([_read(path, describe.shape[0]) for path in images.paths[start : start + BATCH]]))
     seconds = (time.perf_counter() - begin) / len(images.paths)
     arrays = {
         "features": np.concatenate(parts),
@@ -98,45 +121,59 @@ def extract_images(
     }
     if images.stamps is not None:
         arrays["stamps"] = images.stamps
-    if zooms:
-        arrays["zooms"] = np.array(views)
+    if describe.zooms != (1.0,):
+        arrays["zooms"] = np.array(describe.zooms)
     return arrays
 
 
-def check_zooms(zooms: Sequence[float]) -> tuple[float, ...]:
-    """Return the zooms, 1 where there are none; refuse any that is not more than 0 and at most 1."""
-    for zoom in zooms:
-        if not 0 < zoom <= 1:
-            raise SpecError(f"found zoom {zoom:g}, expected more than 0 and at most 1, the whole image")
-    return tuple(zooms) or (1.0,)
+def _shape_of(blob: str, net: NetParameter, source: SourceMap) -> Shape:
+    """Return the shape of a blob that the whole of a net computes; data is opened, memory is not used."""
+    built = build_filtered(net, source, BuildOptions(torch.device("meta"), seed=0))
+    built.close()
+    return built.shapes[blob]
 
 
-def middle(image: np.ndarray, zoom: float) -> np.ndarray:
-    """Return the middle ``zoom`` of an image's height and width; 1 is all of it."""
-    height, width = image.shape[:2]
-    top, left = round(height * (1 - zoom) / 2), round(width * (1 - zoom) / 2)
-    return image[top : max(height - top, top + 1), left : max(width - left, left + 1)]
-
-
-def _scaling(layer: Any, shape: Shape, file: str) -> Scaling:
-    """Return a transform_param's mean and scale for one image of ``shape`` (N, C, H, W).
+def _scaling(layer: LayerParameter, shape: Shape, file: str) -> Scaling:
+    """Return a transform_param's mean and scale for one image of ``shape`` (C, H, W).
 
     A pair's mean has the channels of both images: the first image's count. A mean image larger than the blob is cut at
-    its centre, as Caffe cuts it with the image in phase TEST.
+    its center, as Caffe cuts it with the image in phase TEST.
     """
-    param = layer.transform_param
-    _, channels, height, width = shape
+    param: Any = layer.transform_param
+    channels, height, width = shape
     if param.mean_file:
         mean = read_mean(param.mean_file, Where(file))[:channels]
         top, left = (mean.shape[1] - height) // 2, (mean.shape[2] - width) // 2
         if mean.shape[0] != channels or min(top, left) < 0:
-            message = f"the mean of {param.mean_file} is {mean.shape}, expected at least {tuple(shape[1:])}"
+            message = f"the mean of {param.mean_file} is {mean.shape}, expected at least {shape}"
             raise SpecError(message, Where(file))
-        return Scaling(mean[:, top : top + height, left : left + width], param.scale)
+        return Scaling(mean[:, top : top + height, left : left + width], param.scale, layer.name)
     values = np.array(param.mean_value or [0], np.float32)
     if len(values) not in (1, channels, 2 * channels):
         raise SpecError(f"found {len(values)} mean_value for images of {channels} channels", Where(file))
-    return Scaling(values[:channels, None, None], param.scale)
+    return Scaling(values[:channels, None, None], param.scale, layer.name)
+
+
+def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Sequence[str]) -> None:
+    """Warn where a .caffemodel tells of a transform_param, and the net that gets its weights scales no pixels.
+
+    ``readers`` are the layers of that net that read the input. One that the trained net lacks is taken to do what the
+    transform_param did: a Power layer in a deploy file. An HDF5 file holds no settings.
+    """
+    if h5py.is_hdf5(weights):
+        return
+    trained = read_net_binary(weights).layer
+    if not set(readers) <= {layer.name for layer in trained}:
+        return
+    for layer in trained:
+        p = layer.transform_param
+        if p.scale != 1 or p.mean_value or p.mean_file:
+            settings = " ".join(write_text(p).split())
+            log.logger.warning(
+                f"{weights} was trained with transform_param {{ {settings} }}, which {model} lacks: its images go in "
+                "as they are, 0 to 255; give the prototxt of the training as the model"
+            )
+            return
 
 
 def _read(path: Path, channels: int) -> np.ndarray:
@@ -147,7 +184,7 @@ def _read(path: Path, channels: int) -> np.ndarray:
 
 
 def fitted(image: np.ndarray, shape: Shape) -> np.ndarray:
-    """Return an image (H, W, 3) BGR or (H, W), uint8, as ``shape`` (C, H, W): resized (bilinear), in colour or grey."""
+    """Return an image (H, W, 3) BGR or (H, W), uint8, as ``shape`` (C, H, W): resized (bilinear), in color or gray."""
     channels, height, width = shape
     if channels == 3 and image.ndim == 2:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec.errors import SpecError, Where, did_you_mean
+from netspec.errors import SpecError, Where
+from netspec.graph import check_blobs
 from netspec.net.net import Net
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # tqdm's form: wraps what is counted
@@ -43,10 +44,7 @@ def extract_records(
     readers = [layer for layer in net.layers if getattr(layer, "num_records", 0)]
     if not readers:
         raise SpecError("no layer of this net reads records; give image files instead", Where(net.plan.source.file))
-    for name in blobs:
-        if name not in net.shapes:
-            known = f"{did_you_mean(name, list(net.shapes)) or ';'} it has: {', '.join(net.shapes)}"
-            raise SpecError(f'no blob "{name}" in this net{known}', Where(net.plan.source.file))
+    check_blobs(blobs, net.shapes, net.plan.source.file)
     reader = readers[0]
     batch = reader.top_shapes[0][0]
     records, first = reader.num_records, reader.iteration

@@ -6,9 +6,9 @@ a collecting function gets them all, and a result in which the faulty parts are 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
-from netspec.errors import SpecError
+from netspec.errors import SpecError, Where, did_you_mean
 
 Report = Callable[[SpecError], None]
 
@@ -16,3 +16,12 @@ Report = Callable[[SpecError], None]
 def raise_fault(fault: SpecError) -> None:
     """Raise the fault: the default of every pass."""
     raise fault
+
+
+def check_blobs(wanted: Iterable[str], known: Iterable[str], file: str) -> None:
+    """Raise SpecError for the first wanted blob that a net, read from ``file``, does not have."""
+    blobs = list(dict.fromkeys(known))
+    for name in wanted:
+        if name not in blobs:
+            hint = did_you_mean(name, blobs) or ";"
+            raise SpecError(f'no blob "{name}" in this net{hint} it has: {", ".join(blobs)}', Where(file))

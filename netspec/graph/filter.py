@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 from netspec import log
 from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
-from netspec.proto.schema import NetParameter, NetState
+from netspec.proto.schema import LayerParameter, NetParameter, NetState, NetStateRule, PhaseValue, SolverParameter
 from netspec.proto.source_map import SourceMap
 
 
-def with_state(net: Any, phase: int, level: int | None = None, stages: Iterable[str] = ()) -> Any:
-    """Return a copy of the net whose state has this phase, this level (unless None) and these stages added."""
+def in_state(net: NetParameter, *states: NetState) -> NetParameter:
+    """Return a copy of the net in the state that ``states`` give: each overrides those before it, stages add up."""
     stated = NetParameter()
     stated.CopyFrom(net)
-    stated.state.phase = phase
-    if level is not None:
-        stated.state.level = level
-    stated.state.stage.extend(stages)
+    stated.ClearField("state")
+    for state in states:
+        stated.state.MergeFrom(state)
     return stated
 
 
-def merged_state(*states: Any) -> Any:
-    """Return the NetState in which each of ``states`` overrides those before it (stages add up)."""
-    merged = NetState()
-    for state in states:
-        merged.MergeFrom(state)
-    return merged
+def with_state(
+    net: NetParameter, phase: PhaseValue, level: int | None = None, stages: Iterable[str] = ()
+) -> NetParameter:
+    """Return a copy of the net whose state has this phase, this level (unless None) and these stages added."""
+    return in_state(net, net.state, NetState(phase=phase, level=level, stage=stages))
 
 
-def filter_net(net: Any, source: SourceMap, report: Report = raise_fault) -> tuple[Any, SourceMap]:
+def with_train_state(solver: SolverParameter, level: int | None, stages: Iterable[str]) -> SolverParameter:
+    """Return a copy of the solver whose training net has this level (unless None) and these stages besides its own."""
+    stated = SolverParameter()
+    stated.CopyFrom(solver)
+    stated.train_state.MergeFrom(NetState(level=level, stage=stages))
+    return stated
+
+
+def filter_net(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> tuple[NetParameter, SourceMap]:
     """Return the net with only the layers that its ``state`` includes."""
     filtered = NetParameter()
     filtered.CopyFrom(net)
@@ -47,13 +52,13 @@ def filter_net(net: Any, source: SourceMap, report: Report = raise_fault) -> tup
     return filtered, source.with_layers(kept)
 
 
-def _included(state: Any, layer: Any) -> bool:
+def _included(state: NetState, layer: LayerParameter) -> bool:
     if layer.include:
         return any(_meets(state, rule, layer.name) for rule in layer.include)
     return not any(_meets(state, rule, layer.name) for rule in layer.exclude)
 
 
-def _meets(state: Any, rule: Any, name: str) -> bool:
+def _meets(state: NetState, rule: NetStateRule, name: str) -> bool:
     ending = f"specified by a rule in layer {name}"
     if rule.HasField("phase") and rule.phase != state.phase:
         log.info("net.cpp:296", f"The NetState phase ({state.phase}) differed from the phase ({rule.phase}) {ending}")

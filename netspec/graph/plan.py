@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
+from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 
 PERMISSIVE = 1  # caffe.proto: ParamSpec.DimCheckMode
@@ -50,7 +50,7 @@ class Plan:
     ``final[v]`` is the value that Caffe's memory holds in the end where it held ``v``: the last in-place layer's.
     """
 
-    net: Any
+    net: NetParameter
     source: SourceMap
     nodes: tuple[Node, ...]
     blobs: tuple[str, ...]
@@ -58,7 +58,7 @@ class Plan:
     final: tuple[int, ...]
 
 
-def make_plan(net: Any, source: SourceMap, report: Report = raise_fault) -> Plan:
+def make_plan(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> Plan:
     """Return the Plan of a filtered net with its splits."""
     blobs: list[str] = []
     current: dict[str, int] = {}
@@ -68,7 +68,7 @@ def make_plan(net: Any, source: SourceMap, report: Report = raise_fault) -> Plan
     nodes = []
     for i, layer in enumerate(net.layer):
 
-        def fault(message: str, *path: str | int, i: int = i, layer: Any = layer) -> None:
+        def fault(message: str, *path: str | int, i: int = i, layer: LayerParameter = layer) -> None:
             report(SpecError(message, source.at(i, *path, layer=layer.name, type=layer.type)))
 
         if layer.propagate_down and len(layer.propagate_down) != len(layer.bottom):
@@ -118,7 +118,7 @@ def _final(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
     return tuple(final)
 
 
-def _shared_multipliers(net: Any, source: SourceMap, report: Report) -> dict[str, tuple[float, float]]:
+def _shared_multipliers(net: NetParameter, source: SourceMap, report: Report) -> dict[str, tuple[float, float]]:
     """Return lr_mult and decay_mult of each parameter name: given once, or by several alike."""
     found: dict[str, dict[str, float]] = {}
     for i, layer in enumerate(net.layer):

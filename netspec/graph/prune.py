@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-from netspec.errors import SpecError, Where, did_you_mean
+from netspec.graph import check_blobs
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 
 
 def prune(
-    net: Any, source: SourceMap, wanted: Sequence[str], given: Mapping[str, Sequence[int]]
-) -> tuple[Any, SourceMap]:
+    net: NetParameter, source: SourceMap, wanted: Sequence[str], given: Mapping[str, Sequence[int]]
+) -> tuple[NetParameter, SourceMap]:
     """Return the filtered net with only the layers that ``wanted`` blobs need.
 
     The layer that first writes a blob of ``given`` (name -> shape) is replaced by an Input layer of that shape; layers
     that change it in place stay. Raises SpecError for a blob that the net does not have.
     """
-    blobs = [top for layer in net.layer for top in layer.top]
-    for name in (*wanted, *given):
-        if name not in blobs:
-            known = ", ".join(dict.fromkeys(blobs))
-            raise SpecError(
-                f'no blob "{name}" in this net{did_you_mean(name, blobs) or ";"} it has: {known}', Where(source.file)
-            )
+    check_blobs((*wanted, *given), (top for layer in net.layer for top in layer.top), source.file)
     needed = set(wanted)
     kept: list[int] = []
     for i in reversed(range(len(net.layer))):

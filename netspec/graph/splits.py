@@ -7,7 +7,6 @@ A blob with an explicit loss_weight counts that as one use, and the first of its
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
 
 from netspec.errors import SpecError, did_you_mean
 from netspec.graph import Report, raise_fault
@@ -17,7 +16,7 @@ from netspec.proto.source_map import SourceMap
 Top = tuple[int, int]  # layer index, top index
 
 
-def insert_splits(net: Any, source: SourceMap, report: Report = raise_fault) -> tuple[Any, SourceMap]:
+def insert_splits(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> tuple[NetParameter, SourceMap]:
     """Return the net with Split layers inserted."""
     producer, uses, weights = _count_uses(net, source, report)
     split = NetParameter()
@@ -55,7 +54,7 @@ def _blob_name(layer: str, blob: str, top: int, copy: int) -> str:
 
 
 def _count_uses(
-    net: Any, source: SourceMap, report: Report
+    net: NetParameter, source: SourceMap, report: Report
 ) -> tuple[dict[tuple[int, int], Top], Counter[Top], dict[Top, float]]:
     """Return which top each bottom reads, how often each top is used, and the tops' explicit loss weights."""
     latest: dict[str, Top] = {}

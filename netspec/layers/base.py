@@ -2,12 +2,16 @@
 
 A layer is complete when its constructor returns: its learnable blobs exist and are filled, and ``top_shapes`` says,
 by integer arithmetic alone, what ``forward`` will return.
+
+A new layer, a dialect's too, needs ``setup`` (where it has anything to read or learn), ``reshape`` and ``forward``.
+``construct``, and ``ReadingLayer.open``, exist only so that a line of the log stands where Caffe's does: Caffe opens a
+database in a layer's constructor, before it logs the layer's bottoms and tops, and reads its first record after that.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -16,8 +20,11 @@ import torch
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL, switch
+from netspec.graph import Report, raise_fault
 from netspec.layers import fillers
 from netspec.proto.schema import TEST
+
+MOST = 2**31 - 1  # numbers that a blob of Caffe's can hold (Blob::Reshape)
 
 
 def shape_string(shape: Sequence[int]) -> str:
@@ -52,17 +59,21 @@ def _nowhere(*path: str | int) -> Where:
 class Context:
     """What a layer may know of the net around it.
 
-    ``at(*path)`` is the place in the prototxt of a field of this layer. ``device`` is where blobs are made; on
-    ``meta`` they have shapes and no values. Where ``open_data`` is false, a layer that reads files must not: its tops'
+    ``at(*path)`` is the place in the prototxt of a field of this layer; ``report`` gets the faults after which building
+    can go on (the default raises the first). ``device`` is where blobs are made; on ``meta`` they have shapes and no
+    values, and no file is written. Where ``open_data`` is false, a layer that reads files must not: its tops'
     shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``. Of ``ranks`` nets
-    that train side by side the layer's net is number ``rank``. ``exact`` says which sums are to be Caffe's to the last
-    bit (netspec/exact); with ``accumulate_in_place``, layers that sum up their parameters' gradients themselves add
-    them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
+    that train side by side the layer's net is number ``rank``. ``random`` is this net's own; from ``data_seed``, which
+    is the same for all ranks, follow the draws of the layers that read records. ``exact`` says which sums are to be
+    Caffe's to the last bit (netspec/exact); with ``accumulate_in_place``, layers that sum up their parameters'
+    gradients themselves add them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
     """
 
     phase: int = TEST
     random: Random = field(default_factory=lambda: Random(0))
+    data_seed: int = 0
     at: Callable[..., Where] = _nowhere
+    report: Report = raise_fault
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     open_data: bool = True
     given_shapes: Mapping[str, Shape] = field(default_factory=dict)
@@ -109,7 +120,7 @@ class Layer(torch.nn.Module):
         self.blob_shapes: list[Shape] = []
         self.construct()
         self.context.created()
-        self._check_counts()
+        self.refuse(self._wrong_counts())
         self.setup()
         self.top_shapes: list[Shape] = [self.possible(s) for s in self.reshape(self.bottom_shapes)]
 
@@ -163,17 +174,23 @@ class Layer(torch.nn.Module):
         """Reshape for bottoms of these shapes, if they are others than before."""
         if bottom_shapes != self.bottom_shapes:
             self.bottom_shapes = bottom_shapes
-            self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
+            try:
+                self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
+            except SpecError:
+                self.bottom_shapes = []  # whatever comes next is checked again
+                raise
 
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
         """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""
         data = torch.full(self.possible(shape), value, device=self.context.device)
-        if filler is not None and data.device.type != "meta":
+        if filler is not None:
             try:
-                filled = fillers.fill(filler, tuple(shape), self.context.random.on("cpu"))
+                if data.is_meta:
+                    fillers.check(filler, tuple(shape))
+                else:
+                    data.copy_(fillers.fill(filler, tuple(shape), self.context.random.on("cpu")))
             except ValueError as fault:
-                raise self.error(str(fault)) from None
-            data.copy_(filled)
+                self.context.report(self.error(str(fault), *self._path_to(filler)))
         self.blobs.append(torch.nn.Parameter(data))
         self.blob_shapes.append(tuple(shape))
 
@@ -183,10 +200,20 @@ class Layer(torch.nn.Module):
         return tensor if tensor.shape == self.blob_shapes[index] else tensor.view(self.blob_shapes[index])
 
     def possible(self, shape: Sequence[int]) -> Shape:
-        """Return a shape as a tuple; refuse one with a negative size."""
+        """Return a shape as a tuple; refuse one with a negative size, or of more numbers than Caffe can count."""
         if min(shape, default=0) < 0:
             raise self.error(f"found shape {tuple(shape)}, expected no size below 0")
+        if math.prod(shape) > MOST:
+            raise self.error(f"found shape {tuple(shape)}, {math.prod(shape):,} numbers, expected at most {MOST:,}")
         return tuple(shape)
+
+    def refuse(self, faults: Iterable[SpecError]) -> None:
+        """Report all of these faults; where there is any, the layer is not built."""
+        found = list(faults)
+        for fault in found[:-1]:
+            self.context.report(fault)
+        if found:
+            raise found[-1]
 
     def error(self, message: str, *path: str | int) -> SpecError:
         """Return a SpecError at a field of this layer, e.g. ``self.error("...", "pooling_param", "kernel_size")``."""
@@ -198,7 +225,19 @@ class Layer(torch.nn.Module):
             raise self.error(f"axis {axis} is out of range for a blob of {len(shape)} axes, shape {shape}", *path)
         return axis % len(shape)
 
-    def _check_counts(self) -> None:
+    def missing_input(self) -> SpecError | None:
+        """Return what keeps a solver from running the layer, where it has data that a program must give it first."""
+        return None
+
+    def _path_to(self, message: Any) -> tuple[str, ...]:
+        """Return where one of the layer's fields has this message: ``("convolution_param", "weight_filler")``."""
+        for outer, settings in self.param.ListFields():
+            for inner, value in settings.ListFields() if hasattr(settings, "ListFields") else ():
+                if value is message:
+                    return outer.name, inner.name
+        return ()
+
+    def _wrong_counts(self) -> Iterator[SpecError]:
         for found, (least, most), what in (
             (len(self.bottom_shapes), self.bottoms, "bottom"),
             (self.num_tops, self.tops, "top"),
@@ -208,9 +247,9 @@ class Layer(torch.nn.Module):
                     wanted = f"at least {least}"
                 else:
                     wanted = str(least) if least == most else f"{least} to {most}"
-                raise self.error(f"found {found} {what} blob(s), expected {wanted}", what)
+                yield self.error(f"found {found} {what} blob(s), expected {wanted}", what)
         if self.same_tops and self.num_tops != len(self.bottom_shapes):
-            raise self.error(
+            yield self.error(
                 f"found {self.num_tops} top blob(s) for {len(self.bottom_shapes)} bottom blob(s), expected as many",
                 "top",
             )

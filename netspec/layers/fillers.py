@@ -20,9 +20,15 @@ FAN_IN, FAN_OUT, AVERAGE = 0, 1, 2  # caffe.proto: enum FillerParameter.Variance
 def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
     """Return a float32 CPU tensor of ``shape``, filled as ``filler`` (a FillerParameter) says.
 
-    Raises ValueError, in one plain sentence, for a filler that Caffe would refuse. The distributions are Caffe's; the
-    numbers drawn are not, since its random generator belongs to the version of boost it was built with.
+    Raises ValueError as :func:`check`. The distributions are Caffe's; the numbers drawn are not, since its random
+    generator belongs to the version of boost it was built with.
     """
+    check(filler, shape)
+    return _FILLERS[filler.type](filler, shape, generator)
+
+
+def check(filler: Any, shape: Shape) -> None:
+    """Raise ValueError, in one plain sentence, for a filler that Caffe would refuse for a blob of this shape."""
     if filler.type not in _FILLERS:
         known = sorted(_FILLERS)
         raise ValueError(
@@ -32,7 +38,39 @@ def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
         raise ValueError(f"cannot fill an empty blob of shape {shape}")
     if filler.sparse != -1 and filler.type != "gaussian":
         raise ValueError(f'filler "{filler.type}" knows no sparse (found {filler.sparse}); only "gaussian" does')
-    return _FILLERS[filler.type](filler, shape, generator)
+    if filler.type in _NEED_AN_AXIS and not shape:
+        raise ValueError(f'filler "{filler.type}" needs a blob of at least one axis, found a scalar')
+    if filler.type in _CHECKS:
+        _CHECKS[filler.type](filler, shape)
+
+
+def _check_uniform(filler: Any, shape: Shape) -> None:
+    if not filler.min <= filler.max:
+        raise ValueError(f'filler "uniform" needs min <= max, found min {filler.min:g} and max {filler.max:g}')
+
+
+def _check_gaussian(filler: Any, shape: Shape) -> None:
+    if not filler.std > 0:
+        raise ValueError(f'filler "gaussian" needs std > 0, found {filler.std:g}')
+    if filler.sparse < -1:
+        raise ValueError(f'filler "gaussian" needs sparse >= 0 (or -1 for none), found {filler.sparse}')
+    if filler.sparse >= 0 and not shape:
+        raise ValueError('filler "gaussian" needs a blob of at least one axis for sparse, found a scalar')
+    if shape and filler.sparse > shape[0]:
+        raise ValueError(f'filler "gaussian" needs sparse <= shape[0] = {shape[0]}, found {filler.sparse}')
+
+
+def _check_bilinear(filler: Any, shape: Shape) -> None:
+    if len(shape) != 4 or shape[2] != shape[3]:
+        raise ValueError(f'filler "bilinear" needs a 4-D blob with square filters, found shape {shape}')
+
+
+_CHECKS: dict[str, Callable[[Any, Shape], None]] = {
+    "uniform": _check_uniform,
+    "gaussian": _check_gaussian,
+    "bilinear": _check_bilinear,
+}
+_NEED_AN_AXIS = ("positive_unitball", "xavier", "msra")
 
 
 def _constant(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
@@ -40,28 +78,19 @@ def _constant(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Te
 
 
 def _uniform(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    if not filler.min <= filler.max:
-        raise ValueError(f'filler "uniform" needs min <= max, found min {filler.min:g} and max {filler.max:g}')
     return _draw_uniform(shape, filler.min, filler.max, generator)
 
 
 def _gaussian(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    if not filler.std > 0:
-        raise ValueError(f'filler "gaussian" needs std > 0, found {filler.std:g}')
-    if filler.sparse < -1:
-        raise ValueError(f'filler "gaussian" needs sparse >= 0 (or -1 for none), found {filler.sparse}')
     values = _draw_normal(shape, filler.mean, filler.std, generator)
     if filler.sparse >= 0:
         # On average `sparse` of the weights of one input stay: the probability is a share of the outputs, shape[0].
-        outputs = _first_axis(filler, shape)
-        if filler.sparse > outputs:
-            raise ValueError(f'filler "gaussian" needs sparse <= shape[0] = {outputs}, found {filler.sparse}')
-        values *= torch.empty_like(values).bernoulli_(filler.sparse / outputs, generator=generator)
+        values *= torch.empty_like(values).bernoulli_(filler.sparse / shape[0], generator=generator)
     return values
 
 
 def _positive_unitball(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    rows = _draw_uniform(shape, 0.0, 1.0, generator).view(_first_axis(filler, shape), -1)
+    rows = _draw_uniform(shape, 0.0, 1.0, generator).view(shape[0], -1)
     return (rows / rows.sum(dim=1, keepdim=True)).view(shape)
 
 
@@ -75,8 +104,6 @@ def _msra(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor
 
 
 def _bilinear(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    if len(shape) != 4 or shape[2] != shape[3]:
-        raise ValueError(f'filler "bilinear" needs a 4-D blob with square filters, found shape {shape}')
     width = shape[3]
     factor = (width + 1) // 2
     centre = (width - 1) / (2.0 * factor)
@@ -105,19 +132,13 @@ READS: dict[str, tuple[str, ...]] = {
 }
 
 
-def _first_axis(filler: Any, shape: Shape) -> int:
-    if not shape:
-        raise ValueError(f'filler "{filler.type}" needs a blob of at least one axis, found a scalar')
-    return shape[0]
-
-
 def _fan(filler: Any, shape: Shape) -> float:
     """Return the count that the variance is divided by: Caffe's fans are counts of the blob, not of the layer.
 
     So fan_out is ``num_output`` for an InnerProduct, and wrong by the factor ``group`` for a grouped convolution.
     """
     count = math.prod(shape)
-    fan_in = count // _first_axis(filler, shape)
+    fan_in = count // shape[0]
     fan_out = count // shape[1] if len(shape) > 1 else count
     return {FAN_IN: fan_in, FAN_OUT: fan_out, AVERAGE: (fan_in + fan_out) / 2}[filler.variance_norm]
 

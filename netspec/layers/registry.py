@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
+from netspec.errors import did_you_mean
 from netspec.layers.base import Layer
+from netspec.proto.dialect.files import announce_known
+from netspec.proto.dialect.registry import advice_for_type
 
 _LAYERS: dict[str, type[Layer]] = {}
 L = TypeVar("L", bound=type[Layer])
@@ -37,3 +40,11 @@ def layer_class(type_name: str) -> type[Layer] | None:
 def layer_types() -> list[str]:
     """Return all registered types, in alphabetical order."""
     return sorted(_LAYERS)
+
+
+def unknown_type(type_name: str) -> str:
+    """Return the sentence that says that a type is unknown, and what may be meant or which dialect has it."""
+    announce_known()
+    advice = advice_for_type(type_name)
+    hint = f"; {advice}" if advice else did_you_mean(type_name, layer_types())
+    return f'unknown layer type "{type_name}"{hint or "; `netspec layers` lists the known ones"}'

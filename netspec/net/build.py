@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -20,7 +19,7 @@ from netspec.graph.splits import insert_splits
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.weights import copy_weights, load_weights
-from netspec.proto.schema import PHASES, NetParameter
+from netspec.proto.schema import PHASES, NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 
@@ -42,7 +41,7 @@ def load_net(
     Raises SpecError for every fault of the files.
     """
     net, source = parse_net(path)
-    number = PHASES[phase] if isinstance(phase, str) else phase
+    number = PHASES[phase] if isinstance(phase, str) else PhaseValue(phase)
     options = BuildOptions(torch.device(device), seed, allow_python=allow_python, exact=exact)
     built = build_net(with_state(net, number, level, stages), source, options)
     if weights is not None:
@@ -50,15 +49,19 @@ def load_net(
     return built
 
 
-def build_net(net: Any, source: SourceMap, options: BuildOptions | None = None) -> Net:
+def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
     """Filter by the net's own ``state``, insert splits, plan, and build."""
     options = options or BuildOptions()
-    filtered, source = filter_net(net, source, options.report)
+    return build_filtered(*filter_net(net, source, options.report), options)
+
+
+def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
+    """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
         log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source, options.report)
     built = Net(make_plan(split, source, options.report), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
     if written.layer:  # weights in the prototxt itself
-        copy_weights(built, written, source.file)
+        copy_weights(built, written, source.file, options.report)
     return built

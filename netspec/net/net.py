@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,18 +16,18 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.errors import SpecError, Where, did_you_mean
+from netspec.errors import SpecError, Where
 from netspec.exact.sums import RowSums
 from netspec.exact.switch import applies
+from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
-from netspec.layers import layer_class, layer_types
+from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
 from netspec.net.options import BuildOptions
-from netspec.proto.dialect.files import announce_known
-from netspec.proto.dialect.registry import advice_for_type
-from netspec.proto.schema import NetParameter
+from netspec.net.table import table
+from netspec.proto.schema import PHASE_NAMES, NetParameter
 
 Array = np.ndarray | torch.Tensor
 
@@ -60,7 +60,7 @@ class Net(torch.nn.Module):
         self.param = NetParameter()
         self.param.CopyFrom(plan.net)
         self.name: str = plan.net.name
-        self.phase: int = plan.net.state.phase
+        self.phase = plan.net.state.phase
         self.device = options.device
         self._exact = options.exact
         self.keep: str | Iterable[str] = ()
@@ -91,14 +91,16 @@ class Net(torch.nn.Module):
             log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
             cls = layer_class(node.type)
             if cls is None:
-                options.report(SpecError(_unknown_type(node.type), at("type")))
+                options.report(SpecError(unknown_type(node.type), at("type")))
                 continue
             if any(v not in shapes for v in node.bottoms):
                 continue  # for a fault upstream, which was reported
             context = Context(
                 phase=self.phase,
                 random=self.random,
+                data_seed=self.random.seed if options.data_seed is None else options.data_seed,
                 at=at,
+                report=options.report,
                 device=options.device,
                 open_data=options.open_data,
                 given_shapes=options.given_shapes or {},
@@ -111,10 +113,10 @@ class Net(torch.nn.Module):
             )
             try:
                 layer = cls(param, [shapes[v] for v in node.bottoms], context)
-                weights = _loss_weights(layer)
             except SpecError as fault:
                 options.report(fault)
                 continue
+            weights = _loss_weights(layer, options.report)
             layers[i] = layer
             self.loss_weights.append(weights)
             for v, shape in zip(node.tops, layer.top_shapes, strict=False):
@@ -127,15 +129,12 @@ class Net(torch.nn.Module):
                 if weight:
                     log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
             log.info("net.cpp:139", f"Memory required for data: {memory}")
-            try:
-                self._adopt_params(layers, i, layer)
-            except SpecError as fault:
-                options.report(fault)
+            self._adopt_params(layers, i, layer, options.report)
         if len(layers) == len(self.plan.nodes):
             self._finish(list(layers.values()))
         return torch.nn.ModuleList(layers.values())
 
-    def _log_wiring(self, node: Any) -> None:
+    def _log_wiring(self, node: Node) -> None:
         log.info("net.cpp:86", f"Creating Layer {node.name}")
         for v in node.bottoms:
             log.info("net.cpp:408", f"{node.name} <- {self.plan.blobs[v]}")
@@ -145,12 +144,12 @@ class Net(torch.nn.Module):
             else:
                 log.info("net.cpp:382", f"{node.name} -> {self.plan.blobs[v]}")
 
-    def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer) -> None:
+    def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer, report: Report) -> None:
         """Tie the shared parameters of layer ``i`` to their owners; list the others as learnable."""
         node = self.plan.nodes[i]
         if len(node.params) > len(layer.blobs):
-            message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one a learnable blob"
-            raise layer.error(message, "param", len(layer.blobs))
+            message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one per blob"
+            report(layer.error(message, "param", len(layer.blobs)))
         for j in range(len(layer.blobs)):
             spec = _spec(node, layer, j)
             if spec.owner is None:
@@ -162,17 +161,19 @@ class Net(torch.nn.Module):
             if owner_index not in layers:
                 continue  # for a fault of the owner, which was reported
             owner = layers[owner_index]
+            if owner_blob >= len(owner.blobs):
+                continue  # the owner has too many param { }, which was reported
             here, there = layer.blob_shapes[j], owner.blob_shapes[owner_blob]
             owner_name = self.plan.nodes[owner_index].name
             fits = math.prod(here) == math.prod(there) if spec.permissive else here == there
             if not fits:
                 rule = "equal counts" if spec.permissive else "equal shapes (share_mode: STRICT)"
-                raise layer.error(
+                message = (
                     f'cannot share param "{spec.name}" owned by layer "{owner_name}", param index {owner_blob}: '
-                    f"found shape {shape_string(here)} here and {shape_string(there)} there, expected {rule}",
-                    "param",
-                    j,
+                    f"found shape {shape_string(here)} here and {shape_string(there)} there, expected {rule}"
                 )
+                report(layer.error(message, "param", j))
+                continue
             layer.blobs[j] = owner.blobs[owner_blob]
             place = f"owned by layer '{owner_name}', param index {owner_blob}"
             log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {place}")
@@ -194,6 +195,10 @@ class Net(torch.nn.Module):
         log.info("net.cpp:257", "Network initialization done.")
         for line in unused_fields(self.plan, layers):
             log.warning("net.cpp:257", line)
+
+    def __repr__(self) -> str:
+        """Return the net as a table of its layers."""
+        return f"{self.name or 'a net without a name'}, phase {PHASE_NAMES[self.phase]}\n{table(self)}"
 
     # Running
 
@@ -269,9 +274,7 @@ class Net(torch.nn.Module):
         if self.keep == "all":
             return set(current.values())
         names = [self.keep] if isinstance(self.keep, str) else list(self.keep)
-        for name in names:
-            if name not in current:
-                raise ValueError(f"no blob {name!r} in this net{did_you_mean(name, list(current))}")
+        check_blobs(names, current, self.plan.source.file)
         return set(self.plan.outputs.values()) | {current[name] for name in names}
 
     # Parameters and data
@@ -295,19 +298,29 @@ class Net(torch.nn.Module):
         }
         return {name: weights[v] for name, v in self.plan.outputs.items()}
 
-    def share_weights_with(self, other: Net) -> None:
-        """Use the learnable blobs of ``other``, layer by layer of equal name (Caffe: ShareTrainedLayersWith)."""
-        mine = {node.name: layer for node, layer in zip(self.plan.nodes, self.layers, strict=True)}
-        for node, theirs in zip(other.plan.nodes, other.layers, strict=True):
-            layer = mine.get(node.name)
+    def share_weights_with(self, other: Net, report: Report = raise_fault) -> None:
+        """Use the learnable blobs of ``other``, layer by layer of equal name (Caffe: ShareTrainedLayersWith).
+
+        ``report`` gets a SpecError for each layer whose blobs have other shapes there.
+        """
+        mine = {layer.param.name: layer for layer in self.layers}
+        for theirs in other.layers:
+            layer = mine.get(theirs.param.name)
             if layer is None:
                 continue
             shapes = (layer.blob_shapes, theirs.blob_shapes)
             if shapes[0] != shapes[1]:
                 message = f"cannot share weights with the training net: blobs {shapes[0]} here, {shapes[1]} there"
-                raise layer.error(message)
+                report(layer.error(message))
+                continue
             for j, blob in enumerate(theirs.blobs):
                 layer.blobs[j] = blob
+
+    def missing_inputs(self) -> Iterator[SpecError]:
+        """Yield what keeps a solver, which gives its nets no inputs, from running this one."""
+        for layer in self.layers:
+            if fault := layer.missing_input():
+                yield fault
 
     def restart_data(self) -> None:
         """Make every layer that reads records begin at its first one again."""
@@ -320,7 +333,7 @@ class Net(torch.nn.Module):
             layer.close()
 
 
-def _tops(plan: Plan, node: Any) -> list[str]:
+def _tops(plan: Plan, node: Node) -> list[str]:
     return [plan.blobs[v] for v in node.tops]
 
 
@@ -342,19 +355,12 @@ def _last_uses(plan: Plan) -> list[list[int]]:
     return ends
 
 
-def _loss_weights(layer: Layer) -> list[float]:
+def _loss_weights(layer: Layer, report: Report) -> list[float]:
     """Return the loss weight of each top (Caffe: Layer::SetLossWeights, LossLayer::LayerSetUp)."""
     given = list(layer.param.loss_weight)
     if given:
-        if len(given) != layer.num_tops:
-            message = f"found {len(given)} loss_weight, expected none or one a top blob ({layer.num_tops})"
-            raise layer.error(message, "loss_weight")
-        return given
+        if len(given) == layer.num_tops:
+            return given
+        message = f"found {len(given)} loss_weight, expected none or one per top blob ({layer.num_tops})"
+        report(layer.error(message, "loss_weight"))
     return [1.0 if layer.is_loss and j == 0 else 0.0 for j in range(layer.num_tops)]
-
-
-def _unknown_type(name: str) -> str:
-    announce_known()
-    fork = advice_for_type(name)
-    advice = f"; {fork}" if fork else did_you_mean(name, layer_types()) or "; `netspec layers` lists the known ones"
-    return f'unknown layer type "{name}"{advice}'

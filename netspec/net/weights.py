@@ -5,7 +5,8 @@ Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import torch
 from netspec import log
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
+from netspec.graph import Report, raise_fault
 from netspec.layers.base import shape_string
 from netspec.net.net import Net
 from netspec.proto.binary import read_net_binary
@@ -25,28 +27,37 @@ from netspec.whole_file import whole_file
 Copies = list[tuple[torch.Tensor, np.ndarray]]
 
 
-def load_weights(net: Net, path: str | Path) -> None:
+def load_weights(net: Net, path: str | Path, *, report: Report = raise_fault) -> None:
     """Copy the weights of a .caffemodel or .caffemodel.h5 into the layers of the same names, all or none.
 
     Layers that only the file has are ignored, and named in the log; layers that only the net has stay as they are.
-    Raises SpecError for a file that cannot be read, and for blobs of other number or shape than the net's.
+    ``report`` gets a SpecError for a file that cannot be read, and for blobs of other number or shape than the net's.
     """
     path = Path(path)
-    if h5py.is_hdf5(path):
-        _copy(_from_hdf5(net, path))
-    else:
-        copy_weights(net, read_net_binary(path), path)
+    try:
+        if h5py.is_hdf5(path):
+            _copy(partial(_from_hdf5, net, path), report)
+        else:
+            copy_weights(net, read_net_binary(path), path, report)
+    except SpecError as fault:
+        report(fault)
 
 
-def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
+def copy_weights(net: Net, message: NetParameter, path: str | Path, report: Report = raise_fault) -> None:
     """Copy the weights in a message, read from ``path``, as :func:`load_weights` copies a file's."""
-    _copy(_from_message(net, message, Path(path)))
+    _copy(partial(_from_message, net, message, Path(path)), report)
 
 
-def _copy(copies: Copies) -> None:
+def _copy(find: Callable[[Report], Copies], report: Report) -> None:
+    """Copy what is found where nothing is wrong with any of it; on meta there is nothing to copy to."""
+    faults: list[SpecError] = []
+    copies = find(faults.append)
+    for fault in faults:
+        report(fault)
     with torch.no_grad():
-        for blob, values in copies:
-            blob.copy_(torch.tensor(values).view(blob.shape))
+        for blob, values in copies if not faults else ():
+            if not blob.is_meta:
+                blob.copy_(torch.tensor(values).view(blob.shape))
 
 
 def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
@@ -87,7 +98,7 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
 # Binary
 
 
-def _from_message(net: Net, message: Any, path: Path) -> Copies:
+def _from_message(net: Net, message: Any, path: Path, report: Report) -> Copies:
     targets = _layers_by_name(net)
     copies: Copies = []
     for source in message.layer:
@@ -96,25 +107,27 @@ def _from_message(net: Net, message: Any, path: Path) -> Copies:
             _ignore(source.name)
             continue
         if len(source.blobs) != len(target.blobs):
-            raise _wrong_count(path, source.name, len(source.blobs), len(target.blobs))
+            report(_wrong_count(path, source.name, len(source.blobs), len(target.blobs)))
+            continue
         for j, blob in enumerate(source.blobs):
             if not blobs.fits(blob, target.blob_shapes[j]):
-                raise _wrong_shape(path, source.name, j, blobs.shape_of(blob), target.blob_shapes[j])
+                report(_wrong_shape(path, source.name, j, blobs.shape_of(blob), target.blob_shapes[j]))
+                continue
             try:
                 copies.append((target.blob(j), blobs.to_array(blob)))
             except ValueError as fault:
-                raise SpecError(f'layer "{source.name}", blob {j}: {fault}', Where(str(path))) from None
+                report(SpecError(f'layer "{source.name}", blob {j}: {fault}', Where(str(path))))
     return copies
 
 
 # HDF5: /data/<layer>/<i>, and /diff/<layer>/<i>
 
 
-def _from_hdf5(net: Net, path: Path) -> Copies:
+def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
     targets = _layers_by_name(net)
     shared = _shared(net)
     copies: Copies = []
-    with h5py.File(path, "r") as file:
+    with _opened(path) as file:
         data = file.get("data")
         if not isinstance(data, h5py.Group):
             raise SpecError("these are not weights: the HDF5 file has no group /data", Where(str(path)))
@@ -124,17 +137,27 @@ def _from_hdf5(net: Net, path: Path) -> Copies:
                 _ignore(name)
                 continue
             if len(arrays) > len(target.blobs):
-                raise _wrong_count(path, name, len(arrays), len(target.blobs))
+                report(_wrong_count(path, name, len(arrays), len(target.blobs)))
+                continue
             for j in range(len(target.blobs)):
                 array = arrays.get(str(j))
                 if array is None:
                     if (name, j) in shared:
                         continue
-                    raise _wrong_count(path, name, len(arrays), len(target.blobs))
+                    report(_wrong_count(path, name, len(arrays), len(target.blobs)))
+                    break
                 if array.shape != target.blob_shapes[j]:
-                    raise _wrong_shape(path, name, j, array.shape, target.blob_shapes[j])
+                    report(_wrong_shape(path, name, j, array.shape, target.blob_shapes[j]))
+                    continue
                 copies.append((target.blob(j), array[()]))
     return copies
+
+
+def _opened(path: Path) -> h5py.File:
+    try:
+        return h5py.File(path, "r")
+    except OSError as fault:  # it begins as HDF5 files do
+        raise SpecError(f"cannot be read: {fault}", Where(str(path))) from None
 
 
 def _layer_groups(data: h5py.Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:

@@ -1,7 +1,8 @@
 """Protobuf's text format into a message, by reflection, with the place of everything that was read.
 
 What is accepted is what the C++ parser accepts that Caffe uses, so that a file which Caffe reads is read here, and one
-that it refuses is refused, in one line that says where and why.
+that it refuses is refused, in one line that says where and why. One word more belongs to the language: the
+``ceil_mode: true`` of a pooling_param, which so many forks write for ``round_mode: CEIL`` that no dialect need be on.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ _BOOLEANS = {"true": True, "True": True, "t": True, "false": False, "False": Fal
 _V1_TYPES = V1LayerParameter.LayerType.keys()
 _LAYERS = ("caffe.LayerParameter", "caffe.V1LayerParameter")
 
-# The commonest field that forks have and Caffe has not: the rounding of a pooled extent as a bool.
 _ALIASES = {("caffe.PoolingParameter", "ceil_mode"): ("round_mode", {True: "CEIL", False: "FLOOR"})}
 
 # What else a file may be, if a field is unknown in its outermost message.

@@ -2,10 +2,8 @@
 
 The pool is private: another "caffe.proto" in the process (pycaffe's, a converter's) does not clash with this one, and
 no generated module ties netspec to one version of protobuf. ``caffe.desc`` is ``caffe.proto`` compiled; how, is said
-there.
+there; ``caffe_pb2.pyi`` is made with it and tells type checkers the fields.
 """
-
-# ruff: noqa: D101 (the messages are described in caffe.proto)
 
 from __future__ import annotations
 
@@ -17,9 +15,6 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
 PACKAGE = "caffe"
-TRAIN, TEST = 0, 1  # enum Phase
-PHASES = {"TRAIN": TRAIN, "TEST": TEST}
-PHASE_NAMES = ("TRAIN", "TEST")
 _LAST_NUMBER = 1 << 29  # field numbers end before this
 
 #: The pool; :mod:`netspec.proto.dialect.registry` adds the messages and fields of forks to it.
@@ -64,47 +59,31 @@ def message(name: str) -> type[CaffeMessage]:
 
 
 if TYPE_CHECKING:
+    from netspec.proto.caffe_pb2 import (
+        BlobProto,
+        BlobProtoVector,
+        BlobShape,
+        Datum,
+        FillerParameter,
+        LayerParameter,
+        NetParameter,
+        NetState,
+        NetStateRule,
+        ParamSpec,
+        Phase,
+        SolverParameter,
+        SolverState,
+        TransformationParameter,
+        V0LayerParameter,
+        V1LayerParameter,
+    )
 
-    class _AnyAttribute(type):
-        def __getattr__(cls, name: str) -> Any: ...
-
-    class CaffeMessage(Message, metaclass=_AnyAttribute):
-        """What a type checker may know of a message: its fields and enums exist at run time only."""
-
-        def __init__(self, **fields: Any) -> None: ...
-        def __getattr__(self, name: str) -> Any: ...
-        def __setattr__(self, name: str, value: Any) -> None: ...
-
-    class BlobShape(CaffeMessage): ...
-
-    class BlobProto(CaffeMessage): ...
-
-    class BlobProtoVector(CaffeMessage): ...
-
-    class Datum(CaffeMessage): ...
-
-    class FillerParameter(CaffeMessage): ...
-
-    class NetParameter(CaffeMessage): ...
-
-    class SolverParameter(CaffeMessage): ...
-
-    class SolverState(CaffeMessage): ...
-
-    class NetState(CaffeMessage): ...
-
-    class NetStateRule(CaffeMessage): ...
-
-    class ParamSpec(CaffeMessage): ...
-
-    class LayerParameter(CaffeMessage): ...
-
-    class V1LayerParameter(CaffeMessage): ...
-
-    class TransformationParameter(CaffeMessage): ...
+    CaffeMessage = Any  # a message of any kind, its fields and enums included
+    PhaseValue = Phase.ValueType
 
 else:
     CaffeMessage = Message
+    PhaseValue = int
     BlobShape = message("BlobShape")
     BlobProto = message("BlobProto")
     BlobProtoVector = message("BlobProtoVector")
@@ -117,8 +96,13 @@ else:
     NetStateRule = message("NetStateRule")
     ParamSpec = message("ParamSpec")
     LayerParameter = message("LayerParameter")
+    V0LayerParameter = message("V0LayerParameter")
     V1LayerParameter = message("V1LayerParameter")
     TransformationParameter = message("TransformationParameter")
+
+TRAIN, TEST = PhaseValue(0), PhaseValue(1)  # enum Phase
+PHASES = {"TRAIN": TRAIN, "TEST": TEST}
+PHASE_NAMES = ("TRAIN", "TEST")
 
 
 @dataclass(frozen=True)

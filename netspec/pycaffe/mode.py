@@ -73,6 +73,12 @@ def next_seed() -> int | None:
     return _mode.seed + _mode.nets - 1
 
 
+def solver_seed() -> int | None:
+    """Return the seed of the next solver: processes side by side must draw the order of their records alike."""
+    seed = next_seed()
+    return 0 if seed is None and multiprocess() else seed
+
+
 def follow_seed(random: Random) -> None:
     """Make a net's draws begin anew when a seed is set."""
     _mode.draws.add(random)

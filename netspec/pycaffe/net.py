@@ -21,6 +21,7 @@ from netspec.layers.utility.python import Python
 from netspec.net import net as core
 from netspec.net.build import build_net
 from netspec.net.weights import load_weights, write_binary, write_hdf5
+from netspec.proto.schema import PhaseValue
 from netspec.proto.text import parse_net
 from netspec.pycaffe import mode
 from netspec.pycaffe.errors import original_errors
@@ -65,7 +66,9 @@ class Net:
                 raise RuntimeError(f"Could not open file {path}")
         with original_errors():
             net, source = parse_net(network_file)
-            self._hold(build_net(with_state(net, int(phase), level or 0, stages or ()), source, mode.build_options()))
+            self._hold(
+                build_net(with_state(net, PhaseValue(phase), level or 0, stages or ()), source, mode.build_options())
+            )
         if weights is not None:
             self.copy_from(weights)
 

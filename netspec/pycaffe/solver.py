@@ -6,6 +6,7 @@ Caffe: python/caffe/_caffe.cpp, src/caffe/solver.cpp
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,10 +16,12 @@ from netspec import log
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
 from netspec.pycaffe import mode
+from netspec.pycaffe.debug import debug_info
 from netspec.pycaffe.errors import original_errors
 from netspec.pycaffe.net import Net
 from netspec.solver import solver as core_solver
-from netspec.solver.update import find_rule
+from netspec.solver.nets import TRAIN_NET
+from netspec.solver.update import rule_faults
 
 Outputs = dict[str, torch.Tensor]
 
@@ -30,10 +33,14 @@ class _Training(core_solver.Solver):
         super().__init__(*arguments, **options)
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
 
-    def _build(self, described: Any, offset: int, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
-        if offset == 0 and mode.multiprocess():
+    def _build(self, described: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
+        if role == TRAIN_NET and mode.multiprocess():
             rank, ranks = mode.solver_rank(), mode.solver_count()
-        return super()._build(described, offset, device, rank, ranks)
+            role = f"rank {rank}" if rank else role
+        return super()._build(described, role, device, rank, ranks)
+
+    def check_inputs(self) -> None:
+        """Do nothing: a net's inputs are what its input blobs hold."""
 
     def clear_gradients(self) -> None:
         """Zero the gradients where they are: views of them stay valid."""
@@ -51,6 +58,10 @@ class _Training(core_solver.Solver):
         loss = shown.passes.forward(0, len(net.layers) - 1)
         blobs = {name: shown.blobs[name] for name in shown.outputs}
         return loss, {name: blob.data_memory.tensor(blob.shape) for name, blob in blobs.items()}
+
+    def debugged(self, net: core.Net) -> AbstractContextManager[None]:
+        """Log the passes within."""
+        return debug_info(self.shown[net].passes)
 
     def test_all(self) -> None:
         """Test, in the root's process."""
@@ -77,7 +88,7 @@ class Solver:
             param.type = self.type_name
         with original_errors():
             self._training = _Training(
-                param, node, device=mode.device(), allow_python=True, exact=mode.exact(), seed=mode.next_seed()
+                param, node, device=mode.device(), allow_python=True, exact=mode.exact(), seed=mode.solver_seed()
             )
         self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
         self._training.on_start = lambda: self._call(0)
@@ -192,6 +203,7 @@ _SOLVERS = (SGDSolver, NesterovSolver, AdaGradSolver, RMSPropSolver, AdaDeltaSol
 def get_solver(solver_file: str | Path) -> Solver:
     """Return the solver of the type that the file has."""
     param, node = parse_solver(solver_file)
-    find_rule(param, node)
+    for fault in rule_faults(param, node):
+        raise fault
     named = {cls.type_name.lower(): cls for cls in _SOLVERS}
     return named[param.type.lower()](solver_file)

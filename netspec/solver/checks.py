@@ -10,8 +10,9 @@ from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
 from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Place
-from netspec.solver.lr_policy import check_policy
-from netspec.solver.update import find_rule
+from netspec.solver.lr_policy import policy_faults
+from netspec.solver.update import rule_faults
+from netspec.whole_file import why_unwritable
 
 REGULARIZATIONS = ("L2", "L1")
 _AT_LEAST_ONE = ("average_loss", "iter_size")
@@ -20,11 +21,11 @@ _NOT_NEGATIVE = ("max_iter", "display", "test_interval", "snapshot")
 
 def check_settings(param: Any, node: Place, report: Report = raise_fault) -> None:
     """Report every fault of the solver's own settings; the nets have theirs."""
-    for check in (find_rule, check_policy, _check_regularization):
-        try:
-            check(param, node)
-        except SpecError as fault:
-            report(fault)
+    for fault in (*rule_faults(param, node), *policy_faults(param, node)):
+        report(fault)
+    if param.regularization_type not in REGULARIZATIONS:
+        message = f'unknown regularization_type "{param.regularization_type}", expected {" or ".join(REGULARIZATIONS)}'
+        report(SpecError(message, node.find("regularization_type")))
     for name in _AT_LEAST_ONE + _NOT_NEGATIVE:
         value, least = getattr(param, name), int(name in _AT_LEAST_ONE)
         if value < least:
@@ -43,20 +44,20 @@ def fields_without_effect(param: Any, node: Place) -> Iterator[str]:
             yield f"{node.find(name)}: {name} has no effect: it is a fork's, and no solver here reads it"
 
 
-def check_writable(param: Any, node: Place) -> None:
-    """Refuse a snapshot_prefix that cannot be written to, by writing there (Caffe: CheckSnapshotWritePermissions)."""
+def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_it: bool = True) -> None:
+    """Report a snapshot_prefix that cannot be written to.
+
+    The file system is asked, and then, with ``try_it``, written to (Caffe: CheckSnapshotWritePermissions).
+    """
     probe = Path(f"{param.snapshot_prefix}_iter_0.tempfile")
-    try:
-        probe.touch()
-        probe.unlink()
-    except OSError as fault:
-        message = f'cannot write to snapshot prefix "{param.snapshot_prefix}": {fault.strerror or fault}; '
-        raise SpecError(
-            message + "make sure that the directory exists and is writeable", node.find("snapshot_prefix")
-        ) from None
-
-
-def _check_regularization(param: Any, node: Place) -> None:
-    if param.regularization_type not in REGULARIZATIONS:
-        message = f'unknown regularization_type "{param.regularization_type}", expected {" or ".join(REGULARIZATIONS)}'
-        raise SpecError(message, node.find("regularization_type"))
+    reason = why_unwritable(probe)
+    if try_it and not reason:
+        try:
+            probe.touch()
+            probe.unlink()
+        except OSError as fault:
+            reason = fault.strerror or str(fault)
+    if reason:
+        advice = "make sure that the directory exists and is writeable"
+        message = f'cannot write to snapshot prefix "{param.snapshot_prefix}": {reason}; {advice}'
+        report(SpecError(message, node.find("snapshot_prefix")))

@@ -5,7 +5,7 @@ Caffe: SGDSolver::GetLearningRate (src/caffe/solvers/sgd_solver.cpp:27)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,8 +50,8 @@ POLICIES: dict[str, Policy] = {
 }
 
 
-def check_policy(param: Any, node: Place) -> None:
-    """Refuse an unknown policy, or one without the fields it needs, before the first iteration.
+def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
+    """Yield a SpecError for an unknown policy, or for each field that it needs and lacks.
 
     Caffe refuses a stepsize of 0 and a negative gamma only when it comes to them, and lets a forgotten gamma or
     max_iter make the rate 0 or infinite.
@@ -61,15 +61,16 @@ def check_policy(param: Any, node: Place) -> None:
         known = ", ".join(POLICIES)
         found = f'unknown lr_policy "{param.lr_policy}"' if param.lr_policy else "no lr_policy"
         hint = did_you_mean(param.lr_policy, list(POLICIES))
-        raise SpecError(f"{found}, expected one of {known}{hint}", node.find("lr_policy"))
+        yield SpecError(f"{found}, expected one of {known}{hint}", node.find("lr_policy"))
+        return
     for field in policy.needs:
         value = getattr(param, field)
         if not param.HasField(field):
-            raise SpecError(f'lr_policy "{param.lr_policy}" needs {field}, found none', node.find("lr_policy"))
-        if value < 0 or (value == 0 and field != "gamma"):
+            yield SpecError(f'lr_policy "{param.lr_policy}" needs {field}, found none', node.find("lr_policy"))
+        elif value < 0 or (value == 0 and field != "gamma"):
             expected = "at least 0" if field == "gamma" else "more than 0"
             message = f'lr_policy "{param.lr_policy}" needs {field} of {expected}, found {value:g}'
-            raise SpecError(message, node.find(field))
+            yield SpecError(message, node.find(field))
 
 
 def next_step(param: Any, iteration: int, step: int) -> int:

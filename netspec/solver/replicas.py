@@ -18,8 +18,8 @@ from netspec.net.net import Net
 class Replicas:
     """The training nets besides the root, which has rank 0."""
 
-    def __init__(self, root: Net, others: Sequence[Net]) -> None:
-        self._root, self._others = root, others
+    def __init__(self, root: Net, nets: Sequence[Net]) -> None:
+        self._root, self.nets = root, nets
 
     @torch.no_grad()
     def begin(self) -> None:
@@ -28,7 +28,7 @@ class Replicas:
 
     def backward(self) -> None:
         """Add the gradients of one pass to each replica's own. Nothing waits for a device: they work together."""
-        losses = [net.forward_loss()[0] for net in self._others]
+        losses = [net.forward_loss()[0] for net in self.nets]
         for loss in losses:
             if loss.requires_grad:
                 loss.backward()
@@ -36,7 +36,7 @@ class Replicas:
     @torch.no_grad()
     def reduce(self) -> None:
         """Make the root's gradients the mean over all devices."""
-        for own, *theirs in zip(*(net.learnable for net in (self._root, *self._others)), strict=True):
+        for own, *theirs in zip(*(net.learnable for net in (self._root, *self.nets)), strict=True):
             if own.parameter.grad is None:
                 continue
             for learnable in theirs:
@@ -45,7 +45,7 @@ class Replicas:
 
     def clear(self) -> None:
         """Forget the gradients of the last iteration."""
-        for net in self._others:
+        for net in self.nets:
             for learnable in net.learnable:
                 learnable.parameter.grad = None
 
@@ -56,16 +56,16 @@ class Replicas:
 
     def restart_data(self) -> None:
         """Make every replica begin at its first record again."""
-        for net in self._others:
+        for net in self.nets:
             net.restart_data()
 
     def close(self) -> None:
         """Let go of files and threads."""
-        for net in self._others:
+        for net in self.nets:
             net.close()
 
     def _copy(self, everything: bool) -> None:
-        for net in self._others:
+        for net in self.nets:
             for own, theirs in zip(self._root.learnable, net.learnable, strict=True):
                 if everything or own.lr_mult:
                     theirs.parameter.copy_(own.parameter, non_blocking=True)

@@ -19,6 +19,7 @@ import torch
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
+from netspec.graph.filter import with_train_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
@@ -27,13 +28,13 @@ from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
-from netspec.solver.checks import check_settings, check_writable, fields_without_effect
+from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
+from netspec.solver.tally import Outputs, Tally, as_scores, score_lines
 
-Scores = dict[str, list[float]]
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
     "net_param": ("solver.cpp:97", "Creating training net specified in {}."),
@@ -64,7 +65,7 @@ def load_solver(
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
     param, node = parse_solver(path)
     if level is not None or stages:
-        param = nets.with_train_state(param, level, stages)
+        param = with_train_state(param, level, stages)
     if weights is not None:
         param.ClearField("weights")
         param.weights.extend([str(weights)] if isinstance(weights, (str, Path)) else map(str, weights))
@@ -137,7 +138,7 @@ class Solver:
         for line in fields_without_effect(param, node):
             log.warning("solver.cpp:45", line)
         if param.snapshot:
-            check_writable(param, node)
+            check_prefix(param, node)
         self.param = param
         self.node = node
         self.action = action or (lambda: None)
@@ -149,11 +150,13 @@ class Solver:
         self.on_snapshot: Callable[[str], object] = lambda model: None
         self.iteration = 0
         self.current_step = 0
-        self.scores: list[Scores] = []
+        self.scores: list[Outputs] = []
         self.stopped = False
         self._losses: deque[float] = deque(maxlen=param.average_loss)
         self._displayed = (clock(), 0)
-        self._rule = update.find_rule(param, node)
+        rule = update.find_rule(param.type)
+        assert rule is not None, "check_settings refuses unknown types"
+        self._rule = rule
         self._device = device or choose_device(param, node)
         self._allow_python = allow_python
         self._exact = exact
@@ -163,14 +166,15 @@ class Solver:
         train, *tests = nets.solver_nets(param, node)
         site, sentence = _CREATING[train.origin.split()[0]]
         log.info(site, sentence.format(train.origin))
-        self.net = self._build(train, 0, self._device, 0, 1 + len(others))
+        ranks = 1 + len(others)
+        self.net = self._build(train, train.label, self._device, 0, ranks)
         with log.silent():  # Caffe tells of the root only
-            replicas = [self._build(train, k, other, k, 1 + len(others)) for k, other in enumerate(others, 1)]
-        self._replicas = Replicas(self.net, replicas)
+            replicas = [self._build(train, f"rank {k}", other, k, ranks) for k, other in enumerate(others, 1)]
+        self.replicas = Replicas(self.net, replicas)
         self.test_nets: list[Net] = []
         for i, test in enumerate(tests):
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
-            self.test_nets.append(self._build(test, 1 + i, self._device))
+            self.test_nets.append(self._build(test, test.label, self._device))
         log.info("solver.cpp:57", "Solver scaffolding done.")
         self.history = [
             torch.zeros_like(learnable.parameter.detach())
@@ -178,13 +182,15 @@ class Solver:
             for learnable in self.net.learnable
         ]
 
-    def _build(
-        self, described: nets.SolverNet, offset: int, device: torch.device, rank: int = 0, ranks: int = 1
-    ) -> Net:
-        """Build a net; ``offset`` keeps the random draws of a solver's nets apart."""
+    def _build(self, described: nets.SolverNet, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> Net:
+        """Build a net and load the weights to start from.
+
+        Each ``role`` has random draws of its own, but for the records: those that train side by side share their order.
+        """
         options = BuildOptions(
             device,
-            self._seed + offset,
+            seed=nets.seed_of(self._seed, role),
+            data_seed=self._seed if ranks > 1 else None,
             allow_python=self._allow_python,
             rank=rank,
             ranks=ranks,
@@ -213,7 +219,7 @@ class Solver:
         log.info("solver.cpp:289", f"Solving {self.net.name}")
         log.info("solver.cpp:290", f"Learning Rate Policy: {self.param.lr_policy}")
         if self.param.snapshot_after_train:
-            check_writable(self.param, self.node)
+            check_prefix(self.param, self.node)
         self.step(self.param.max_iter - self.iteration)
         if self.param.snapshot_after_train and not self._is_due(self.param.snapshot):
             self.snapshot()
@@ -229,9 +235,13 @@ class Solver:
         log.info("solver.cpp:332", "Optimization Done.")
 
     def step(self, iterations: int) -> None:
-        """Run some iterations. The window of the averaged loss begins anew."""
+        """Run some iterations. The window of the averaged loss begins anew.
+
+        Raises SpecError where a net has inputs, which nobody would fill.
+        """
+        self.check_inputs()
         self.stopped = False
-        self._replicas.begin()
+        self.replicas.begin()
         self._losses.clear()
         self._displayed = (self.clock(), self.iteration)
         for _ in range(iterations):
@@ -254,21 +264,28 @@ class Solver:
                 self.stopped = True
                 return
 
+    def check_inputs(self) -> None:
+        """Raise SpecError where a net has inputs: nobody would fill them."""
+        for net in (self.net, *self.test_nets):
+            for fault in net.missing_inputs():
+                raise fault
+
     def _is_due(self, interval: int) -> bool:
         return interval > 0 and self.iteration % interval == 0
 
     def _forward_backward(self) -> tuple[float, dict[str, torch.Tensor]]:
         """Sum the gradients of iter_size passes; return the mean of their losses, and the outputs of the last."""
         self.clear_gradients()
-        self._replicas.clear()
+        self.replicas.clear()
         total = np.float32(0)
         outputs: dict[str, torch.Tensor] = {}
         for _ in range(self.param.iter_size):
-            with self._debugged(self.net, self._is_due(self.param.display)):
+            wanted = self.param.debug_info and self._is_due(self.param.display)
+            with self.debugged(self.net) if wanted else nullcontext():
                 loss, outputs = self.train_pass()
-            self._replicas.backward()
+            self.replicas.backward()
             total += np.float32(loss.item())
-        self._replicas.reduce()
+        self.replicas.reduce()
         return float(total / np.float32(self.param.iter_size)), outputs
 
     def clear_gradients(self) -> None:
@@ -287,8 +304,9 @@ class Solver:
         """Run a net forward; return its loss and outputs."""
         return net.forward_loss()
 
-    def _debugged(self, net: Net, wanted: bool = True) -> AbstractContextManager[None]:
-        return debug_info(net) if wanted and self.param.debug_info else nullcontext()
+    def debugged(self, net: Net) -> AbstractContextManager[None]:
+        """Log the passes within, as ``debug_info`` asks for."""
+        return debug_info(net)
 
     @torch.no_grad()
     def apply_update(self) -> None:
@@ -314,7 +332,7 @@ class Solver:
         rates = [rate * item.lr_mult for item in learnable]
         self._rule.compute(self.param, diffs, rates, self.history, self.iteration)
         update.subtract(weights, diffs)
-        self._replicas.update()
+        self.replicas.update()
         self.iteration += 1
 
     def _advance_rate(self) -> float:
@@ -330,8 +348,7 @@ class Solver:
         pace = f"{log.number(speed)} iter/s, {log.number(now - then)}s/{self.param.display} iters"
         log.info("solver.cpp:239", f"Iteration {self.iteration} ({pace}), loss = {log.number(self.loss)}")
         self._displayed = (now, self.iteration)
-        scores = {name: blob.detach().reshape(-1).tolist() for name, blob in outputs.items()}
-        _log_scores("solver.cpp:258", "Train", scores, self.net.output_loss_weights)
+        _log_scores("solver.cpp:258", "Train", as_scores(outputs), self.net.output_loss_weights)
 
     # Testing
 
@@ -347,8 +364,7 @@ class Solver:
         log.info("solver.cpp:347", f"Iteration {self.iteration}, Testing net (#{i})")
         net, batches = self.test_nets[i], self.param.test_iter[i]
         net.share_weights_with(self.net)
-        sums: Scores = {}
-        total = 0.0
+        tally = Tally()
         for _ in range(batches):
             while request := self.action():
                 if request == "snapshot":
@@ -357,15 +373,11 @@ class Solver:
             if self.stopped:
                 log.info("solver.cpp:396", "Test interrupted.")
                 return
-            with self._debugged(net):
-                loss, outputs = self.test_pass(net)
-            total += loss.item()
-            for name, blob in outputs.items():
-                scores = blob.reshape(-1).tolist()
-                sums[name] = [a + b for a, b in zip(sums[name], scores, strict=True)] if name in sums else scores
+            with self.debugged(net) if self.param.debug_info else nullcontext():
+                tally.add(*self.test_pass(net))
         if self.param.test_compute_loss and batches:
-            log.info("solver.cpp:401", f"Test loss: {log.number(total / batches)}")
-        self.scores[i] = {name: [value / batches for value in values] for name, values in sums.items()}
+            log.info("solver.cpp:401", f"Test loss: {log.number(tally.loss)}")
+        self.scores[i] = tally.scores
         _log_scores("solver.cpp:414", "Test", self.scores[i], net.output_loss_weights)
         self.on_test(i)
 
@@ -416,23 +428,18 @@ class Solver:
         self.current_step = state.current_step
         for net in (self.net, *self.test_nets):
             net.restart_data()
-        self._replicas.restart_data()
+        self.replicas.restart_data()
 
     def close(self) -> None:
         """Let go of the files and threads of all nets."""
         for net in (self.net, *self.test_nets):
             net.close()
-        self._replicas.close()
+        self.replicas.close()
 
 
-def _log_scores(site: str, phase: str, scores: Scores, weights: dict[str, float]) -> None:
-    number = 0
-    for name, values in scores.items():
-        weight = weights[name]
-        for value in values:
-            ending = f" (* {log.number(weight)} = {log.number(weight * value)} loss)" if weight else ""
-            log.info(site, f"    {phase} net output #{number}: {name} = {log.number(value)}{ending}")
-            number += 1
+def _log_scores(site: str, phase: str, scores: Outputs, weights: dict[str, float]) -> None:
+    for i, line in enumerate(score_lines(scores, weights)):
+        log.info(site, f"    {phase} net output #{i}: {line}")
 
 
 def _same_shape(mine: tuple[int, ...], theirs: tuple[int, ...]) -> bool:

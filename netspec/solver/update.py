@@ -11,7 +11,7 @@ Caffe: src/caffe/solvers/*.cpp
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,17 +140,23 @@ RULES: dict[str, Rule] = {
 }
 
 
-def find_rule(param: Any, node: Place) -> Rule:
-    """Return the rule of ``type``, in any case of letters; refuse what the constructors of Caffe's solvers refuse."""
-    name = {known.lower(): known for known in RULES}.get(param.type.lower())
-    if name is None:
+def find_rule(type_name: str) -> Rule | None:
+    """Return the rule of a solver's ``type``, in any case of letters; None where there is none of that name."""
+    return {name.lower(): rule for name, rule in RULES.items()}.get(type_name.lower())
+
+
+def rule_faults(param: Any, node: Place) -> Iterator[SpecError]:
+    """Yield what the constructors of Caffe's solvers refuse."""
+    rule = find_rule(param.type)
+    if rule is None:
         message = f'unknown solver type "{param.type}", expected one of {", ".join(RULES)}'
-        raise SpecError(message + did_you_mean(param.type, list(RULES)), node.find("type"))
-    if param.momentum and not RULES[name].momentum:
-        raise SpecError(f"momentum cannot be used with {name}; remove it", node.find("momentum"))
+        yield SpecError(message + did_you_mean(param.type, list(RULES)), node.find("type"))
+        return
+    name = next(name for name in RULES if RULES[name] is rule)
+    if param.momentum and not rule.momentum:
+        yield SpecError(f"momentum cannot be used with {name}; remove it", node.find("momentum"))
     if name == "RMSProp" and not 0 <= param.rms_decay < 1:
-        raise SpecError(f"rms_decay {param.rms_decay:g}, expected at least 0 and less than 1", node.find("rms_decay"))
-    return RULES[name]
+        yield SpecError(f"rms_decay {param.rms_decay:g}, expected at least 0 and less than 1", node.find("rms_decay"))
 
 
 def _accelerate(diffs: Tensors, rates: Sequence[float], history: Tensors, momentum: float) -> None:

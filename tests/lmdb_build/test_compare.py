@@ -18,6 +18,8 @@ from netspec.errors import SpecError
 from netspec.scores import read_scores
 from paths import GOLDEN, ROOT
 
+pytestmark = pytest.mark.slow
+
 SOLVER = "sgd_step/solver.prototxt"
 OLDER = (GOLDEN / "snapshot" / "straight_iter_60.caffemodel").read_bytes()
 

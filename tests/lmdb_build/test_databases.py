@@ -291,6 +291,7 @@ def test_the_mean_of_a_missing_database_is_refused(tmp_path: Path, capsys: pytes
     assert capsys.readouterr().err.startswith(f'{tmp_path}/nix: database "{tmp_path}/nix" is not there')
 
 
+@pytest.mark.slow
 def test_the_doors_work_from_anywhere_without_torch(tmp_path: Path, pair_list: str) -> None:
     (tmp_path / "torch.py").write_text("raise ImportError('not needed here')")
 

@@ -1,4 +1,4 @@
-"""A made-up round trip that the tests of evaluation, report and detector share."""
+"""A synthetic round trip that the tests of evaluation, report and detector share."""
 
 from pathlib import Path
 
@@ -15,9 +15,9 @@ def blots(seed: int, height: int = 48, width: int = 64) -> np.ndarray:
     rng = np.random.default_rng(seed)
     image = np.full((height, width, 3), 128, np.uint8)
     for _ in range(40):
-        centre = rng.integers(0, (width, height))
-        colour = [int(c) for c in rng.integers(0, 256, 3)]
-        cv2.circle(image, (int(centre[0]), int(centre[1])), int(rng.integers(2, 9)), colour, -1)
+        center = rng.integers(0, (width, height))
+        color = [int(c) for c in rng.integers(0, 256, 3)]
+        cv2.circle(image, (int(center[0]), int(center[1])), int(rng.integers(2, 9)), color, -1)
     return image
 
 
@@ -25,7 +25,7 @@ def blots(seed: int, height: int = 48, width: int = 64) -> np.ndarray:
 def two_laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two rounds on a circle of 20 places, one a second, in TUM RGB-D layout; the second is a little darker.
 
-    Neighbouring places are 18 degrees apart, so that only frames i and i + 20 show the same place.
+    Neighboring places are 18 degrees apart, so that only frames i and i + 20 show the same place.
     """
     folder = tmp_path_factory.mktemp("data") / "two_laps"
     (folder / "rgb").mkdir(parents=True)
@@ -39,8 +39,8 @@ def two_laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         turn = 2 * np.pi * frame / PLACES
         x, y, z, w = Rotation.from_euler("z", turn).as_quat()
         poses.append(f"{frame}.0 {5 * np.cos(turn):.4f} {5 * np.sin(turn):.4f} 1.0 {x:.6f} {y:.6f} {z:.6f} {w:.6f}")
-    (folder / "rgb.txt").write_text("# made up\n" + "\n".join(names) + "\n")
-    (folder / "groundtruth.txt").write_text("# made up\n" + "\n".join(poses) + "\n")
+    (folder / "rgb.txt").write_text("# synthetic\n" + "\n".join(names) + "\n")
+    (folder / "groundtruth.txt").write_text("# synthetic\n" + "\n".join(poses) + "\n")
     return folder
 
 

@@ -1,4 +1,4 @@
-"""Methods judged on a made-up round trip, and how methods are named."""
+"""Methods judged on a synthetic round trip, and how methods are named."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.evaluate import evaluate, figures, named_method
-from loopclosure.methods.base import METHODS, MethodResult, Setting, make_method
+from loopclosure.evaluate import evaluate, named_method
+from loopclosure.methods.base import METHODS, MethodContext, MethodResult, make_method
 from loopclosure.methods.features import FeatureMethod
 from loopclosure.places.datasets import load_tum
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
@@ -16,25 +16,25 @@ from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 class Says:
     """A method that returns given scores."""
 
-    def __init__(self, scores, name="says", once=()):
-        self.scores, self.name, self.once = scores, name, once
+    def __init__(self, scores, name="says", training_stages=()):
+        self.scores, self.name, self.training_stages = scores, name, training_stages
 
-    def score(self, query_images, reference_images, train_images, progress):
-        return MethodResult(self.scores, {"training": 2.0, "looking": 1.0}, ["a note"], self.once)
+    def score(self, images, progress):
+        return MethodResult(self.scores, {"training": 2.0, "looking": 1.0}, ["a note"], self.training_stages)
 
 
 def test_perfect_features_find_every_loop(two_laps, two_laps_features):
     data = load_tum(two_laps)
-    found = evaluate(data, [named_method(f"net=features:{two_laps_features}", Setting())])
+    found = evaluate(data, [named_method(f"net=features:{two_laps_features}", MethodContext())])
     (outcome,) = found.outcomes
     assert outcome.name == "net"
     assert outcome.pairs.average_precision == pytest.approx(1.0)
     assert outcome.best.recall_at_full_precision == 1.0
     assert outcome.best.positives == 20
     assert outcome.seconds["features"] == pytest.approx(40 * 0.004)
-    assert found.images == 40
-    assert figures(outcome)[BEST_MATCH]["recall at 1"] == 1.0
-    assert figures(outcome)[ALL_PAIRS]["average precision"] == pytest.approx(1.0)
+    assert found.image_count == 40
+    assert outcome.measures[BEST_MATCH]["recall at 1"] == 1.0
+    assert outcome.measures[ALL_PAIRS]["average precision"] == pytest.approx(1.0)
 
 
 def test_silence_is_said_and_costs_recall(two_laps):
@@ -44,12 +44,12 @@ def test_silence_is_said_and_costs_recall(two_laps):
     (outcome,) = evaluate(data, [("half", Says(scores))]).outcomes
     assert outcome.pairs.recall[0] == 0.5
     silent = int(np.count_nonzero(data.truth.judged[30:]))
-    assert outcome.notes[-1].startswith(f"it says nothing of {silent} of ")
+    assert outcome.notes[-1].startswith(f"no score for {silent} of ")
 
 
 def test_training_is_not_counted_a_frame(two_laps):
     data = load_tum(two_laps)
-    (outcome,) = evaluate(data, [("x", Says(np.zeros((40, 40)), once=("training",)))]).outcomes
+    (outcome,) = evaluate(data, [("x", Says(np.zeros((40, 40)), training_stages=("training",)))]).outcomes
     assert outcome.seconds_on_frames == 1.0
 
 
@@ -73,11 +73,11 @@ def test_two_methods_of_one_name_are_refused(two_laps):
     ],
 )
 def test_labels(text, name):
-    assert named_method(text, Setting())[0] == name
+    assert named_method(text, MethodContext())[0] == name
 
 
 def test_methods_that_refine_another():
-    method = make_method("seqslam+features:a.npz:cosine", Setting(exclude_frames=7))
+    method = make_method("seqslam+features:a.npz:cosine", MethodContext(exclude_frames=7))
     assert method.name == "seqslam+a (cosine)"
     assert method.inner == FeatureMethod(Path("a.npz"), Path("a.npz"), "cosine")
     assert method.exclude_frames == 7

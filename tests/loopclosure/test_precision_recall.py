@@ -9,11 +9,8 @@ from loopclosure.places.truth import Exclusion, sequence_truth, traverse_truth
 from loopclosure.precision_recall import (
     ALL_PAIRS,
     BEST_MATCH,
-    all_pairs,
-    best_match,
-    best_matches,
+    JudgedScores,
     curve,
-    recall_at_k,
 )
 
 # The worked example: rows are the data base's five places, columns the four queries.
@@ -40,7 +37,7 @@ def example_truth(soft=()):
 
 
 def test_all_pairs_of_the_worked_example():
-    found = all_pairs(SCORES, example_truth())
+    found = JudgedScores(SCORES, example_truth()).all_pairs_curve()
     assert found.convention == ALL_PAIRS
     assert found.average_precision == pytest.approx(0.95)
     precision, recall = np.append(1, found.precision), np.append(0, found.recall)
@@ -53,10 +50,10 @@ def test_all_pairs_of_the_worked_example():
 
 
 def test_best_match_of_the_worked_example():
-    matches = best_matches(SCORES, example_truth())
+    matches = JudgedScores(SCORES, example_truth()).best_matches
     assert list(matches.reference) == [0, 1, 3, 4]
     assert list(matches.right) == [True, True, False, False]
-    found = best_match(SCORES, example_truth())
+    found = JudgedScores(SCORES, example_truth()).best_match_curve()
     assert found.convention == BEST_MATCH
     assert found.positives == 3
     assert found.recall_at_full_precision == pytest.approx(2 / 3)
@@ -65,7 +62,7 @@ def test_best_match_of_the_worked_example():
 
 
 def test_recall_at_k_of_the_worked_example():
-    found = recall_at_k(SCORES, example_truth(), (1, 2, 3, 99))
+    found = JudgedScores(SCORES, example_truth()).recall_at((1, 2, 3, 99))
     assert found == {1: pytest.approx(2 / 3), 2: 1.0, 3: 1.0, 99: 1.0}
 
 
@@ -92,26 +89,26 @@ def test_a_pair_without_a_score_can_still_be_missed():
     truth = example_truth()
     scores = SCORES.copy()
     scores[2, 4] = np.nan  # the loop of query 2
-    assert all_pairs(scores, truth).recall[-1] == 0.75
+    assert JudgedScores(scores, truth).all_pairs_curve().recall[-1] == 0.75
     scores[2] = np.nan
-    matches = best_matches(scores, truth)
+    matches = JudgedScores(scores, truth).best_matches
     assert matches.reference[2] == -1
     assert not matches.right[2]
-    assert recall_at_k(scores, truth, (5,)) == {5: pytest.approx(2 / 3)}
+    assert JudgedScores(scores, truth).recall_at((5,)) == {5: pytest.approx(2 / 3)}
 
 
 def test_soft_pairs_are_ignored_over_all_pairs():
     # query 2's best reference, place 3, lies beside its true place
-    found = all_pairs(SCORES, example_truth(soft=[(3, 2)]))
+    found = JudgedScores(SCORES, example_truth(soft=[(3, 2)])).all_pairs_curve()
     assert found.samples == 19
     assert found.recall_at_full_precision == 1.0
 
 
 def test_soft_best_match_is_right_with_a_loop_and_ignored_without():
-    matches = best_matches(SCORES, example_truth(soft=[(3, 2), (4, 3)]))
+    matches = JudgedScores(SCORES, example_truth(soft=[(3, 2), (4, 3)])).best_matches
     assert list(matches.right) == [True, True, True, False]
     assert list(matches.ignored) == [False, False, False, True]
-    found = best_match(SCORES, example_truth(soft=[(3, 2), (4, 3)]))
+    found = JudgedScores(SCORES, example_truth(soft=[(3, 2), (4, 3)])).best_match_curve()
     assert (found.samples, found.recall_at_full_precision) == (3, 1.0)
 
 
@@ -121,10 +118,10 @@ def test_one_sequence_is_judged_below_the_diagonal_and_outside_the_exclusion():
     assert {(3, 0), (4, 0), (4, 1)} == {(int(i), int(j)) for i, j in np.argwhere(truth.judged)}
     assert truth.positives == 3
     assert list(truth.queries_with_a_loop) == [False, False, False, True, True]
-    assert "at most 2 frames apart" in truth.sentence
+    assert "at most 2 frames apart" in truth.description
     scores = np.arange(25.0).reshape(5, 5)
-    assert list(best_matches(scores, truth).reference) == [-1, -1, -1, 0, 1]
-    assert all_pairs(scores, truth).exclusion == truth.sentence
+    assert list(JudgedScores(scores, truth).best_matches.reference) == [-1, -1, -1, 0, 1]
+    assert JudgedScores(scores, truth).all_pairs_curve().truth_description == truth.description
 
 
 def test_seconds_exclude_by_stamps():
@@ -135,7 +132,7 @@ def test_seconds_exclude_by_stamps():
 
 
 def test_thresholds_for_a_wanted_precision():
-    found = all_pairs(SCORES, example_truth())
+    found = JudgedScores(SCORES, example_truth()).all_pairs_curve()
     assert found.threshold_for_precision(1.0) == 0.85
     assert found.threshold_for_precision(0.8) == 0.7
     assert found.recall_at_precision(0.8) == 1.0
@@ -143,7 +140,7 @@ def test_thresholds_for_a_wanted_precision():
 
 
 def test_best_f1():
-    found = all_pairs(SCORES, example_truth())
+    found = JudgedScores(SCORES, example_truth()).all_pairs_curve()
     assert found.best_f1 == pytest.approx(2 * 0.8 / 1.8)
     assert found.best_f1_threshold == 0.7
 
@@ -158,4 +155,4 @@ def test_nothing_to_find_gives_nan_rather_than_a_figure():
 
 def test_sizes_must_agree():
     with pytest.raises(InputError, match=r"the scores are 5 x 4, the truth is 4 x 5"):
-        all_pairs(SCORES.T, example_truth())
+        JudgedScores(SCORES.T, example_truth()).all_pairs_curve()

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from netspec.check.check import check_file, is_solver
-from netspec.check.table import as_json
+from netspec.check.check import check_file
+from netspec.net.table import as_json
 from netspec.proto.text import parse_net, parse_solver
 from paths import SHARED
 
@@ -33,7 +33,6 @@ def given_shapes(name: str) -> dict[str, tuple[int, ...]]:
 
 @pytest.mark.parametrize("name", sorted(SHAPES))
 def test_net_builds_with_caffes_shapes(name: str) -> None:
-    assert not is_solver(CORPUS / name)
     (checked,) = check_file(CORPUS / name, phase=1)
     assert not checked.faults
     assert checked.net is not None
@@ -46,11 +45,11 @@ def test_net_builds_with_caffes_shapes(name: str) -> None:
 def test_nets_with_data_layers_and_solvers_check(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     root = CORPUS / Path(name).parts[0]
     monkeypatch.chdir((CORPUS / name).parent if name.startswith("forresti") else root)  # where its paths begin
-    assert is_solver(CORPUS / name) == (name in SOLVERS)
     shapes = given_shapes(name)
     for phase in (0, 1):
         checked = check_file(CORPUS / name, phase, stages=["test-on-test"], shapes=shapes)
         assert [str(fault) for part in checked for fault in part.faults] == []
+        assert (checked[0].net is None) == (name in SOLVERS)
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -11,10 +11,12 @@ import pytest
 
 from paths import GOLDEN, ROOT
 
+pytestmark = pytest.mark.slow
+
 DOORS = sorted(
     path.name
     for path in (ROOT / "tools").iterdir()
-    if path.is_file() and "python" in path.read_text().partition("\n")[0] and path.name != "benchmark_forward.py"
+    if path.is_file() and "python" in path.read_text().partition("\n")[0] and not path.name.startswith("benchmark_")
 )
 
 

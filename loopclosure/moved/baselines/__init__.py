@@ -1,1 +1,1 @@
-"""Was loopclosure.baselines."""
+"""Former name of loopclosure.methods and loopclosure.words."""

@@ -1,3 +1,3 @@
-"""Was loopclosure.baselines.thumbnails."""
+"""Former name of loopclosure.descriptors.thumbnails."""
 
 from loopclosure.descriptors.thumbnails import Thumbnailer as Thumbnailer

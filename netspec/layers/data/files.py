@@ -9,8 +9,9 @@ Caffe: src/caffe/layers/base_data_layer.cpp
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any, ClassVar, TypeVar
 
 import torch
 
@@ -19,50 +20,74 @@ from netspec.data.database import open_reader
 from netspec.data.images import read_image_list
 from netspec.data.prefetch import Feed
 from netspec.data.sources import Cursor, DatabaseSource, ImageListSource, Source, draw_skip
-from netspec.data.transformer import Transformer
-from netspec.errors import SpecError
+from netspec.data.transformer import Transformer, contradictions
+from netspec.errors import SpecError, Where
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.proto.schema import PHASE_NAMES
+from netspec.whole_file import why_unwritable
 
 BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
 MOVED = ("scale", "mean_file", "crop_size", "mirror")  # to transform_param, so in a current layer they mean nothing
 Batch = tuple[tuple[torch.Tensor, ...], int]
+T = TypeVar("T")
 
 
 class ReadingLayer(Layer):
     """Base of the layers that read records from files, some batches ahead of the net.
 
-    Files are opened in the constructor, threads start at the first forward pass. Where no data may be opened, the tops'
-    shapes are those given, or those that the prototxt fixes.
+    Files are opened in the constructor, threads start at the first forward pass. Where no data may be opened, or the
+    first top's shape is given, the tops' shapes are those given, or those that the prototxt fixes.
     """
 
     bottoms = (0, 0)
     tops = (2, 2)
+    group: ClassVar[str]  # the field with the layer's own settings
 
-    def open(self) -> Source:
-        """Open the files."""
-        raise NotImplementedError
-
-    def batch_size_of_param(self) -> int:
-        """Return the batch size that the prototxt asks for."""
+    def open(self) -> Source | None:
+        """Open the files; None where :meth:`attempt` met a fault."""
         raise NotImplementedError
 
     def known_shape(self) -> Shape | None:
         """Return the first top's shape where the prototxt alone says it."""
         return None
 
+    def wrong_settings(self) -> Iterator[SpecError]:
+        """Yield what is wrong whatever the files hold."""
+        p = getattr(self.param, self.group)
+        if p.batch_size <= 0:
+            yield self.error(f"batch_size must be above 0, found {p.batch_size}", self.group, "batch_size")
+        if not p.source:
+            yield self.error("source is missing: where is the data?", self.group, "source")
+
+    def construct(self) -> None:
+        """Look at the settings; faults are gathered, so that all are reported. Files are opened if there are none."""
+        self.faults = list(self.wrong_settings())
+        self._sound = not self.faults
+        given = any(top in self.context.given_shapes for top in self.param.top[:1])
+        self.opens_data = self.context.open_data and not given
+
+    def attempt(self, function: Callable[..., T], *arguments: Any) -> T | None:
+        """Return what a function returns, None where it raises a SpecError, which is kept."""
+        try:
+            return function(*arguments)
+        except SpecError as fault:
+            self.faults.append(fault)
+            return None
+
     def setup(self) -> None:
         """Open the files, or find out the shapes without them."""
-        self.batch_size = self.batch_size_of_param()
+        self.batch_size: int = getattr(self.param, self.group).batch_size
         self._source: Source | None = None
         self._feed: Feed[Batch] | None = None
-        if not self.context.open_data:
+        if not self.opens_data:
+            self.refuse(self.faults)
             self._shapes = self.shapes_without_data()
             return
-        self._source = self.open()
-        self._shapes = list(self._source.shapes)[: self.num_tops]
-        make = partial(_make, self._source, self.num_tops, self.context.device.type == "cuda")
+        self._source = self.attempt(self.open) if self._sound else None
+        self.refuse(self.faults)
+        self._shapes = list(self.source.shapes)[: self.num_tops]
+        make = partial(_make, self.source, self.num_tops, self.context.device.type == "cuda")
         ahead: int = self.param.data_param.prefetch
         self._feed = Feed(make, ahead, workers=max(1, min(ahead, os.cpu_count() or 1)))
 
@@ -76,7 +101,8 @@ class ReadingLayer(Layer):
 
     def shape_wanted(self, blob: str, example: str) -> SpecError:
         """Return the error that asks for the shape of a top."""
-        return self.error(f'the shape of "{blob}" is known by its data only; say --shape {blob}={example}', "top")
+        advice = f"say --shape {blob}={example}, or --data"
+        return self.error(f'the shape of "{blob}" is known by its data only; {advice}', "top")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the tops' shapes."""
@@ -90,8 +116,8 @@ class ReadingLayer(Layer):
 
     @property
     def num_records(self) -> int:
-        """How many records there are; a batch may read past the last one, on from the first."""
-        return self.source.cursor.count
+        """How many records there are (0: the data is not open); a batch may read past the last, on from the first."""
+        return self._source.cursor.count if self._source else 0
 
     @property
     def iteration(self) -> int:
@@ -134,24 +160,17 @@ class ReadingLayer(Layer):
 
     def transformer(self) -> Transformer:
         """Return the transformer of this layer's ``transform_param``."""
-        seed = self.context.random.seed
-        return Transformer(self.param.transform_param, self.phase, self.context.at, seed, self.stream)
+        context = self.context
+        return Transformer(self.param.transform_param, self.phase, context.at, context.data_seed, self.stream)
 
-    def positive(self, value: int, *path: str) -> int:
-        """Return ``value``, or refuse it."""
-        if value <= 0:
-            raise self.error(f"{path[-1]} must be above 0, found {value}", *path)
-        return value
-
-    def named(self, value: str, *path: str) -> str:
-        """Return ``value``, or say that it is missing."""
-        if not value:
-            raise self.error(f"{path[-1]} is missing: where is the data?", *path)
-        return value
+    @property
+    def place(self) -> Where:
+        """Where the prototxt names the data."""
+        return self.context.at(self.group, "source")
 
     def skip(self, rand_skip: int, count: int, *path: str) -> int:
         """Draw how many records to pass over at the start."""
-        skip = draw_skip(rand_skip, self.context.random.seed, self.stream)
+        skip = draw_skip(rand_skip, self.context.data_seed, self.stream)
         if rand_skip:
             log.info("image_data_layer.cpp:70", f"Skipping first {skip} data points.")
         if skip >= count:
@@ -182,28 +201,32 @@ class Data(ReadingLayer):
     """
 
     tops = (1, 2)
+    group = "data_param"
     ignores = frozenset(f"data_param.{name}" for name in MOVED)
 
-    def batch_size_of_param(self) -> int:
-        """Return data_param.batch_size."""
-        return self.positive(self.param.data_param.batch_size, "data_param", "batch_size")
+    def wrong_settings(self) -> Iterator[SpecError]:
+        """Yield what is wrong with data_param and transform_param."""
+        yield from super().wrong_settings()
+        yield from contradictions(self.param.transform_param, self.context.at)
 
     def construct(self) -> None:
-        """Open the database; a setting that is missing is said first."""
-        if self.context.open_data:
-            self.batch_size_of_param()
-            p, at = self.param.data_param, self.context.at("data_param", "source")
-            self._reader = open_reader(self.named(p.source, "data_param", "source"), BACKENDS[p.backend], at)
+        """Open the database."""
+        super().construct()
+        if self.opens_data and self._sound:
+            p = self.param.data_param
+            self._reader = self.attempt(open_reader, p.source, BACKENDS[p.backend], self.place)
 
-    def open(self) -> Source:
+    def open(self) -> Source | None:
         """Read the first record, which sets the shape."""
         p, reader = self.param.data_param, self._reader
-        transformer = self.transformer()
+        transformer = self.attempt(self.transformer)
+        if reader is None or transformer is None:
+            return None
         if p.force_encoded_color:
             transformer.color = True
         skip = self.skip(p.rand_skip, len(reader), "data_param", "rand_skip")
         cursor = Cursor(len(reader), self.batch_size, skip, rank=self.context.rank, ranks=self.context.ranks)
-        source = DatabaseSource(reader, cursor, transformer, self.context.at("data_param", "source"))
+        source = DatabaseSource(reader, cursor, transformer, self.place)
         self.log_size(source, "data_layer.cpp:45")
         return source
 
@@ -228,28 +251,33 @@ class ImageData(ReadingLayer):
     Caffe: src/caffe/layers/image_data_layer.cpp
     """
 
+    group = "image_data_param"
     ignores = frozenset(f"image_data_param.{name}" for name in MOVED)
 
-    def batch_size_of_param(self) -> int:
-        """Return image_data_param.batch_size, and check that new_height and new_width come together."""
+    def wrong_settings(self) -> Iterator[SpecError]:
+        """Yield what is wrong with image_data_param and transform_param."""
         p = self.param.image_data_param
         if bool(p.new_height) != bool(p.new_width):
-            raise self.error("new_height and new_width must be given together", "image_data_param")
-        return self.positive(p.batch_size, "image_data_param", "batch_size")
+            yield self.error("new_height and new_width must be given together", self.group)
+        yield from super().wrong_settings()
+        yield from contradictions(self.param.transform_param, self.context.at)
 
-    def open(self) -> Source:
+    def open(self) -> Source | None:
         """Read the list; its first image sets the shape."""
         p = self.param.image_data_param
-        name = self.named(p.source, "image_data_param", "source")
-        log.info("image_data_layer.cpp:38", f"Opening file {name}")
-        images = read_image_list(name, self.context.at("image_data_param", "source"))
+        log.info("image_data_layer.cpp:38", f"Opening file {p.source}")
+        images = self.attempt(read_image_list, p.source, self.place)
+        transformer = self.attempt(self.transformer)
+        if images is None or transformer is None:
+            return None
         if p.shuffle:
             log.info("image_data_layer.cpp:53", "Shuffling data")
         log.info("image_data_layer.cpp:63", f"A total of {len(images)} images.")
         skip = self.skip(p.rand_skip, len(images), "image_data_param", "rand_skip")
-        cursor = Cursor(len(images), self.batch_size, skip, p.shuffle, self.context.random.seed, self.stream)
+        seed, rank, ranks = self.context.data_seed, self.context.rank, self.context.ranks
+        cursor = Cursor(len(images), self.batch_size, skip, p.shuffle, seed, self.stream, rank, ranks)
         size = (p.new_height, p.new_width) if p.new_height else None
-        source = ImageListSource(images, p.root_folder, p.is_color, size, cursor, self.transformer())
+        source = ImageListSource(images, p.root_folder, p.is_color, size, cursor, transformer)
         self.log_size(source, "image_data_layer.cpp:90")
         return source
 
@@ -269,25 +297,22 @@ class HDF5Data(ReadingLayer):
     """
 
     tops = (1, None)
+    group = "hdf5_data_param"
 
-    def batch_size_of_param(self) -> int:
-        """Return hdf5_data_param.batch_size."""
+    def wrong_settings(self) -> Iterator[SpecError]:
+        """Yield what is wrong with hdf5_data_param; there is no transform_param."""
+        yield from super().wrong_settings()
         if self.param.HasField("transform_param"):
-            raise self.error("HDF5Data does not transform data; take transform_param away", "transform_param")
-        return self.positive(self.param.hdf5_data_param.batch_size, "hdf5_data_param", "batch_size")
+            yield self.error("HDF5Data does not transform data; take transform_param away", "transform_param")
 
-    def open(self) -> Source:
+    def open(self) -> Source | None:
         """Look into all the files for their rows."""
         from netspec.data.hdf5 import Hdf5Source
 
-        p = self.param.hdf5_data_param
-        name = self.named(p.source, "hdf5_data_param", "source")
-        at = self.context.at("hdf5_data_param", "source")
-        context = self.context
-        seed = context.random.seed - context.rank  # all ranks share one order
-        return Hdf5Source(
-            name, self.param.top, self.batch_size, p.shuffle, seed, self.stream, at, context.rank, context.ranks
-        )
+        p, context = self.param.hdf5_data_param, self.context
+        seed, rank, ranks = context.data_seed, context.rank, context.ranks
+        tops = self.param.top
+        return Hdf5Source(p.source, tops, p.batch_size, p.shuffle, seed, self.stream, self.place, rank, ranks)
 
     def shapes_without_data(self) -> list[Shape]:
         """Return the shapes given by the caller; the prototxt says nothing of them."""
@@ -306,32 +331,39 @@ class WindowData(ReadingLayer):
     Caffe: src/caffe/layers/window_data_layer.cpp
     """
 
+    group = "window_data_param"
     ignores = frozenset(
         {f"window_data_param.{name}" for name in MOVED if name != "scale"}
         | {f"transform_param.{name}" for name in ("scale", "force_color", "force_gray")}
     )
 
-    def batch_size_of_param(self) -> int:
-        """Return window_data_param.batch_size, and check crop_size, crop_mode and context_pad."""
+    def wrong_settings(self) -> Iterator[SpecError]:
+        """Yield what is wrong with window_data_param and transform_param."""
+        from netspec.data.windows import wrong_means
+
         p, crop = self.param.window_data_param, self.param.transform_param.crop_size
-        self.positive(crop, "transform_param", "crop_size")
+        yield from super().wrong_settings()
+        if crop <= 0:
+            yield self.error(f"crop_size must be above 0, found {crop}", "transform_param", "crop_size")
         if p.crop_mode not in ("warp", "square"):
             message = f'unknown crop_mode "{p.crop_mode}"; expected warp or square'
-            raise self.error(message, "window_data_param", "crop_mode")
-        if 2 * p.context_pad >= crop:
+            yield self.error(message, self.group, "crop_mode")
+        if crop > 0 and 2 * p.context_pad >= crop:
             message = f"context_pad {p.context_pad} on both sides leaves nothing of crop_size {crop}"
-            raise self.error(message, "window_data_param", "context_pad")
-        return self.positive(p.batch_size, "window_data_param", "batch_size")
+            yield self.error(message, self.group, "context_pad")
+        yield from wrong_means(self.param.transform_param, self.context.at)
 
-    def open(self) -> Source:
+    def open(self) -> Source | None:
         """Read the window file."""
-        from netspec.data.windows import WindowSource
+        from netspec.data.windows import WindowSource, read_window_file, window_mean
 
-        p = self.param
-        self.named(p.window_data_param.source, "window_data_param", "source")
-        return WindowSource(
-            p.window_data_param, p.transform_param, self.context.at, self.context.random.seed, self.stream
-        )
+        p, transform, context = self.param.window_data_param, self.param.transform_param, self.context
+        file = self.attempt(read_window_file, p, self.place)
+        mean = self.attempt(window_mean, transform, context.at)
+        if file is None or mean is None:
+            return None
+        seed, rank, ranks = context.data_seed, context.rank, context.ranks
+        return WindowSource(p, transform, file, mean, context.at, seed, self.stream, rank, ranks)
 
     def known_shape(self) -> Shape:
         """Return the shape; the prototxt says all of it."""
@@ -354,13 +386,16 @@ class HDF5Output(Layer):
     def setup(self) -> None:
         """Create the file, so that one that cannot be written stops the run before it begins."""
         name = self.param.hdf5_output_param.file_name
+        place = ("hdf5_output_param", "file_name")
         if not name:
-            raise self.error("file_name is missing: where shall the results go?", "hdf5_output_param", "file_name")
+            raise self.error("file_name is missing: where shall the results go?", *place)
+        if reason := why_unwritable(name):
+            raise self.error(f'HDF5 file "{name}" cannot be written: {reason}', *place)
         self._sink = None
-        if self.context.open_data:
+        if self.context.open_data and self.context.device.type != "meta":
             from netspec.data.hdf5 import Hdf5Sink
 
-            self._sink = Hdf5Sink(name, self.context.at("hdf5_output_param", "file_name"))
+            self._sink = Hdf5Sink(name, self.context.at(*place))
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Check that both bottoms have as many rows."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
 import torch
 
 from netspec import log
+from netspec.errors import SpecError
 from netspec.layers import fillers
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
@@ -44,6 +45,12 @@ class Input(Layer):
         """Return the shapes."""
         return self.shapes
 
+    def missing_input(self) -> SpecError:
+        """A solver calls its nets without inputs."""
+        blobs = " and ".join(f'"{top}"' for top in self.param.top)
+        advice = "a layer that reads data (Data, ImageData, HDF5Data, ...) must make them"
+        return self.error(f"nothing fills {blobs} while a solver runs; {advice}")
+
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return zeros, which is what Caffe's blobs hold until the caller fills them."""
         return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
@@ -62,14 +69,23 @@ class DummyData(Layer):
     OLD_AXES = ("num", "channels", "height", "width")
 
     def setup(self) -> None:
-        """Read the shapes, and fill each blob for a try; those of constant fillers are kept."""
+        """Read the shapes and fillers, and fill the blobs that stay as they are."""
         self.shapes = [self.possible(shape) for shape in self._read_shapes()]
         given = list(self.param.dummy_data_param.data_filler)
         self._fillers = self._one_a_top(given or [FillerParameter()], "data_filler")
-        self._constants: list[torch.Tensor | None] = []
-        for i, filler in enumerate(self._fillers):
-            blob = self._fill(i, torch.Generator())
-            self._constants.append(blob if filler.type == "constant" else None)
+        self.refuse(self._wrong_fillers())
+        on_meta = self.context.device.type == "meta"
+        self._constants = [
+            self._fill(i, torch.Generator()) if filler.type == "constant" and not on_meta else None
+            for i, filler in enumerate(self._fillers)
+        ]
+
+    def _wrong_fillers(self) -> Iterator[SpecError]:
+        for i, (filler, shape) in enumerate(zip(self._fillers, self.shapes, strict=True)):
+            try:
+                fillers.check(filler, shape)
+            except ValueError as fault:
+                yield self.error(str(fault), "dummy_data_param", "data_filler", i)
 
     def filled_once(self) -> Sequence[torch.Tensor | None]:
         """Return the constant blobs."""
@@ -85,10 +101,7 @@ class DummyData(Layer):
         return tuple(self._fill(i, generator) if kept is None else kept for i, kept in enumerate(self._constants))
 
     def _fill(self, i: int, generator: torch.Generator) -> torch.Tensor:
-        try:
-            return fillers.fill(self._fillers[i], self.shapes[i], generator).to(self.context.device)
-        except ValueError as fault:
-            raise self.error(str(fault), "dummy_data_param", "data_filler", i) from None
+        return fillers.fill(self._fillers[i], self.shapes[i], generator).to(self.context.device)
 
     def _read_shapes(self) -> list[Shape]:
         p = self.param.dummy_data_param
@@ -147,14 +160,20 @@ class MemoryData(Layer):
         self._arrays = torch.from_numpy(data), torch.from_numpy(labels)
         self._next = 0
 
+    def missing_input(self) -> SpecError | None:
+        """Images and labels come from the program."""
+        message = "has no data yet; call set_input_arrays(data, labels) on it first"
+        return self.error(message) if self._arrays is None else None
+
     def restart(self) -> None:
         """Return to the first image."""
         self._next = 0
 
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the next batch."""
-        if self._arrays is None:
-            raise self.error("has no data yet; call set_input_arrays(data, labels) on it first")
+        if fault := self.missing_input():
+            raise fault
+        assert self._arrays is not None
         here = slice(self._next, self._next + self.shape[0])
         self._next = here.stop % len(self._arrays[0])
         return tuple(array[here].to(self.context.device) for array in self._arrays)

@@ -41,12 +41,15 @@ def __getattr__(name: str) -> NoReturn:
     raise AttributeError(f"netspec's stand-in for pycaffe has no {name}; it offers Layer, TRAIN and TEST")
 
 
-_offered: list[ModuleType] = [sys.modules[__name__]]  # the last one is what ``import caffe`` gives
+_offered: dict[str, ModuleType] = {"caffe": sys.modules[__name__]}  # the modules that ``import caffe...`` gives
 
 
-def offer(module: ModuleType) -> None:
-    """Let the code of Python layers import ``module`` as ``caffe`` in place of this one."""
-    _offered.append(module)
+def offer(package: ModuleType) -> None:
+    """Let the code of Python layers import ``package``, with what is in it, as ``caffe`` in place of this module."""
+    inside = f"{package.__name__}."
+    for name, module in list(sys.modules.items()):
+        if name == package.__name__ or name.startswith(inside):
+            _offered["caffe" + name[len(package.__name__) :]] = module
 
 
 @contextmanager
@@ -56,13 +59,14 @@ def importable() -> Iterator[None]:
     sys.path.insert(0, directory)
     stand_in = "caffe" not in sys.modules and not _is_installed(directory)
     if stand_in:
-        sys.modules["caffe"] = _offered[-1]
+        sys.modules.update(_offered)
     try:
         yield
     finally:
         sys.path.remove(directory)
         if stand_in:
-            sys.modules.pop("caffe", None)
+            for name in _offered:
+                sys.modules.pop(name, None)
 
 
 @cache

@@ -17,10 +17,10 @@ from pathlib import Path
 
 from netspec import log
 from netspec.errors import SpecError, Where, did_you_mean
+from netspec.proto.dialect.folders import FOLDERS
 from netspec.proto.dialect.registry import Dialect, announce
 
 GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name and a module each
-FOLDER = Path(__file__).parents[2] / "dialects"  # netspec's own, found also where netspec is not installed
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class DialectFile:
 
 @cache
 def known_files() -> dict[str, DialectFile]:
-    """Return the dialects that can be found by name: netspec's own, and those of installed packages' entry points."""
+    """Return the dialects found by name: those in FOLDERS, and those of installed packages' entry points."""
     found = {}
     for point in entry_points(group=GROUP):
         module = point.value.partition(":")[0].strip()
@@ -46,8 +46,9 @@ def known_files() -> dict[str, DialectFile]:
             log.logger.warning(f'dialect "{point.name}": there is no module {module}; it is left out')
         else:
             found[point.name] = DialectFile(point.name, Path(spec.origin), module)
-    for path in sorted(FOLDER.glob("[!_]*.py")):
-        found[path.stem] = DialectFile(path.stem, path, f"{GROUP}.{path.stem}")
+    for folder, package in FOLDERS:
+        for path in sorted(Path(folder).glob("[!_]*.py")):
+            found[path.stem] = DialectFile(path.stem, path, f"{package}.{path.stem}")
     return found
 
 

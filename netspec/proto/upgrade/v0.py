@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from netspec import log
 from netspec.errors import SpecError, did_you_mean
-from netspec.proto.schema import NetParameter, V1LayerParameter, fields_of
+from netspec.proto.schema import NetParameter, V0LayerParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.upgrade.rewrite import Draft, copy_without
 
@@ -154,7 +154,7 @@ def _merge(producer: tuple[V1LayerParameter, Place], layer: V1LayerParameter, pl
     inner.put("pad", padding.layer.pad, _inner(padding_place).fields.get("pad", ()))
 
 
-def _upgrade_layer(old: V1LayerParameter, place: Place, draft: Draft) -> None:
+def _upgrade_layer(old: V0LayerParameter, place: Place, draft: Draft) -> None:
     """Put the fields of a V0LayerParameter into the draft of a V1 layer."""
     draft.copy(old, place, {n for n in fields_of(old.DESCRIPTOR) if n not in _UNCHANGED})
     if old.HasField("type"):

@@ -182,7 +182,7 @@ class TestTables:
     @pytest.mark.parametrize(
         ("text", "words"),
         [
-            ("", "has no row below its head line"),
+            ("", "has no row below its header line"),
             ("a,b\n1,2\n", r"p\.csv:1:1: has 0 columns of image names \(none\); expected 2"),
             ("a,b\n1.jpg,2.jpg\n3.jpg,4.jpg\n", r'p\.csv:2:1: image "1\.jpg" is not in .*i\.csv'),
         ],
@@ -203,7 +203,7 @@ class TestTables:
 
     def test_an_image_in_two_groups_is_refused(self, tmp_path: Path) -> None:
         table = self.write(tmp_path / "p.csv", "a,b,floor\n1.jpg,2.jpg,x\n2.jpg,3.jpg,y\n")
-        with pytest.raises(InputError, match=r'p\.csv:3:1: 2\.jpg is of floor "x" above, here "y"'):
+        with pytest.raises(InputError, match=r'p\.csv:3:1: 2\.jpg has floor "x" above, "y" here'):
             table_source(table, tmp_path, "floor")
 
     def test_ie_tower_and_place_pairs(self) -> None:

@@ -7,16 +7,16 @@ from scipy.spatial.transform import Rotation
 from lmdb_build.pairs.by_pose import PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import Frame, Sequence
+from loopclosure.places.trajectory import Frame, PosedSequence
 
 
-def sequence(name: str, views: list[tuple[float, float, float]]) -> Sequence:
+def sequence(name: str, views: list[tuple[float, float, float]]) -> PosedSequence:
     """Frames at (second, x in metres, heading in degrees)."""
     stamps, x, heading = np.array(views, float).T
     quaternions = Rotation.from_euler("y", heading[:, None], degrees=True).as_quat()
     positions = np.column_stack([x, np.zeros((len(x), 2))])
     frames = tuple(Frame(stamp, f"rgb/{stamp:g}.png") for stamp in stamps)
-    return Sequence(name, frames, stamps, positions, quaternions, 0)
+    return PosedSequence(name, frames, stamps, positions, quaternions, 0)
 
 
 # Index: 0 and 1 are neighbours in time and place, 2 a revisit of 0, 3 turned by 20 degrees, 4 by 90, 5 far away.
@@ -91,9 +91,9 @@ def test_judging_does_not_depend_on_the_order() -> None:
 
 
 def test_unknown_and_double_names_are_refused() -> None:
-    with pytest.raises(InputError, match='no sequence is called "c"; there are: a, b'):
+    with pytest.raises(InputError, match='no sequence has the name "c"; there are: a, b'):
         two(scenes=Scenes(same_scene=(("a", "c"),)))
-    with pytest.raises(InputError, match='two sequences are called "a"'):
+    with pytest.raises(InputError, match='two sequences have the name "a"'):
         PoseSource([sequence("a", VIEWS), sequence("a", VIEWS)], ["x/a", "y/a"])
 
 
@@ -104,7 +104,7 @@ def warned(source: PoseSource, pairs: list[tuple[int, int]]) -> str:
 
 def test_negatives_across_undeclared_sequences_are_warned_about() -> None:
     pairs = [(0, 2), (0, 4), (0, 6)]
-    assert "1 negatives are of different sequences that nobody said" in warned(two(), pairs)
+    assert "1 negatives are of different sequences that are not declared" in warned(two(), pairs)
     assert not warned(two(scenes=Scenes(all_others_differ=True)), pairs)
     assert not warned(two(scenes=Scenes(same_scene=(("a", "b"),))), pairs)
 

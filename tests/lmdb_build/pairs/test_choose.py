@@ -13,10 +13,10 @@ from lmdb_build.pairs.choose import NEGATIVE, POSITIVE, choose_pairs, find_pairs
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import same_place
-from loopclosure.places.trajectory import Frame, Poses, Sequence
+from loopclosure.places.trajectory import Frame, PosedSequence, Poses
 
 
-def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> Sequence:
+def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> PosedSequence:
     """A camera that turns and strays about, back to where it was now and then."""
     rng = np.random.default_rng(seed)
     stamps = start_s + np.arange(count) / 10
@@ -24,7 +24,7 @@ def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> Sequence:
     positions = np.cumsum(rng.normal(0, 0.15, (count, 3)), axis=0)
     quaternions = np.column_stack([np.zeros((count, 2)), np.sin(yaw / 2), np.cos(yaw / 2)])
     frames = tuple(Frame(float(stamp), f"rgb/{stamp:.6f}.png") for stamp in stamps)
-    return Sequence(name, frames, stamps, positions, quaternions, 0)
+    return PosedSequence(name, frames, stamps, positions, quaternions, 0)
 
 
 def pose_source(lengths: tuple[int, ...] = (120, 90, 110), rule: PoseRule | None = None) -> PoseSource:
@@ -133,7 +133,7 @@ def test_sequences_can_be_given_to_splits_by_name() -> None:
     ("named", "words"),
     [
         ({"val": ["s1"]}, "name the sequences of all splits but one; not named: train, test"),
-        ({"val": ["s9"], "test": ["s1"]}, 'no sequence is called "s9"; there are: s0, s1, s2'),
+        ({"val": ["s9"], "test": ["s1"]}, 'no sequence has the name "s9"; there are: s0, s1, s2'),
         ({"val": ["s1"], "test": ["s1"]}, 'sequence "s1" is named for two splits'),
     ],
 )
@@ -152,7 +152,9 @@ def test_too_few_pairs_are_an_error_that_says_how_many_there_are(tmp_path: Path)
     pairs = [(a, b) for a in range(30) for b in range(a + 1, 30)]
     labels = source.judge(*np.array(pairs).T)
     positives, negatives = int((labels == POSITIVE).sum()), int((labels == NEGATIVE).sum())
-    with pytest.raises(InputError, match=f"{positives} positive and {negatives} negative ones; .* --at-most") as caught:
+    with pytest.raises(
+        InputError, match=f"{positives} positive and {negatives} negative pairs; .* --at-most"
+    ) as caught:
         build(source, Plan({"train": 2000}), tmp_path / "lists")
     assert str(caught.value).startswith("train: 2000 pairs need 1000 of each label")
     assert not (tmp_path / "lists").exists()
@@ -172,9 +174,9 @@ def test_a_label_without_any_pair_is_an_error_even_with_at_most(tmp_path: Path) 
     ("plan", "words"),
     [
         (Plan({"train": 7}), "even, not 7"),
-        (Plan({"train": 0}), "no pair is asked for"),
+        (Plan({"train": 0}), "no pairs are asked for"),
         (Plan({"train": 2}, seed=-1), "seed"),
-        (Plan({"train": 2}, warp_share=1.5), "--warp-share is 0 to 1"),
+        (Plan({"train": 2}, warp_share=1.5), "--warp-share must be 0 to 1"),
         (Plan({"train": 2, "val": 2}, shares={"train": 1.0, "val": 0.0, "test": 0.0}), "share of val is 0"),
     ],
 )

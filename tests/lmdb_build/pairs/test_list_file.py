@@ -118,7 +118,7 @@ class TestWarp:
     def test_warped_images_must_lie_below_the_root(self, photos: Path) -> None:
         source = singles_source(photos / "photos", photos / "photos")
         plan = Plan({"train": 4}, by="group", warp_share=1.0)
-        with pytest.raises(InputError, match="warped images must lie below the root folder"):
+        with pytest.raises(InputError, match="warped images must be below the root folder"):
             build_lists(source, plan, photos / "photos", photos / "out", lambda text: None, lambda doubt: None)
 
     def test_a_missing_image_is_named(self, photos: Path) -> None:

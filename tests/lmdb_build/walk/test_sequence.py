@@ -13,7 +13,7 @@ from lmdb_build.walk.render import Camera, Light, Renderer
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import same_place_matrix
-from loopclosure.places.trajectory import Sequence, read_groundtruth, read_tum_sequence, rotation_matrices
+from loopclosure.places.trajectory import PosedSequence, read_groundtruth, read_tum_sequence, rotation_matrices
 
 SMALL = Walk(frames=150, width=64, height=48, laps=3, seed=7)
 CAMERA = Camera(160, 120, 131.25)
@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def sequence(folder: Path) -> Sequence:
+def sequence(folder: Path) -> PosedSequence:
     return read_tum_sequence(folder)
 
 
@@ -45,7 +45,7 @@ def facing_quad(distance: float, size: float, texture: np.ndarray) -> Quad:
     return Quad(origin, np.array([size, 0, 0.0]), np.array([0, size, 0.0]), texture, 0)
 
 
-def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence: Sequence) -> None:
+def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence: PosedSequence) -> None:
     assert (len(sequence), sequence.dropped) == (SMALL.frames, 0)
     assert all((folder / frame.path).is_file() for frame in sequence.frames)
     trajectory = read_groundtruth(folder / "groundtruth.txt")
@@ -55,6 +55,7 @@ def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence:
     assert picture.shape == (SMALL.height, SMALL.width, 3)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_house(folder: Path, tmp_path: Path) -> None:
     short = replace(SMALL, frames=4, laps=1)
     for name, walk in (("a", short), ("b", short), ("c", replace(short, seed=8))):
@@ -66,7 +67,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_house(folde
     assert (tmp_path / "a/rgb/1000.000000.jpg").read_bytes() != (tmp_path / "c/rgb/1000.000000.jpg").read_bytes()
 
 
-def test_places_are_seen_again_on_every_lap(sequence: Sequence) -> None:
+def test_places_are_seen_again_on_every_lap(sequence: PosedSequence) -> None:
     truth = same_place_matrix(sequence, sequence)
     lap = np.arange(SMALL.frames) * SMALL.laps // SMALL.frames
     for later in (1, 2):
@@ -74,7 +75,7 @@ def test_places_are_seen_again_on_every_lap(sequence: Sequence) -> None:
         assert again.mean() > 0.9
 
 
-def test_the_same_place_looks_the_same_and_other_places_do_not(folder: Path, sequence: Sequence) -> None:
+def test_the_same_place_looks_the_same_and_other_places_do_not(folder: Path, sequence: PosedSequence) -> None:
     thumbnails = []
     for frame in sequence.frames:
         picture = cv2.imread(str(folder / frame.path))
@@ -91,7 +92,7 @@ def test_the_same_place_looks_the_same_and_other_places_do_not(folder: Path, seq
     assert other < 0.15
 
 
-def test_a_lap_later_it_is_another_light_and_a_few_steps_aside(sequence: Sequence) -> None:
+def test_a_lap_later_it_is_another_light_and_a_few_steps_aside(sequence: PosedSequence) -> None:
     truth = same_place_matrix(sequence, sequence)
     later = np.flatnonzero(np.arange(SMALL.frames) >= SMALL.frames // SMALL.laps)
     aside = []
@@ -175,7 +176,7 @@ def test_the_way_leads_through_every_room_and_never_into_furniture(rooms: int) -
                 assert np.linalg.norm(gap, axis=1).min() >= 0.5
 
 
-def test_the_camera_is_carried_upright(sequence: Sequence) -> None:
+def test_the_camera_is_carried_upright(sequence: PosedSequence) -> None:
     axes = rotation_matrices(sequence.quaternions)
     assert (axes[:, 2, 1] < -0.98).all()  # y points down
     assert (np.abs(axes[:, 2, 0]) < 0.05).all()  # x is level
@@ -189,7 +190,7 @@ def test_the_camera_is_carried_upright(sequence: Sequence) -> None:
         ({"frames": 1}, "frames must be 2"),
         ({"width": 8}, "width must be 32"),
         ({"laps": 0}, "laps must be 1"),
-        ({"seed": -1}, "seed is 0 or more"),
+        ({"seed": -1}, "seed must be 0 or more"),
     ],
 )
 def test_numbers_that_make_no_walk_are_refused(tmp_path: Path, change: dict[str, int], words: str) -> None:

@@ -80,6 +80,7 @@ def test_equal_scores_come_in_the_order_of_the_references(columns, monkeypatch):
     np.testing.assert_array_equal(top_k(same, same, k=3).indices, np.tile([0, 1, 2], (9, 1)))
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_blocks(monkeypatch):
     """20,000 frames: the whole matrix would be 1.6 GB of float32."""
     import tracemalloc
@@ -113,7 +114,7 @@ def test_fewer_references_than_asked_for():
         (lambda: similarity_matrix(np.zeros((3, 2)), metric="l1"), 'unknown metric "l1"'),
         (lambda: similarity_matrix(np.array([[0.0], [np.nan]])), "frame 1"),
         (lambda: top_k(np.eye(3), k=0), "best 0"),
-        (lambda: top_k(np.eye(3), np.eye(3), exclusion=Exclusion(frames=1)), "concerns one sequence"),
+        (lambda: top_k(np.eye(3), np.eye(3), exclusion=Exclusion(frames=1)), "applies to one sequence"),
         (lambda: top_k(np.eye(3), exclusion=Exclusion(seconds=1)), "have no time"),
         (lambda: Exclusion(frames=-1), "cannot exclude -1"),
     ],

@@ -1,4 +1,4 @@
-"""PCA whitening: its algebra, what it is good for, and its way through the commands."""
+"""PCA whitening: its algebra, its benefit, and its use in the commands."""
 
 import csv
 import json
@@ -10,13 +10,14 @@ from scipy.spatial.distance import pdist
 from scipy.stats import ortho_group
 
 from loopclosure.cli import main
+from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.descriptors.whitening import learn_whitening
 from loopclosure.errors import InputError
-from loopclosure.methods.base import make_method
+from loopclosure.methods.base import Images, make_method
 from loopclosure.methods.features import FeatureMethod, WhitenBy
-from loopclosure.places.frames import read_image
+from loopclosure.places.frames import read_bgr
 from loopclosure.progress import silent
 
 PLACES = 20
@@ -131,14 +132,14 @@ def test_it_finds_the_pairs_that_common_variation_hides(training, laps):
 @pytest.mark.parametrize(
     ("descriptors", "settings", "sentence"),
     [
-        (np.ones((1, 3)), {}, "other.npz: has 1 descriptors; a whitening is learnt from 2"),
+        (np.ones((1, 3)), {}, "other.npz: has 1 descriptors; a whitening is learned from at least 2"),
         (np.full((5, 3), 0.1), {}, "other.npz: has 5 descriptors that are all the same"),
         (np.array([[1.0], [np.nan]]), {}, "other.npz: has a descriptor with a NaN"),
         (np.eye(3), {"components": 0}, "components is 0; expected 1 or more"),
         (np.eye(3), {"power": 1.5}, "power is 1.5; expected 0"),
     ],
 )
-def test_what_cannot_be_learnt_from(descriptors, settings, sentence):
+def test_what_cannot_be_learned_from(descriptors, settings, sentence):
     with pytest.raises(InputError, match=sentence):
         learn_whitening(descriptors.astype(np.float32), source="other.npz", **settings)
 
@@ -176,10 +177,10 @@ def test_queries_and_references(tmp_path, training, laps):
     np.savez(tmp_path / "other.npz", features=training)
     method = make_method(f"features:{tmp_path}/q.npz,{tmp_path}/r.npz:whiten={tmp_path}/other.npz")
     images = [Path(name) for name in names]
-    result = method.score(images, images, [], silent)
+    result = method.score(Images(images, images), silent)
     assert found(result.scores) == 1
     assert list(result.seconds) == ["training whitening", "whitening", "similarity"]
-    assert result.once == ("training whitening",)
+    assert result.training_stages == ("training whitening",)
 
 
 def test_each_view_is_whitened(files, training, laps):
@@ -194,12 +195,22 @@ def test_each_view_is_whitened(files, training, laps):
     images = [Path(f"/data/two_laps/rgb/{i}.png") for i in range(len(laps))]
     shares = {}
     for other in ("other.npz", "halves.npz"):
-        result = make_method(f"features:{files}/views.npz:whiten={files / other}").score(images, None, [], silent)
+        result = make_method(f"features:{files}/views.npz:whiten={files / other}").score(Images(images), silent)
         shares[other] = found(result.scores[PLACES:, :PLACES])
         assert "2 views of 24 dimensions, euclidean" in result.notes
     assert min(shares.values()) >= 0.95
-    with pytest.raises(InputError, match=r"laps.npz: describes 1 view\(s\) of an image, .*views.npz 2"):
-        make_method(f"features:{files}/views.npz,{files}/laps.npz").score(images, images, [], silent)
+    with pytest.raises(InputError, match=r"laps.npz: has 1 view\(s\) of each image, .*views.npz has 2"):
+        make_method(f"features:{files}/views.npz,{files}/laps.npz").score(Images(images, images), silent)
+
+
+def test_whitened_features_are_those_of_the_same_images(files, training, laps):
+    stamps = np.arange(len(laps), dtype=float)
+    np.savez(files / "views.npz", features=np.hstack([laps, laps[::-1]]), stamps=stamps, zooms=np.array([1, 0.7]))
+    features, whitening = read_features(files / "views.npz"), learn_whitening(training, components=5)
+    white = features.whitened(whitening)
+    np.testing.assert_allclose(white.features, np.hstack([whitening(laps), whitening(laps[::-1])]), atol=1e-6)
+    assert (white.names, white.views, white.path) == (features.names, 2, features.path)
+    np.testing.assert_array_equal(white.stamps, stamps)
 
 
 def test_detect_finds_loops_through_the_views(two_laps, tmp_path):
@@ -214,7 +225,7 @@ def test_detect_finds_loops_through_the_views(two_laps, tmp_path):
         assert [int(row["match_id"]) for row in csv.DictReader(stream)] == list(range(PLACES))
 
 
-def test_tested_images_are_not_learnt_from(files, training, laps):
+def test_tested_images_are_not_learned_from(files, training, laps):
     images = [Path(f"/data/two_laps/rgb/{i}.png") for i in range(len(laps))]
     nearly = laps[5] * np.float32(1.0001)
     np.savez(files / "overlap.npz", features=np.vstack([training, nearly]), names=np.array(["x"] * 400 + ["a/5.png"]))
@@ -223,18 +234,18 @@ def test_tested_images_are_not_learnt_from(files, training, laps):
         method = make_method(f"features:{files}/laps.npz:whiten={files / other}")
         sentence = rf"{other}: 1 of 40 test images are training images too, the first is .*rgb/5.png"
         with pytest.raises(InputError, match=sentence):
-            method.score(images, None, [], silent)
+            method.score(Images(images), silent)
         with pytest.raises(InputError, match=r"1 of 10 test images are"):
-            method.score(images[20:], images[:10], [], silent)
+            method.score(Images(images[20:], images[:10]), silent)
     # Equal names alone are no equal images: those of other.npz are 0.png to 399.png as well.
-    assert make_method(f"features:{files}/laps.npz:whiten={files}/other.npz").score(images, None, [], silent)
+    assert make_method(f"features:{files}/laps.npz:whiten={files}/other.npz").score(Images(images), silent)
 
 
 def test_files_of_two_nets(files, laps):
     np.savez(files / "wide.npz", features=np.random.default_rng(0).normal(size=(9, 30)))
     method = make_method(f"features:{files}/laps.npz:whiten={files}/wide.npz")
     with pytest.raises(InputError, match=r"wide.npz: has descriptors of 30 dimensions, those to be whitened have 24"):
-        method.score([Path("rgb/1.png"), Path("rgb/2.png")], None, [], silent)
+        method.score(Images([Path("rgb/1.png"), Path("rgb/2.png")]), silent)
 
 
 def test_evaluate(two_laps, files, tmp_path, capsys):
@@ -277,7 +288,7 @@ def test_detect(two_laps, files, tmp_path, capsys):
 
 def test_detect_whitens_what_describe_returns(two_laps, tmp_path, capsys):
     describe = Thumbnailer()
-    rows = np.stack([describe(read_image(two_laps / "rgb" / f"{i}.png")).reshape(-1) for i in range(PLACES)])
+    rows = np.stack([describe(read_bgr(two_laps / "rgb" / f"{i}.png")).reshape(-1) for i in range(PLACES)])
     np.savez(tmp_path / "other.npz", features=rows)
     saved = tmp_path / "detector.npz"
     words = ["detect", str(two_laps), "--threshold", "-0.5", "--save", str(saved), "--out", str(tmp_path)]

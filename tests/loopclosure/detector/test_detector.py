@@ -81,7 +81,7 @@ def test_without_a_threshold_nothing_is_accepted():
 def test_consistency_wants_the_frames_before_to_agree():
     descriptors = two_laps()
     lonely = descriptors[:60].copy()
-    lonely[50] = descriptors[3]  # one frame looks like an old one, its neighbours do not
+    lonely[50] = descriptors[3]  # one frame looks like an old one, its neighbors do not
     plain = LoopDetector(exclude_recent=10, threshold=-0.5)
     steady = LoopDetector(exclude_recent=10, threshold=-0.5, consistency=3, consistency_window=2)
     assert [r.query_id for r in run(plain, lonely) if r.accepted is not None] == [50]

@@ -1,4 +1,4 @@
-"""Loops as CSV and g2o: frames of reference, order of quaternions, and nothing made up."""
+"""Loops as CSV and g2o: frames of reference, order of quaternions, and nothing invented."""
 
 import csv
 

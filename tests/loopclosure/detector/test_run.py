@@ -6,7 +6,14 @@ import pytest
 
 from loopclosure.descriptors.feature_file import Features, read_features
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.run import calibrate, from_poses, judged_by_poses, load_describe, open_recording, run_detector
+from loopclosure.detector.run import (
+    calibrate_on_data_set,
+    from_poses,
+    judged_by_poses,
+    load_describe,
+    open_recording,
+    run_detector,
+)
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.datasets import load_tum
@@ -70,7 +77,7 @@ def test_video(tmp_path):
 
 def test_calibration_on_a_sequence(two_laps, two_laps_features):
     detector = LoopDetector(small, exclude_recent=10, metric="cosine")
-    sentence = calibrate(detector, load_tum(two_laps), precision=1.0)
+    sentence = calibrate_on_data_set(detector, load_tum(two_laps), precision=1.0)
     assert "two_laps precision at least 1 at recall 1.000 of the 20 frames" in sentence
     assert len(detector) == 0
     assert detector.settings.threshold is not None

@@ -1,4 +1,4 @@
-"""Geometric verification on made-up views: a textured wall seen from two sides, and another wall."""
+"""Geometric verification on synthetic views: a textured wall seen from two sides, and another wall."""
 
 import cv2
 import numpy as np
@@ -14,8 +14,8 @@ def wall(seed):
     rng = np.random.default_rng(seed)
     image = np.full((240, 320, 3), 128, np.uint8)
     for _ in range(220):
-        centre = rng.integers(0, (320, 240))
-        cv2.circle(image, tuple(int(c) for c in centre), int(rng.integers(3, 22)), rng.integers(0, 256, 3).tolist(), -1)
+        center = rng.integers(0, (320, 240))
+        cv2.circle(image, tuple(int(c) for c in center), int(rng.integers(3, 22)), rng.integers(0, 256, 3).tolist(), -1)
     return cv2.GaussianBlur(image, (0, 0), 1.0)
 
 
@@ -45,6 +45,19 @@ def test_matches_join_what_is_the_same_point(check):
     assert len(np.unique(matches[:, 1])) == len(matches) > 50
     steps = b.points[matches[:, 1]] - a.points[matches[:, 0]]
     assert np.mean(np.all(np.abs(steps - [20, 10]) < 1.0, axis=1)) > 0.9
+
+
+def test_matches_are_those_of_the_plain_ratio_test(check):
+    a, b = check.describe(wall(0)), check.describe(seen_from_the_side(wall(0)))
+    distances = np.linalg.norm(a.descriptors[:, None].astype(float) - b.descriptors[None], axis=2)
+    best: dict[int, tuple[float, int]] = {}
+    for point, row in enumerate(distances):
+        nearest, second = np.argsort(row, kind="stable")[:2]
+        if row[nearest] < check.ratio * row[second]:
+            best[int(nearest)] = min(best.get(int(nearest), (np.inf, -1)), (row[nearest], point))
+    expected = sorted([point, nearest] for nearest, (_, point) in best.items())
+    assert check.matches(a, b).tolist() == expected
+    assert len(expected) > 50
 
 
 def test_an_image_without_a_point_is_no_crash(check):

@@ -1,4 +1,4 @@
-"""The baselines as the judge calls them: one sequence and two traverses, with files and settings."""
+"""The baselines as the evaluation calls them: one sequence and two traverses, with files and settings."""
 
 from pathlib import Path
 
@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from loopclosure.descriptors.thumbnails import Thumbnailer
+from loopclosure.detector.run import load_describe
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Setting, make_method
+from loopclosure.methods.base import Images, MethodContext, make_method
 from loopclosure.methods.baselines import BagOfWordsMethod, FabMapMethod, ThumbnailMethod
 from loopclosure.progress import silent
 from loopclosure.words.word_model import WordModel
@@ -39,7 +41,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
 
 @pytest.mark.parametrize("spec", [f"fabmap:{WORDS}", f"fabmap:{WORDS},scored=posterior", f"bow:{WORDS}", "thumbnails"])
 def test_two_traverses(spec: str, images: dict[str, list[Path]]) -> None:
-    result = make_method(spec).score(images["again"], images["first"], images["train"], silent)
+    result = make_method(spec).score(Images(images["again"], images["first"], images["train"]), silent)
     assert result.scores.shape == (PLACES, PLACES)
     np.testing.assert_array_equal(np.argmax(result.scores, axis=1), np.arange(PLACES))
     assert result.notes
@@ -49,7 +51,7 @@ def test_two_traverses(spec: str, images: dict[str, list[Path]]) -> None:
 @pytest.mark.parametrize("spec", [f"fabmap:{WORDS}", f"bow:{WORDS}", "thumbnails"])
 def test_one_sequence(spec: str, images: dict[str, list[Path]]) -> None:
     walk = images["first"] + images["again"]
-    result = make_method(spec, Setting(exclude_frames=2)).score(walk, None, images["train"], silent)
+    result = make_method(spec, MethodContext(exclude_frames=2)).score(Images(walk, None, images["train"]), silent)
     assert result.scores.shape == (2 * PLACES, 2 * PLACES)
     assert np.isfinite(result.scores[np.tril_indices(2 * PLACES, -1)]).all()
     earlier = np.where(np.tri(2 * PLACES, 2 * PLACES, -3, dtype=bool), result.scores, -np.inf)
@@ -63,7 +65,7 @@ def test_every_stage_is_shown_and_timed(images: dict[str, list[Path]]) -> None:
         shown[stage] = total
         return items
 
-    result = make_method(f"fabmap:{WORDS}").score(images["again"], images["first"], images["train"], progress)
+    result = make_method(f"fabmap:{WORDS}").score(Images(images["again"], images["first"], images["train"]), progress)
     assert shown == {"training features": 10, "features": 16}
     assert list(result.seconds) == [
         "training features", "vocabulary", "training words", "tree", "features", "words", "likelihoods",
@@ -72,39 +74,55 @@ def test_every_stage_is_shown_and_timed(images: dict[str, list[Path]]) -> None:
 
 def test_a_vocabulary_is_kept_and_used_again(tmp_path: Path, images: dict[str, list[Path]]) -> None:
     path = tmp_path / "words.npz"
-    first = make_method(f"fabmap:model={path},{WORDS}").score(images["again"], images["first"], images["train"], silent)
+    first = make_method(f"fabmap:model={path},{WORDS}").score(
+        Images(images["again"], images["first"], images["train"]), silent
+    )
     assert len(WordModel.load(path).vocabulary) == 200
-    second = make_method(f"fabmap:model={path}").score(images["again"], images["first"], [], silent)
+    second = make_method(f"fabmap:model={path}").score(Images(images["again"], images["first"]), silent)
     np.testing.assert_array_equal(first.scores, second.scores)
     assert "vocabulary" not in second.seconds
     assert f"read from {path}" in second.notes[0]
     with pytest.raises(InputError, match=r"words.npz: 10 of 10 test images are training images too"):
-        make_method(f"bow:model={path}").score(images["train"], None, [], silent)
+        make_method(f"bow:model={path}").score(Images(images["train"]), silent)
 
 
 @pytest.mark.parametrize("spec", ["fabmap", "bow"])
 def test_training_images_are_needed_and_are_not_tested(spec: str, images: dict[str, list[Path]]) -> None:
     with pytest.raises(InputError, match="needs training images"):
-        make_method(spec).score(images["again"], images["first"], [], silent)
+        make_method(spec).score(Images(images["again"], images["first"]), silent)
     with pytest.raises(InputError, match=r"8 of 16 test images are training images too"):
-        make_method(spec).score(images["again"], images["first"], images["first"], silent)
+        make_method(spec).score(Images(images["again"], images["first"], images["first"]), silent)
+
+
+@pytest.mark.parametrize(
+    ("american", "british"),
+    [
+        ("thumbnails:normalize=none", "thumbnails:normalise=none"),
+        ("seqslam:normalize=image,anchor=center", "seqslam:normalise=image,anchor=centre"),
+    ],
+)
+def test_settings_may_be_spelled_the_british_way(american: str, british: str) -> None:
+    assert make_method(british) == make_method(american) != make_method(american.partition(":")[0])
+    options = {"normalise": "patch"}
+    assert load_describe("loopclosure.baselines.thumbnails:Thumbnailer", options) == Thumbnailer(normalize="patch")
 
 
 def test_settings_reach_the_part_they_belong_to() -> None:
     fabmap = make_method(
-        "fabmap:words=77, kind=orb,version=1,samples=9,motion=yes,scored=posterior", Setting(exclude_frames=6, seed=4)
+        "fabmap:words=77, kind=orb,version=1,samples=9,motion=yes,scored=posterior",
+        MethodContext(exclude_frames=6, seed=4),
     )
     assert isinstance(fabmap, FabMapMethod)
-    assert (fabmap.words.training.words, fabmap.words.training.extractor.kind) == (77, "orb")
+    assert (fabmap.source.training.words, fabmap.source.training.extractor.kind) == (77, "orb")
     assert (fabmap.settings.version, fabmap.settings.samples, fabmap.settings.motion) == (1, 9, True)
-    assert (fabmap.settings.recent, fabmap.settings.seed, fabmap.words.training.seed) == (6, 4, 4)
+    assert (fabmap.settings.recent, fabmap.settings.seed, fabmap.source.training.seed) == (6, 4, 4)
     assert fabmap.scored == "posterior"
     bow = make_method("bow:metric=cosine,radius=0.5,root=no")
     assert isinstance(bow, BagOfWordsMethod)
-    assert (bow.metric, bow.words.training.radius, bow.words.training.extractor.root) == ("cosine", 0.5, False)
-    small = make_method("thumbnails:width=16,normalise=none")
+    assert (bow.metric, bow.source.training.radius, bow.source.training.extractor.root) == ("cosine", 0.5, False)
+    small = make_method("thumbnails:width=16,normalize=none")
     assert isinstance(small, ThumbnailMethod)
-    assert (small.thumbnailer.width, small.thumbnailer.normalise) == (16, "none")
+    assert (small.thumbnailer.width, small.thumbnailer.normalize) == (16, "none")
 
 
 @pytest.mark.parametrize(
@@ -126,14 +144,15 @@ def test_arguments_that_make_no_sense(spec: str, message: str) -> None:
         make_method(spec)
 
 
+@pytest.mark.slow
 def test_corridor_loop_with_its_two_images_without_features() -> None:
     corridor = shared("data", "corridor_loop", "samples")
     train = sorted(shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy", "rgb").glob("*.jpg"))[::12]
     walk = [corridor / f"{k}.jpg" for k in range(1, 85)]
-    result = make_method("fabmap:words=300,max_features=150", Setting(exclude_frames=10)).score(
-        walk, None, train, silent
+    result = make_method("fabmap:words=300,max_features=150", MethodContext(exclude_frames=10)).score(
+        Images(walk, None, train), silent
     )
-    assert "2 of 84 images have no feature at all: places without words" in result.notes
+    assert "2 of 84 images have no features: places without words" in result.notes
     assert np.isfinite(result.scores[np.tril_indices(84, -1)]).all()
     truth = cv2.imread(str(corridor.parent / "samples_GT.bmp"), cv2.IMREAD_GRAYSCALE) > 0
     allowed = np.tri(84, 84, -11, dtype=bool)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import MethodResult, Setting, make_method
+from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
 from loopclosure.methods.seqslam import (
     SeqSlam,
     SequenceSettings,
-    best_matches,
     earlier,
     enhance_contrast,
+    least_cost_matches,
     trajectory_costs,
 )
 from loopclosure.progress import silent
@@ -60,7 +60,7 @@ def test_contrast_of_the_oracle() -> None:
 
 
 def test_matches_of_the_oracle() -> None:
-    match, ratio = best_matches(trajectory_costs(enhance_contrast(planted(), 10), OPEN_SEQSLAM), window=10)
+    match, ratio = least_cost_matches(trajectory_costs(enhance_contrast(planted(), 10), OPEN_SEQSLAM), window=10)
     expected = """5:7:.970799 6:8:.974159 7:19:.970108 8:7:.908976 9:7:.853456 10:8:.955933 11:5:.943301 12:5:.441713
         13:5:.403547 14:6:.295662 15:7:.290555 16:8:.303895 17:9:.226682 18:10:.160210 19:11:.242648 20:12:.279916"""
     found = [line.split(":") for line in expected.split()]
@@ -112,21 +112,21 @@ def test_short_trajectories_at_the_edges() -> None:
 
 
 @pytest.mark.parametrize("velocity", [0.8, 1.0, 1.2])
-@pytest.mark.parametrize("anchor", ["centre", "start"])
+@pytest.mark.parametrize("anchor", ["center", "start"])
 def test_a_drive_at_another_speed_is_found(velocity: float, anchor: str) -> None:
     path = [(q, int(5 + velocity * q)) for q in range(30)]
     costs = trajectory_costs(noise_with_path(30, 45, path), SequenceSettings(anchor=anchor, edges="drop"))
-    match, _ = best_matches(costs)
+    match, _ = least_cost_matches(costs)
     # From the start, half the length is added whatever the speed: one frame off at 0.8, and one by rounding.
     off = np.abs(match[5:25] - [reference for _, reference in path[5:25]])
-    assert off.max() <= (1 if anchor == "centre" else 2)
+    assert off.max() <= (1 if anchor == "center" else 2)
 
 
 def test_a_drive_the_other_way_needs_both_directions() -> None:
     distances = noise_with_path(30, 30, [(q, 29 - q) for q in range(30)])
     for directions, found in (("forward", False), ("both", True)):
         settings = SequenceSettings(directions=directions, edges="drop")
-        match, _ = best_matches(trajectory_costs(distances, settings))
+        match, _ = least_cost_matches(trajectory_costs(distances, settings))
         assert np.all(match[5:25] == 29 - np.arange(5, 25)) == found
 
 
@@ -145,7 +145,7 @@ def test_uniqueness() -> None:
     costs[0, 10] = 2.0  # within the window of ten about 5: no rival
     costs[1, [2, 12]] = 0.0
     costs[2] = np.nan
-    match, ratio = best_matches(costs, window=10)
+    match, ratio = least_cost_matches(costs, window=10)
     np.testing.assert_array_equal(match, [5, 2, -1])
     np.testing.assert_array_equal(ratio, [0.25, 1.0, np.nan])
 
@@ -155,7 +155,7 @@ def test_earlier_frames() -> None:
 
 
 def two_laps() -> np.ndarray:
-    """Return scores (40, 40) of a sequence whose second half passes the first again; neighbours look alike too."""
+    """Return scores (40, 40) of a sequence whose second half passes the first again; neighbors look alike too."""
     scores = -noise_with_path(40, 40, [(q, q - 20) for q in range(20, 40)])
     for gap in range(-3, 4):
         near = np.arange(max(0, gap), min(40, 40 + gap))
@@ -163,9 +163,9 @@ def two_laps() -> np.ndarray:
     return scores
 
 
-def test_one_sequence_never_matches_its_neighbours() -> None:
+def test_one_sequence_never_matches_its_neighbors() -> None:
     method = SeqSlam(Fixed(two_laps()), exclude_frames=5)
-    result = method.score(frames(40), None, [], silent)
+    result = method.score(Images(frames(40)), silent)
     assert not np.isfinite(result.scores[~earlier(40, 5)]).any()
     best = np.argmax(np.nan_to_num(result.scores[20:], nan=-np.inf), axis=1)
     assert np.mean(best == np.arange(20)) > 0.9
@@ -177,13 +177,13 @@ def test_two_traverses_use_the_whole_matrix() -> None:
     scores = -noise_with_path(30, 30, [(q, q) for q in range(30)])
     noisy = scores + np.random.default_rng(9).normal(0, 0.3, scores.shape)
     alone = np.argmax(noisy, axis=1) == np.arange(30)
-    result = SeqSlam(Fixed(noisy)).score(frames(30), frames(30), [], silent)
+    result = SeqSlam(Fixed(noisy)).score(Images(frames(30), frames(30)), silent)
     together = np.argmax(np.nan_to_num(result.scores, nan=-np.inf), axis=1) == np.arange(30)
     assert together.mean() > 0.85 > 0.5 > alone.mean()  # what sequences are for
 
 
 def test_uniqueness_as_the_score() -> None:
-    result = SeqSlam(Fixed(two_laps()), exclude_frames=5, scored="uniqueness").score(frames(40), None, [], silent)
+    result = SeqSlam(Fixed(two_laps()), exclude_frames=5, scored="uniqueness").score(Images(frames(40)), silent)
     assert np.all(np.isfinite(result.scores).sum(axis=1) <= 1)
     query, reference = np.argwhere(np.isfinite(result.scores)).T
     second = query >= 20
@@ -194,9 +194,7 @@ def test_uniqueness_as_the_score() -> None:
 def test_uniqueness_of_scores_that_may_be_of_either_sign() -> None:
     log_odds = 40.0 * (two_laps() + 1.0)
     settings = SequenceSettings(contrast=0)
-    result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(
-        frames(40), None, [], silent
-    )
+    result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(Images(frames(40)), silent)
     found = result.scores[np.isfinite(result.scores)]
     assert len(found) > 20
     assert np.all((found >= 0) & (found <= 1))
@@ -206,11 +204,11 @@ def test_a_sequence_shorter_than_the_exclusion_has_no_scores() -> None:
     for settings in (SequenceSettings(), SequenceSettings(contrast=0)):
         for scored in ("cost", "uniqueness"):
             method = SeqSlam(Fixed(np.zeros((4, 4))), settings, scored, exclude_frames=5)
-            assert np.isnan(method.score(frames(4), None, [], silent).scores).all()
+            assert np.isnan(method.score(Images(frames(4)), silent).scores).all()
 
 
 def test_the_command_line_builds_it() -> None:
-    method = make_method("seqslam:length=6,directions=both,width=32,patch=4", Setting(exclude_frames=7))
+    method = make_method("seqslam:length=6,directions=both,width=32,patch=4", MethodContext(exclude_frames=7))
     assert isinstance(method, SeqSlam)
     assert (method.settings.length, method.settings.directions, method.exclude_frames) == (6, "both", 7)
     assert method.name == "seqslam"
@@ -223,7 +221,7 @@ def test_the_command_line_builds_it() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"directions": "backward"}, 'directions of SeqSLAM: "backward" is none of forward, both'),
+        ({"directions": "backward"}, 'directions of SeqSLAM is "backward"; expected forward or both'),
         ({"anchor": "end"}, "anchor of SeqSLAM"),
         ({"edges": "pad"}, "edges of SeqSLAM"),
         ({"length": 0}, "length >= 1"),

@@ -50,7 +50,7 @@ def test_a_mask_of_places_fits_where_places_are_pairs_of_images() -> None:
     for camera in ("all", "both"):
         with pytest.raises(InputError, match=r"mask\.png: is 2 x 2, but there are 4 images$"):
             mask_of_places(camera, mask, 4, Path("mask.png"))
-    with pytest.raises(InputError, match="is 8 x 8, but there are 4 images; does the folder hold one camera's"):
+    with pytest.raises(InputError, match="is 8 x 8, but there are 4 images; does the folder have only one camera's"):
         mask_of_places("left", np.zeros((8, 8), bool), 4, Path("mask.png"))
 
 

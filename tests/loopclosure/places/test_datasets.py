@@ -1,4 +1,4 @@
-"""Data sets with their truth, on made-up files; on the real ones where they are at hand."""
+"""Data sets with their truth, on synthetic files; on the real ones where they are available."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def tum_folder(tmp_path):
     """A camera that turns by 10 degrees each second for 72 s: two rounds on the spot."""
     folder = write_images(tmp_path / "turn" / "rgb", [f"{i}.png" for i in range(72)]).parent
     lines = [f"{i}.0 rgb/{i}.png" for i in range(72)] + ["100.0 rgb/0.png"]  # the last one has no pose
-    (folder / "rgb.txt").write_text("# made up\n" + "\n".join(lines) + "\n")
+    (folder / "rgb.txt").write_text("# synthetic\n" + "\n".join(lines) + "\n")
     poses = []
     for i in range(72):
         x, y, z, w = Rotation.from_euler("y", 10 * i, degrees=True).as_quat()
@@ -45,8 +45,8 @@ def test_tum_truth_is_the_papers_rule(tum_folder):
     assert data.truth.judged[10, 0]
     assert not data.truth.judged[9, 0]
     assert data.exclude_frames == 9
-    assert "2 m" in data.truth.sentence
-    assert "less than 10 s apart" in data.truth.sentence
+    assert "2 m" in data.truth.description
+    assert "less than 10 s apart" in data.truth.description
     assert data.notes[0] == "frames without a pose, left out: 1"
     assert data.notes[1].startswith("71 of 180 pairs")
 
@@ -101,7 +101,7 @@ def test_fabmap_cameras(fabmap_folder, tmp_path, camera, frames, loops):
         assert cv2.imread(str(data.query_images[0])).shape == (6, 16, 3)
     if camera == "both":
         assert not data.truth.judged[9, 0]
-        assert "left with a right image" in data.notes[0]
+        assert "left and a right image" in data.notes[0]
 
 
 def test_fabmap_stride_and_limit_count_places(fabmap_folder):
@@ -124,29 +124,29 @@ def test_fabmap_mask_of_places_for_images_of_both_cameras(fabmap_folder):
 def test_fabmap_faults(fabmap_folder, tmp_path):
     with pytest.raises(InputError, match="unknown camera"):
         load_fabmap(fabmap_folder, camera="front")
-    with pytest.raises(InputError, match="name a folder"):
+    with pytest.raises(InputError, match="give a folder"):
         load_fabmap(fabmap_folder, camera="joined")
     np.save(tmp_path / "big.npy", np.eye(24, k=-20, dtype=np.uint8))
-    with pytest.raises(InputError, match="24 x 24, but there are 12 images; does the folder hold one camera's"):
+    with pytest.raises(InputError, match="24 x 24, but there are 12 images; does the folder have only one camera's"):
         load_fabmap(fabmap_folder, tmp_path / "big.npy")
     (fabmap_folder / "ImageCollectionCoordinates.txt").write_text("1 2\n3 4\n")
     with pytest.raises(InputError, match="has 2 rows, but there are 12 images"):
         load_fabmap(fabmap_folder, camera="left", exclusion=Exclusion(frames=1))
     (fabmap_folder / "CollegeGroundTruth.mat").unlink()
-    with pytest.raises(InputError, match="the mask of loops; name the file"):
+    with pytest.raises(InputError, match="the mask of loops; give the file"):
         load_fabmap(fabmap_folder)
 
 
 def test_folder_with_a_mask_in_natural_order(tmp_path):
     folder = write_images(tmp_path / "walk", [f"{i + 1}.png" for i in range(12)])
     truth = np.zeros((12, 12), np.uint8)
-    truth[11, 0], truth[10, 0] = 255, 128  # the grey one is soft
+    truth[11, 0], truth[10, 0] = 255, 128  # the gray one is soft
     cv2.imwrite(str(tmp_path / "truth.bmp"), truth)
     data = load_folder(folder, tmp_path / "truth.bmp", exclusion=Exclusion(frames=2))
     assert [path.stem for path in data.query_images] == [str(i + 1) for i in range(12)]
     assert np.argwhere(data.truth.hard).tolist() == [[11, 0]]
     assert np.argwhere(data.truth.soft).tolist() == [[10, 0], [11, 0]]
-    assert "1 pairs that nearly show the same place are ignored" in data.truth.sentence
+    assert "1 pairs that nearly show the same place are ignored" in data.truth.description
 
 
 def test_folder_masks_on_either_side_of_the_diagonal(tmp_path):

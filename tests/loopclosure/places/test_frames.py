@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import Selection, image_paths, read_image, video_frames, video_length
+from loopclosure.places.frames import Selection, image_paths, read_bgr, video_frames, video_length
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_selection(selection, expected):
     ("selection", "sentence"),
     [
         (Selection(start=10), "no frame is left of 10"),
-        (Selection(start="half"), '"half" is no frame'),
+        (Selection(start="half"), '"half" is not a frame'),
         (Selection(stride=0), "stride of 0"),
         (Selection(limit=0), "limit of 0"),
     ],
@@ -65,13 +65,13 @@ def test_broken_sources(tmp_path):
         image_paths(tmp_path / "list.txt")
     with pytest.raises(InputError, match="cannot be read"):
         image_paths(tmp_path / "absent.txt")
-    with pytest.raises(InputError, match="single file"):
+    with pytest.raises(InputError, match="single image"):
         image_paths(tmp_path / "a.png")
     with pytest.raises(InputError, match="no such image"):
-        read_image(tmp_path / "a.png")
+        read_bgr(tmp_path / "a.png")
     (tmp_path / "a.png").write_text("text")
-    with pytest.raises(InputError, match="is not an image"):
-        read_image(tmp_path / "a.png")
+    with pytest.raises(InputError, match="is not a readable image"):
+        read_bgr(tmp_path / "a.png")
 
 
 def test_video(tmp_path):

@@ -47,12 +47,12 @@ def test_sparse_and_bool_masks(tmp_path):
         ("x.txt", "0 one\n", r"x.txt:1:1: expected numbers"),
         ("x.txt", "# nothing\n", "is empty"),
         ("x.txt", "0 7\n0 0\n", "largest entry is 7"),
-        ("x.txt", "0 -1\n1 0\n", "negative or not finite"),
+        ("x.txt", "0 -1\n1 0\n", "negative or non-finite"),
         ("x.txt", "0 0\n0 0\n", "largest entry is 0"),
         ("x.jpg", "", "a JPEG has lost the exact values"),
         ("x.npy", "no array", "cannot be read as .npy"),
         ("x.mat", "no matlab", "cannot be read as .mat"),
-        ("x.png", "no image", "is not an image"),
+        ("x.png", "no image", "is not a readable image"),
     ],
 )
 def test_broken_masks(tmp_path, name, content, sentence):

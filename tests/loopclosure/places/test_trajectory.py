@@ -33,7 +33,7 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def test_groundtruth_is_sorted_and_its_quaternions_are_normalised(tmp_path: Path) -> None:
+def test_groundtruth_is_sorted_and_its_quaternions_are_normalized(tmp_path: Path) -> None:
     path = write(tmp_path / "groundtruth.txt", "# comment\n\n2 1 2 3 0.7071 0 0 0.7071\n1 4 5 6 0 0 0.9998 0\n")
     trajectory = read_groundtruth(path)
     assert trajectory.stamps.tolist() == [1, 2]

@@ -3,18 +3,20 @@
 import csv
 import json
 import re
+from dataclasses import replace
+from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pytest
 
 from loopclosure.evaluate import evaluate, named_method
-from loopclosure.methods.base import MethodResult, Setting
+from loopclosure.methods.base import MethodContext, MethodResult
 from loopclosure.places.datasets import load_traverses, load_tum
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
-from loopclosure.report.figures import best_true_references, decisions
-from loopclosure.report.files import figures_text
+from loopclosure.report.files import measures_text
 from loopclosure.report.page import write_report
+from loopclosure.report.plots import best_true_references, decisions
 
 
 class Says:
@@ -22,18 +24,34 @@ class Says:
 
     name = "says"
 
-    def __init__(self, scores):
-        self.scores = scores
+    def __init__(self, scores, result=None):
+        self.result = result or MethodResult(scores, {"vocabulary": 3.0, "looking": 0.4}, ["a <note>"], ("vocabulary",))
 
-    def score(self, query_images, reference_images, train_images, progress):
-        return MethodResult(self.scores, {"vocabulary": 3.0, "looking": 0.4}, ["a <note>"], ("vocabulary",))
+    def score(self, images, progress):
+        return self.result
+
+
+class Tags(HTMLParser):
+    """What a browser would find in a page: tags, attributes, the schemes of sources, and texts."""
+
+    def __init__(self):
+        super().__init__()
+        self.names, self.attributes, self.sources, self.texts = set(), set(), set(), []
+
+    def handle_starttag(self, tag, attributes):
+        self.names.add(tag)
+        self.attributes |= {name for name, _ in attributes}
+        self.sources |= {value.partition(":")[0] for name, value in attributes if name == "src"}
+
+    def handle_data(self, data):
+        self.texts.append(data)
 
 
 @pytest.fixture(scope="module")
 def evaluation(two_laps, two_laps_features):
     rng = np.random.default_rng(0)
     methods = [
-        named_method(f"A net & more=features:{two_laps_features}", Setting()),
+        named_method(f"A net & more=features:{two_laps_features}", MethodContext()),
         ("<noise>", Says(rng.normal(size=(40, 40)))),
         ("silent", Says(np.full((40, 40), np.nan))),
     ]
@@ -63,6 +81,22 @@ def test_the_page_stands_alone_and_says_what_it_judges_by(evaluation, folder):
     assert "loopclosure evaluate --x" in page
 
 
+def test_what_is_named_maliciously_is_text(two_laps, tmp_path):
+    evil = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7 * 7 }}{% raw %}$\\frac{"
+    data = load_tum(two_laps)
+    data = replace(data, name=evil, notes=[evil], truth=replace(data.truth, description=evil))
+    says = MethodResult(np.zeros((40, 40)), {evil: 1.0}, [evil])
+    evaluation = evaluate(data, [(evil, Says(says.scores, says)), (evil.upper(), Says(says.scores))], train=evil)
+    page = write_report(evaluation, tmp_path, evil, f"loopclosure evaluate --title {evil}").read_text()
+    reader = Tags()
+    reader.feed(page)
+    assert "script" not in reader.names
+    assert not any(name.startswith("on") for name in reader.attributes)
+    assert reader.sources == {"data"}
+    assert {evil, f"loopclosure evaluate --title {evil}"} <= set(reader.texts)
+    assert reader.texts.count(evil) >= 8  # title, heading, training, note of the data, name of the method, stage, note
+
+
 def test_pictures_are_written_and_in_the_page(folder):
     page = (folder / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
@@ -77,9 +111,9 @@ def test_pairs_are_shown_for_each_method(folder):
     sections = page[page.index("<h2>Pairs</h2>") : page.index("<h2>Settings</h2>")].split("<h3>")[1:]
     net, noise, silent = sections
     assert net.count('class="pair found"') == 4
-    assert "surest wrong" in net
+    assert "wrong, highest score" in net
     assert noise.count('class="pair false"') == 4
-    assert silent.count("surest right: none") == 1
+    assert silent.count("right, highest score: none") == 1
     assert silent.count("no score") >= 4
 
 
@@ -98,8 +132,8 @@ def test_figures_are_the_same_in_csv_json_and_text(evaluation, folder):
         )
         assert float(cell["value"]) == pytest.approx(expected, abs=1e-6)
         assert "less than 10 s apart excluded" in cell["truth and exclusion"]
-        assert f"{expected:.3f}" in figures_text(evaluation)
-    assert summary["truth_and_exclusion"] == evaluation.data.truth.sentence
+        assert f"{expected:.3f}" in measures_text(evaluation)
+    assert summary["truth_and_exclusion"] == evaluation.data.truth.description
     assert summary["true_pairs"] == evaluation.data.truth.positives
     assert summary["queries_with_a_loop"] == 20
 
@@ -165,7 +199,7 @@ def test_two_traverses_without_positions(tmp_path):
 
 
 def test_large_matrices_are_drawn_without_losing_loops():
-    from loopclosure.report.figures import _greatest_of_blocks
+    from loopclosure.report.plots import _greatest_of_blocks
 
     values = np.zeros((1001, 900))
     values[700, 333] = 1.0

@@ -45,7 +45,7 @@ def with_(settings: FabMapSettings, **changes: object) -> FabMapSettings:
     return FabMapSettings(**{**settings.__dict__, **changes})
 
 
-def made_up_walk(images: int = 60, words: int = 80, seed: int = 0) -> tuple[WordTree, np.ndarray, np.ndarray]:
+def synthetic_walk(images: int = 60, words: int = 80, seed: int = 0) -> tuple[WordTree, np.ndarray, np.ndarray]:
     """Return the tree and words of a training walk, and the words of another one that passes its places twice."""
     rng = np.random.default_rng(seed)
     common = rng.random(words) * 0.3
@@ -204,7 +204,7 @@ def test_naive_example_b() -> None:
 @pytest.mark.parametrize("naive", [False, True])
 @pytest.mark.parametrize("motion", [False, True])
 def test_version_2_is_version_1_that_samples_every_training_image_once(naive: bool, motion: bool) -> None:
-    tree, training, walk = made_up_walk()
+    tree, training, walk = synthetic_walk()
     first = FabMap(tree, training, with_(ALL_SAMPLES, naive=naive, motion=motion))
     second = FabMap(tree, training, FabMapSettings(naive=naive, motion=motion))
     for words in walk:
@@ -229,7 +229,7 @@ def test_version_2_is_version_1_that_samples_every_training_image_once(naive: bo
 )
 @pytest.mark.parametrize("only_new", [False, True])
 def test_offline_is_online(settings: FabMapSettings, only_new: bool) -> None:
-    tree, training, walk = made_up_walk()
+    tree, training, walk = synthetic_walk()
     fabmap = FabMap(tree, training, settings)
     scores = score_sequence(FabMapModel(tree, training, settings), walk, only_new)
     for i, words in enumerate(walk):
@@ -243,7 +243,7 @@ def test_offline_is_online(settings: FabMapSettings, only_new: bool) -> None:
 
 
 def test_two_traverses_are_located_on_a_finished_map() -> None:
-    tree, training, walk = made_up_walk()
+    tree, training, walk = synthetic_walk()
     lap, again = walk[:30], walk[30:]
     scores = score_sets(FabMapModel(tree, training), again, lap)
     fabmap = FabMap(tree, training)
@@ -257,7 +257,7 @@ def test_two_traverses_are_located_on_a_finished_map() -> None:
 
 
 def test_sampling_approaches_the_mean_of_all_and_follows_the_seed() -> None:
-    tree, training, walk = made_up_walk()
+    tree, training, walk = synthetic_walk()
     model = {seed: FabMapModel(tree, training, FabMapSettings(version=1, seed=seed)) for seed in (0, 1)}
     drawn = [model[seed].new_place(walk, model[seed].draws()) for seed in (0, 0, 1)]
     exact = logsumexp(model[0].likelihoods(walk, training), axis=1) - np.log(len(training))
@@ -267,7 +267,7 @@ def test_sampling_approaches_the_mean_of_all_and_follows_the_seed() -> None:
 
 
 def test_posteriors_sum_to_one() -> None:
-    tree, training, walk = made_up_walk()
+    tree, training, walk = synthetic_walk()
     fabmap = FabMap(tree, training, FabMapSettings(motion=True, recent=3))
     for words in walk:
         location = fabmap.add(words)
@@ -304,7 +304,7 @@ def test_a_word_of_every_image_says_less_than_a_rare_one() -> None:
 
 
 def test_images_without_words_are_places_too() -> None:
-    tree, training, _ = made_up_walk()
+    tree, training, _ = synthetic_walk()
     nothing = np.zeros(len(tree), int)
     for version in (1, 2):
         fabmap = FabMap(tree, training, FabMapSettings(version=version, samples=0))
@@ -316,7 +316,7 @@ def test_images_without_words_are_places_too() -> None:
 
 
 def test_the_matrix_that_openfabmap_writes() -> None:
-    tree, training, walk = made_up_walk()
+    tree, training, walk = synthetic_walk()
     scores = score_sequence(FabMapModel(tree, training), walk)
     matrix = scores.openfabmap_matrix()
     np.testing.assert_array_equal(np.diag(matrix), scores.new)
@@ -326,7 +326,7 @@ def test_the_matrix_that_openfabmap_writes() -> None:
 
 
 def test_recent_images_have_log_odds_but_no_posterior() -> None:
-    tree, training, walk = made_up_walk()
+    tree, training, walk = synthetic_walk()
     scores = score_sequence(FabMapModel(tree, training, FabMapSettings(recent=4)), walk)
     np.testing.assert_array_equal(np.isfinite(scores.posterior), np.tri(60, 60, -5, dtype=bool))
     np.testing.assert_array_equal(np.isfinite(scores.log_odds), np.tri(60, 60, -1, dtype=bool))

@@ -4,11 +4,11 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from loopclosure.errors import InputError
-from loopclosure.words.vocabulary import Extractor, Vocabulary, founders, kmeans, nearest_centres, sequential_clusters
+from loopclosure.words.vocabulary import Extractor, Vocabulary, founders, kmeans, nearest_centers, sequential_clusters
 
 
 def texture(seed: int) -> np.ndarray:
-    """Return a blotchy grey image (120, 160) that has features."""
+    """Return a blotchy gray image (120, 160) that has features."""
     noise = np.random.default_rng(seed).random((120, 160)).astype(np.float32)
     blotches = cv2.GaussianBlur(noise, (0, 0), 2.5)
     return cv2.normalize(blotches, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -49,7 +49,7 @@ def test_a_blank_image_has_no_features_and_no_words(kind: str) -> None:
     np.testing.assert_array_equal(vocabulary.count(blank), [0, 0, 0])
 
 
-def test_no_more_features_than_asked_for_and_colour_is_taken_as_grey() -> None:
+def test_no_more_features_than_asked_for_and_color_is_taken_as_gray() -> None:
     extractor = Extractor(max_features=15)
     assert len(extractor(texture(1))) == 15
     np.testing.assert_array_equal(extractor(cv2.cvtColor(texture(1), cv2.COLOR_GRAY2BGR)), extractor(texture(1)))
@@ -58,33 +58,33 @@ def test_no_more_features_than_asked_for_and_colour_is_taken_as_grey() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"), [({"kind": "surf"}, '"surf"; known: sift, orb'), ({"max_features": 0}, "is 0")]
 )
-def test_extractors_that_are_none(settings: dict, message: str) -> None:
+def test_impossible_extractors(settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Extractor(**settings)
 
 
-def test_nearest_centre_across_blocks() -> None:
-    descriptors, centres = unit_vectors(9000, seed=1), unit_vectors(30, seed=2) * 0.7
-    np.testing.assert_array_equal(nearest_centres(descriptors, centres), np.argmin(cdist(descriptors, centres), axis=1))
+def test_nearest_center_across_blocks() -> None:
+    descriptors, centers = unit_vectors(9000, seed=1), unit_vectors(30, seed=2) * 0.7
+    np.testing.assert_array_equal(nearest_centers(descriptors, centers), np.argmin(cdist(descriptors, centers), axis=1))
 
 
 def test_words_are_counted() -> None:
-    centres = unit_vectors(5, 128)
-    vocabulary = Vocabulary(centres, Extractor())
-    np.testing.assert_array_equal(vocabulary.nearest(centres[[3, 1, 3]]), [3, 1, 3])
-    np.testing.assert_array_equal(vocabulary.count_descriptors(centres[[3, 1, 3]]), [0, 1, 0, 2, 0])
+    centers = unit_vectors(5, 128)
+    vocabulary = Vocabulary(centers, Extractor())
+    np.testing.assert_array_equal(vocabulary.nearest(centers[[3, 1, 3]]), [3, 1, 3])
+    np.testing.assert_array_equal(vocabulary.count_descriptors(centers[[3, 1, 3]]), [0, 1, 0, 2, 0])
     assert len(vocabulary) == 5
 
 
 def test_kmeans_finds_clusters_and_follows_the_seed() -> None:
     heaps = unit_vectors(10, 16, seed=4)
     points = np.repeat(heaps, 200, axis=0) + np.random.default_rng(0).normal(0, 0.01, (2000, 16)).astype(np.float32)
-    centres = kmeans(points, 10, seed=1)
-    assert centres.shape == (10, 16)
-    assert centres.dtype == np.float32
-    spread = np.linalg.norm(points - centres[nearest_centres(points, centres)], axis=1)
+    centers = kmeans(points, 10, seed=1)
+    assert centers.shape == (10, 16)
+    assert centers.dtype == np.float32
+    spread = np.linalg.norm(points - centers[nearest_centers(points, centers)], axis=1)
     assert spread.mean() < 0.2
-    np.testing.assert_array_equal(centres, kmeans(points, 10, seed=1))
+    np.testing.assert_array_equal(centers, kmeans(points, 10, seed=1))
 
 
 def test_kmeans_needs_as_many_descriptors_as_words() -> None:
@@ -107,11 +107,11 @@ def test_founders_are_those_of_the_plain_loop() -> None:
 
 def test_founders_lie_apart_and_cover_all_across_blocks() -> None:
     descriptors, radius = unit_vectors(10_000, seed=3), 0.7
-    centres = descriptors[founders(descriptors, radius)]
-    apart = cdist(centres, centres)
+    centers = descriptors[founders(descriptors, radius)]
+    apart = cdist(centers, centers)
     np.fill_diagonal(apart, np.inf)
     assert apart.min() > radius
-    assert cdist(descriptors, centres).min(axis=1).max() <= radius + 1e-6
+    assert cdist(descriptors, centers).min(axis=1).max() <= radius + 1e-6
 
 
 def test_sequential_words_are_the_means_of_their_clusters() -> None:

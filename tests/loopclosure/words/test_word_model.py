@@ -11,7 +11,7 @@ from loopclosure.words.word_model import Training, WordModel, train
 
 
 def write_textures(folder: Path, count: int, first_seed: int = 0) -> list[Path]:
-    """Write grey images with features, the last one blank."""
+    """Write gray images with features, the last one blank."""
     folder.mkdir(exist_ok=True)
     paths = []
     for i in range(count):
@@ -38,7 +38,7 @@ def test_training_counts_the_words_of_its_images_and_times_its_stages(training_i
     assert list(seconds) == ["training features", "vocabulary", "training words", "tree"]
     assert all(value > 0 for value in seconds.values())
     assert model.training_words.shape == (12, 40)
-    np.testing.assert_array_equal(model.words(training_images), model.training_words)
+    np.testing.assert_array_equal(model.count_words(training_images), model.training_words)
     assert model.training_words[-1].sum() == 0  # the blank image
     assert "k-means, 40 words" in model.vocabulary.made
     assert "12 training images" in model.vocabulary.made
@@ -46,7 +46,7 @@ def test_training_counts_the_words_of_its_images_and_times_its_stages(training_i
 
 def test_the_same_seed_makes_the_same_model(training_images: list[Path], model: WordModel) -> None:
     again = train(training_images, Training(words=40, lower_bound=0.0))
-    np.testing.assert_array_equal(again.vocabulary.centres, model.vocabulary.centres)
+    np.testing.assert_array_equal(again.vocabulary.centers, model.vocabulary.centers)
     np.testing.assert_array_equal(again.tree.parent, model.tree.parent)
 
 
@@ -68,7 +68,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, training_images: list[Path], mo
     for name in ("parent", "marginal", "given_present", "given_absent"):
         np.testing.assert_array_equal(getattr(loaded.tree, name), getattr(model.tree, name))
     np.testing.assert_array_equal(loaded.training_words, model.training_words)
-    np.testing.assert_array_equal(loaded.words(training_images[:3]), model.training_words[:3])
+    np.testing.assert_array_equal(loaded.count_words(training_images[:3]), model.training_words[:3])
 
 
 def test_orb_words_keep_their_extractor(tmp_path: Path, training_images: list[Path]) -> None:
@@ -77,7 +77,7 @@ def test_orb_words_keep_their_extractor(tmp_path: Path, training_images: list[Pa
     assert WordModel.load(tmp_path / "orb.npz").vocabulary.extractor == extractor
 
 
-def test_files_that_are_no_model(tmp_path: Path) -> None:
+def test_files_without_a_model(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none.npz: cannot read the word model: No such file"):
         WordModel.load(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("words")

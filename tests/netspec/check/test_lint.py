@@ -26,16 +26,19 @@ def siamese(params: tuple[str, str] = SHARED, extra: str = "", source: str = "no
 
 @pytest.fixture
 def advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
-    """``advice(net, solver=None, phase=0)``: what is said of a net's text, or of a solver's that trains it."""
+    """``advice(net, solver=None, phase=0)``: what is said of a net's text, or of a solver's that trains it.
+
+    With ``open_data`` the data layers are opened, else their shapes are given.
+    """
     monkeypatch.chdir(tmp_path)
 
-    def check(net: str, solver: str | None = None, phase: int = 0) -> list[str]:
+    def check(net: str, solver: str | None = None, phase: int = 0, open_data: bool = False) -> list[str]:
         Path("net.prototxt").write_text(net)
         if solver is not None:
             Path("solver.prototxt").write_text('net: "net.prototxt"\n' + solver)
         path = "net.prototxt" if solver is None else "solver.prototxt"
-        shapes = {"pair": (10, 2, 4, 4), "sim": (10,)} if "pair" in net else {}
-        checked = check_file(path, phase, shapes=shapes)
+        shapes = {"pair": (10, 2, 4, 4), "sim": (10,)} if "pair" in net and not open_data else {}
+        checked = check_file(path, phase, shapes=shapes, open_data=open_data)
         assert not [fault for part in checked for fault in part.faults]
         return [line for part in checked for line in part.advice]
 
@@ -95,7 +98,7 @@ def test_two_layers_of_one_name(advice: Callable[..., list[str]]) -> None:
 def test_a_phase_without_its_data_layer(advice: Callable[..., list[str]], tmp_path: Path) -> None:
     net = (DATA % "nowhere").replace('top: "sim"', 'top: "sim" include { phase: TRAIN }')
     Path("net.prototxt").write_text(net)
-    (checked,) = check_file("net.prototxt", 1)
+    (checked,) = check_file("net.prototxt")
     assert [str(fault) for fault in checked.faults] == [
         'net.prototxt:3:35: layer "cut" (Slice): unknown bottom blob "pair"; available: none'
     ]
@@ -156,10 +159,8 @@ def test_a_test_that_reads_far_more_or_less_than_there_is(
     advice: Callable[..., list[str]], iterations: int, far: bool
 ) -> None:
     source = str(GOLDEN / "pairs" / "test_lmdb")
-    said = advice(siamese(source=source), SOLVER + f"test_interval: 10\ntest_iter: {iterations}")
+    solver = SOLVER + f"test_interval: 10\ntest_iter: {iterations}"
     read = f"test_iter {iterations} x batch 10 = {10 * iterations}"
-    assert said == ([f'solver.prototxt:4:1: {read}, but "{source}" has 200 records'] if far else [])
-
-
-def test_of_data_that_is_not_at_hand_nothing_is_said(advice: Callable[..., list[str]]) -> None:
-    assert advice(siamese(), SOLVER + "test_interval: 10 test_iter: 1") == []
+    expected = [f'solver.prototxt:4:1: {read}, but layer "d" has 200 records'] if far else []
+    assert advice(siamese(source=source), solver, open_data=True) == expected
+    assert advice(siamese(source=source), solver) == []

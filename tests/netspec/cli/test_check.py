@@ -27,9 +27,18 @@ def test_check_prints_a_net_as_json(run: Run) -> None:
 def test_check_prints_a_table(run: Run) -> None:
     result = run("check", NET, *PAIR_SHAPE)
     rows = {line.split()[0]: line for line in result.out.splitlines() if line}
-    assert rows["conv2"].split() == ["conv2", "Convolution", "4x8x8x8", "1,208", "0.01", "307,200"]
-    assert rows["conv2_p"].split()[3] == "shared"
+    assert rows["conv2"].split() == ["conv2", "Convolution", "pool1", "conv2", "4x8x8x8", "1,208", "0.01", "307,200"]
+    assert rows["slice_pair"].split()[3:8] == ["data,", "data_p", "4x1x28x28,", "4x1x28x28", "0.02"]
+    assert rows["pair_data"].split()[2] == "-"
+    assert rows["conv2_p"].split()[5] == "shared"
     assert rows["total"].split() == ["total", "5,756", "0.20", "1,340,416"]
+
+
+def test_check_shows_caffes_log_when_asked(run: Run) -> None:
+    quiet, loud = (run("check", NET, *PAIR_SHAPE, *words) for words in ([], ["-v"]))
+    assert quiet.err == ""
+    assert "Network initialization done." in loud.messages
+    assert loud.out == quiet.out
 
 
 def test_check_builds_all_nets_of_a_solver(run: Run, edited: Edit) -> None:
@@ -37,14 +46,14 @@ def test_check_builds_all_nets_of_a_solver(run: Run, edited: Edit) -> None:
     result = run("check", solver, *PAIR_SHAPE, "--json")
     assert (result.status, result.err) == (0, "")
     assert sorted(json.loads(result.out)) == ["test net #0", "train net"]
-    assert run("check", solver, *PAIR_SHAPE).out.count("conv2_p") == 2
+    assert run("check", solver, *PAIR_SHAPE).out.count("\nconv2_p ") == 2
 
 
 def test_check_opens_no_data(run: Run) -> None:
     Path("pairs").unlink()
     assert run("check", NET, *PAIR_SHAPE).status == 0
     wanted = f'{NET}:14:3: layer "pair_data" (Data): the shape of "pair_data" is known by its data only; '
-    assert run("check", NET).fault == wanted + "say --shape pair_data=50,C,H,W"
+    assert run("check", NET).fault == wanted + "say --shape pair_data=50,C,H,W, or --data"
 
 
 def test_check_gives_shapes_to_data_layers_and_inputs_only(run: Run) -> None:

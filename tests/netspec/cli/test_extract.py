@@ -12,7 +12,7 @@ import torch
 import netspec
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
-from paths import GOLDEN
+from paths import GOLDEN, ROOT
 
 NET = "sgd_step/train_val.prototxt"
 INIT = "sgd_step/init.caffemodel"
@@ -64,7 +64,7 @@ def test_extract_reads_another_database_and_as_many_batches_as_asked(run: Run) -
 def test_extract_without_weights_warns_of_random_ones(run: Run) -> None:
     result = run("extract", "--model", NET, "--blob", "feat", "--out", "f.npz", "--iterations", 1)
     assert result.status == 0
-    assert "no --weights: the net has random ones" in result.messages
+    assert result.err == "warning: no --weights: the net has random ones\n"
 
 
 @pytest.fixture
@@ -149,9 +149,9 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
-        (["--images", "nowhere"], "nowhere: cannot read the image list: "),
-        (["--images", "list.txt"], "list.txt:2:1: image 'b.png' is missing in ."),
-        (["--images", "empty"], "empty: no image files in this folder"),
+        (["--images", "nowhere"], "nowhere: cannot be read: No such file or directory; expected a folder of images"),
+        (["--images", "list.txt"], 'list.txt:2:1: no such image "b.png" in .'),
+        (["--images", "empty"], "empty: holds no image; expected files that end in .png, "),
         (
             ["--images", "walk/rgb", "--input", "dat"],
             f'{NET}: no blob "dat" in this net; did you mean "data"? it has: ',
@@ -165,8 +165,7 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
             f'{NET}: no data layer "pair" to give a source to; this net\'s: pair_data',
         ),
         (["--source", "pair_data=nowhere"], 'database "nowhere" is not there'),
-        (["--images", "walk/rgb", "--zooms", "1,2"], "found zoom 2, expected more than 0 and at most 1"),
-        (["--out", "nowhere/f.npz"], "--out nowhere/f.npz: there is no folder nowhere; make it first"),
+        (["--out", "nowhere/f.npz"], "--out nowhere/f.npz: cannot be written: No such file or directory"),
         (["--weights", "nowhere.caffemodel"], "nowhere.caffemodel: cannot be read: No such file or directory"),
     ],
 )
@@ -176,12 +175,132 @@ def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: l
     assert fault in run("extract", *IMAGES, *words).fault
 
 
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["--images", "walk/rgb", "--zooms", "1,2"], "found zoom 2, expected more than 0 and at most 1"),
+        (["--images", "walk/rgb", "--zooms", "1,x"], 'found zooms "1,x", expected numbers with commas between'),
+        (["--images", "walk/rgb", "--blob", "sim"], "--images takes one --blob, found 2"),
+        (["--images", "walk/rgb", "--shape", "x=1,1,9,9"], "--shape names x, expected the input blob data"),
+        (["--zooms", "1,0.5"], "--zooms are of --images"),
+    ],
+)
+def test_extract_refuses_words_that_do_not_go_together(run: Run, images: Path, words: list[str], fault: str) -> None:
+    result = run("extract", *IMAGES, *words)
+    assert result.status == 2
+    assert fault in result.err.splitlines()[-1]
+
+
 def test_extract_knows_no_such_blob(run: Run) -> None:
     words = ["--model", NET, "--blob", "feet", "--out", "f.npz", "--weights", INIT]
     expected = f'{NET}: no blob "feet" in this net; did you mean "feat"? it has: pair_data, sim, data, '
     assert run("extract", *words).fault.startswith(expected)
     assert run("extract", *words, "--images", "pairs", "--shape", "data=1,1,28,28").status == 1
     assert not Path("f.npz").exists()
+
+
+# What extract says
+
+
+def test_extract_says_in_three_lines_what_it_did(run: Run, images: Path) -> None:
+    result = run("extract", *IMAGES, "--images", images / "rgb", "--zooms", "1,0.5")
+    assert (result.status, result.err) == (0, "")
+    what, pixels, wrote = result.out.splitlines()
+    assert what == f"{NET}: feat of 3 images from walk/rgb"
+    scaled = '0 to 255, times 0.00390625, as the transform_param of layer "pair_data" says'
+    assert pixels == f"data (1 x 28 x 28): gray, {scaled}"
+    assert wrote.startswith("f.npz: features (3, 16), names (3,), zooms (2,); ")
+    assert wrote.endswith(" ms per image")
+
+
+@pytest.mark.parametrize(
+    ("param", "told"),
+    [
+        ("mean_value: 128 scale: 0.0078125", ", minus 128, times 0.0078125"),
+        ("mean_value: 123 mean_value: 104 mean_value: 123", ", minus 123, 104, 123"),
+        ("mirror: true", ""),
+    ],
+)
+def test_extract_says_what_it_does_to_the_pixels(run: Run, images: Path, param: str, told: str) -> None:
+    Path("net.prototxt").write_text(
+        'layer { name: "in" type: "DummyData" top: "data" dummy_data_param { shape { dim: 1 dim: 3 dim: 9 dim: 9 } } '
+        f"transform_param {{ {param} }} }}"
+    )
+    words = ["--model", "net.prototxt", "--blob", "data", "--images", images / "rgb", "--out", "f.npz"]
+    pixels = run("extract", *words).out.splitlines()[1]
+    assert pixels == f'data (3 x 9 x 9): BGR, 0 to 255{told}, as the transform_param of layer "in" says'
+
+
+def test_extract_says_how_many_records_it_read(run: Run) -> None:
+    result = run("extract", "--model", NET, "--weights", INIT, "--blob", "feat", "sim", "--out", "f.npz")
+    assert (result.status, result.err) == (0, "")
+    what, wrote = result.out.splitlines()
+    assert what == f"{NET}: feat, sim of 200 records"
+    assert wrote.startswith("f.npz: feat (200, 8), sim (200, 1), keys (200,); ")
+    assert wrote.endswith(" ms per record")
+
+
+def test_extract_shows_caffes_log_when_asked(run: Run, images: Path) -> None:
+    words = [*IMAGES, "--images", images / "rgb"]
+    quiet = run("extract", *words)
+    for option in ("-v", "--verbose"):
+        loud = run("extract", option, *words)
+        assert "Network initialization done." in loud.messages
+        assert "Creating Layer conv1" in loud.messages
+        assert loud.out.splitlines()[:2] == quiet.out.splitlines()[:2]
+
+
+# Whether the pixels are those of the training
+
+INPUT = """
+layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1 dim: 28 dim: 28 } } }
+"""
+OWN_SCALE = 'layer { name: "scale" type: "Power" bottom: "data" top: "data" power_param { scale: 0.00390625 } }'
+CONV = """
+layer {
+  name: "conv1" type: "Convolution" bottom: "data" top: "conv1" convolution_param { num_output: 6 kernel_size: 5 }
+}
+"""
+TRAINED = f"{INIT} was trained with transform_param {{ scale: 0.00390625 }}, which deploy.prototxt lacks: "
+
+
+def conv1_of(run: Run, model: str, weights: str = INIT) -> tuple[np.ndarray, Any]:
+    """The blob "conv1" of the images, and what the command said."""
+    words = ["--model", model, "--weights", weights, "--blob", "conv1", "--images", "walk/rgb", "--out", "f.npz"]
+    result = run("extract", *words)
+    assert result.status == 0
+    return np.load("f.npz")["features"], result
+
+
+def test_a_deploy_file_without_the_scale_of_the_training_gets_a_warning(run: Run, images: Path) -> None:
+    Path("deploy.prototxt").write_text(INPUT + CONV)
+    found, result = conv1_of(run, "deploy.prototxt")
+    assert result.err.startswith(f"warning: {TRAINED}")
+    assert len(result.err.splitlines()) == 1
+    assert "data (1 x 28 x 28): gray, 0 to 255, since no transform_param says otherwise" in result.out
+    assert not np.allclose(found, conv1_of(run, NET)[0], atol=0.1)
+
+
+def test_a_deploy_file_that_scales_by_itself_gets_no_warning(run: Run, images: Path) -> None:
+    Path("deploy.prototxt").write_text(INPUT + OWN_SCALE + CONV)
+    found, result = conv1_of(run, "deploy.prototxt")
+    assert result.err == ""
+    np.testing.assert_allclose(found, conv1_of(run, NET)[0], rtol=1e-4, atol=1e-5)
+
+
+def test_weights_that_tell_of_no_transform_get_no_warning(run: Run, images: Path) -> None:
+    Path("deploy.prototxt").write_text(INPUT + CONV)
+    net = netspec.load_net("deploy.prototxt")
+    for weights in ("deploy.caffemodel", "deploy.caffemodel.h5"):
+        netspec.save_weights(net, weights)
+        assert conv1_of(run, "deploy.prototxt", weights)[1].err == ""
+
+
+def test_the_net_that_the_project_brings_gets_no_warning(run: Run, images: Path) -> None:
+    words = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
+    _, result = conv1_of(run, str(words / "deploy.prototxt"), str(words / "siamese_words_256.caffemodel"))
+    assert result.err == ""
+    assert len(result.out.splitlines()) == 3
 
 
 # extract_features
@@ -206,7 +325,7 @@ def test_extract_features_says_in_one_line_what_is_wrong(run: Run) -> None:
     def fault(*words: str) -> str:
         return run("extract_features", INIT, NET, *words).fault
 
-    assert 'no blob "feet" in this net; it has: pair_data, ' in fault("feet", "db", "1", "lmdb")
+    assert 'no blob "feet" in this net; did you mean "feat"? it has: ' in fault("feet", "db", "1", "lmdb")
     assert "found 2 blob names and 1 databases, expected as many" in fault("feat,sim", "db", "1", "lmdb")
     Path("db").mkdir()
     assert fault("feat", "db", "1", "lmdb").startswith("db: exists already; ")

@@ -12,6 +12,8 @@ import pytest
 
 from paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 SOLVER = "sgd_step/solver.prototxt"
 
 

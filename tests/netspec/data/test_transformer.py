@@ -40,20 +40,20 @@ def caffe(
 
 
 def test_without_settings_values_become_floats() -> None:
-    found = transformer()(list(IMAGES), 0)
+    found = transformer()(list(IMAGES), range(40))
     assert found.dtype == np.float32
     assert (found == IMAGES).all()
 
 
 @pytest.mark.parametrize("mean_value", [[7.5], [1.0, 2.5, 103.939]])
 def test_the_mean_is_subtracted_before_the_scale(mean_value: list[float]) -> None:
-    found = transformer(mean_value=mean_value, scale=0.017)(list(IMAGES), 0)
+    found = transformer(mean_value=mean_value, scale=0.017)(list(IMAGES), range(40))
     means = np.array(mean_value, np.float32).reshape(-1, 1, 1)
     assert (found == (IMAGES.astype(np.float32) - means) * np.float32(0.017)).all()
 
 
 def test_the_crop_is_central_and_floored_in_test() -> None:
-    found = transformer(crop_size=6)(list(IMAGES), 0)
+    found = transformer(crop_size=6)(list(IMAGES), range(40))
     assert (found == IMAGES[:, :, 1:7, 3:9]).all()
 
 
@@ -63,7 +63,7 @@ def test_training_does_what_caffes_loops_do_with_the_same_draws(tmp_path: Path, 
     write_mean(str(tmp_path / "mean.binaryproto"), mean)
     settings = {"crop_size": 6, "mirror": True, "scale": 0.0039, "mean_file": str(tmp_path / "mean.binaryproto")}
     images = list(IMAGES.astype(np.float32) if floats else IMAGES)
-    found = transformer(TRAIN, **settings)(images, first=1000)
+    found = transformer(TRAIN, **settings)(images, range(1000, 1040))
     draws = words(5, "data", 1000, len(images)).tolist()
     assert len({(m % 2, h % 4, w % 7) for m, h, w, _ in draws}) > 20
     for image, top, (m, h, w, _) in zip(images, found, draws, strict=True):  # drawn in the order mirror, h_off, w_off
@@ -71,16 +71,17 @@ def test_training_does_what_caffes_loops_do_with_the_same_draws(tmp_path: Path, 
 
 
 def test_mirroring_happens_in_test_too() -> None:  # as in Caffe: only the crop knows the phase
-    found = transformer(TEST, mirror=True)(list(IMAGES), 0)
+    found = transformer(TEST, mirror=True)(list(IMAGES), range(40))
     mirrored = [(top == image[:, :, ::-1]).all() for top, image in zip(found, IMAGES, strict=True)]
     assert mirrored == [m % 2 == 1 for m in words(5, "data", 0, 40)[:, 0].tolist()]
 
 
 def test_records_are_transformed_alike_in_any_batch() -> None:
     train = transformer(TRAIN, crop_size=4, mirror=True)
-    whole = train(list(IMAGES), 0)
-    parts = np.concatenate([train(list(IMAGES[i : i + 8]), i) for i in range(0, 40, 8)])
+    whole = train(list(IMAGES), range(40))
+    parts = np.concatenate([train(list(IMAGES[i : i + 8]), range(i, i + 8)) for i in range(0, 40, 8)])
     assert (whole == parts).all()
+    assert (whole[1::3] == train(list(IMAGES[1::3]), range(1, 40, 3))).all()
 
 
 def test_force_color_and_force_gray_are_for_encoded_images(caplog: pytest.LogCaptureFixture) -> None:

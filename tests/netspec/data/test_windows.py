@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from netspec.data.windows import WindowSource, read_window_file
+from netspec.data.windows import WindowSource, read_window_file, window_mean, wrong_means
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import TransformationParameter, message
 
@@ -33,10 +34,21 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def at(*path: str | int) -> Where:
+    return Where("net.prototxt", 5, 1)
+
+
+def window_param(folder: Path, **fields: object) -> Any:
+    return message("WindowDataParameter")(source=str(folder / "windows.txt"), **({"batch_size": 8} | fields))
+
+
 def source(folder: Path, transform: dict | None = None, **fields: object) -> WindowSource:
-    param = message("WindowDataParameter")(source=str(folder / "windows.txt"), **({"batch_size": 8} | fields))
+    param = window_param(folder, **fields)
     transform_param = TransformationParameter(crop_size=CROP, **(transform or {}))
-    return WindowSource(param, transform_param, lambda *path: Where("net.prototxt", 5, 1), 1, "data/TRAIN")
+    for fault in wrong_means(transform_param, at):
+        raise fault
+    file, mean = read_window_file(param, at()), window_mean(transform_param, at)
+    return WindowSource(param, transform_param, file, mean, at, 1, "data/TRAIN")
 
 
 def warped(x1: int, y1: int, x2: int, y2: int) -> np.ndarray:
@@ -44,7 +56,7 @@ def warped(x1: int, y1: int, x2: int, y2: int) -> np.ndarray:
 
 
 def test_windows_are_sorted_by_their_overlap(folder: Path) -> None:
-    found = read_window_file(str(folder / "windows.txt"), "", 0.5, 0.3, None)
+    found = read_window_file(window_param(folder, fg_threshold=0.5, bg_threshold=0.3), None)
     assert [(w.label, w.x1, w.y2) for w in found.foreground] == [(5, 4, 17), (7, 0, 9)]
     assert [(w.label, w.x1) for w in found.background] == [(0, 10)]  # 0.4 is neither
 

@@ -1,15 +1,14 @@
 """How tests of dialects build one layer, and check its gradients."""
 
 from collections.abc import Callable
-from functools import partial
 
 import pytest
 import torch
 
 from netspec.dialects import use_dialect
-from netspec.layers import Context, Layer, Random, layer_class
+from netspec.layers import Layer
+from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST
-from netspec.proto.text import parse_net_text
 from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 
@@ -22,18 +21,12 @@ def _leave_no_dialect(leave_no_dialect: None) -> None:
 def build() -> Callable[..., Layer]:
     """``build(dialect, text, *bottom_shapes, phase=TEST, tops=1)``: a layer from the text of a LayerParameter.
 
-    Its faults have the places of that text, the file being "f".
+    Its faults have the places of that text, the file being "<layer>".
     """
 
     def build_layer(name: str, text: str, *shapes: tuple[int, ...], phase: int = TEST, tops: int = 1) -> Layer:
         use_dialect(name)
-        net, source = parse_net_text(f"layer {{ {text} }}", "f")
-        param = net.layer[0]
-        param.bottom.extend(f"bottom{i}" for i in range(len(shapes)))
-        param.top.extend(f"top{i}" for i in range(tops))
-        cls = layer_class(param.type)
-        assert cls is not None, param.type
-        return cls(param, shapes, Context(phase=phase, random=Random(0), at=partial(source.at, 0)))
+        return make_layer(text, shapes, tops, phase=phase)
 
     return build_layer
 

@@ -14,6 +14,7 @@ SENET = SHARED / "corpus" / "hujie-frank+SENet" / "models"
 PARAMETERS = {"SE-ResNet-50": 28.1, "SE-ResNet-101": 49.3, "SE-ResNet-152": 66.8, "SE-ResNeXt-50": 27.6}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(SENET.glob("*.prototxt")), ids=lambda path: path.stem)
 def test_senets_build(path: Path) -> None:
     net, _ = parse_net(path)

@@ -60,7 +60,7 @@ def test_the_documented_example_runs_from_the_command_line(fork: Path, capsys: p
     assert main(["check", net]) == 1
     assert 'LayerParameter has no field "times_param"' in capsys.readouterr().err
     assert main(["check", net, "--plugin", str(fork)]) == 0
-    assert re.search(r"times +Times +2x3", capsys.readouterr().out)
+    assert re.search(r"times +Times +x +y +2x3", capsys.readouterr().out)
     assert main(["-plugin", str(fork), "check", net]) == 2  # an option of the command
     assert main(["layers", "--plugin", str(fork)]) == 0
     assert re.search(r"^Times +Multiply by a number\.$", capsys.readouterr().out, re.MULTILINE)

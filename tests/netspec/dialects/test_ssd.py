@@ -40,8 +40,8 @@ def test_permute(build: Build, gradcheck: Gradcheck, order: tuple[int, ...], axe
 
 
 def test_permute_refuses_an_axis_twice_or_beyond(build: Build) -> None:
-    for order, column in (("order: 0 order: 0", 50), ("order: 4 order: 0", 41)):
-        with pytest.raises(SpecError, match=rf"^f:1:{column}: .*expected each of 0 to 3 at most once"):
+    for order, column in (("order: 0 order: 0", 42), ("order: 4 order: 0", 33)):
+        with pytest.raises(SpecError, match=rf"^<layer>:1:{column}: .*expected each of 0 to 3 at most once"):
             build("ssd", f"type: 'Permute' permute_param {{ {order} }}", (2, 3, 4, 5))
 
 

@@ -3,9 +3,9 @@
 import pytest
 
 from netspec.errors import SpecError
-from netspec.graph.filter import filter_net, merged_state, with_state
+from netspec.graph.filter import filter_net, in_state, with_state
 from netspec.graph.splits import insert_splits
-from netspec.proto.schema import NetState
+from netspec.proto.schema import NetParameter, NetState
 from netspec.proto.text import parse_net_text
 
 RULES = """
@@ -52,8 +52,10 @@ def test_include_and_exclude_together_are_refused_with_their_place() -> None:
 
 
 def test_states_merge_as_the_solver_merges_them() -> None:
-    state = merged_state(NetState(phase=0, level=1), NetState(stage=["a"]), NetState(level=3, stage=["b"]))
+    net = NetParameter(state=NetState(level=7, stage=["own"]))
+    state = in_state(net, NetState(phase=0, level=1), NetState(stage=["a"]), NetState(level=3, stage=["b"])).state
     assert (state.phase, state.level, list(state.stage)) == (0, 3, ["a", "b"])
+    assert net.state.level == 7  # the argument is as it was
 
 
 def _split(text: str) -> list[str]:

@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 import torch
-from google.protobuf import text_format
 
 from netspec.errors import Where
-from netspec.layers import Context, Layer, Random, layer_class
-from netspec.proto.schema import TEST, LayerParameter
+from netspec.layers import Layer, Random
+from netspec.net.one_layer import make_layer
+from netspec.proto.schema import TEST
 
 
 @pytest.fixture(autouse=True)
@@ -39,14 +39,8 @@ def build(exact: str) -> Callable[..., Layer]:
     def build_layer(
         text: str, *shapes: tuple[int, ...], tops: int = 1, phase: int = TEST, seed: int = 0, **context: Any
     ) -> Layer:
-        param = LayerParameter()
-        text_format.Parse(text, param)
-        param.bottom.extend(f"bottom{i}" for i in range(len(shapes)))
-        param.top.extend(f"top{i}" for i in range(tops))
-        cls = layer_class(param.type)
-        assert cls is not None, param.type
         options = {"phase": phase, "random": Random(seed), "at": _at, "exact": exact, **context}
-        return cls(param, shapes, Context(**options))
+        return make_layer(text, shapes, tops, **options)
 
     return build_layer
 

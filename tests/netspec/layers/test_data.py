@@ -15,7 +15,7 @@ from google.protobuf import text_format
 from netspec.data.database import Writer, open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
 from netspec.errors import SpecError, Where
-from netspec.layers import Context, Layer, Random, layer_class
+from netspec.layers import Context, Layer, layer_class
 from netspec.layers.data.files import ReadingLayer
 from netspec.layers.data.memory import MemoryData
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
@@ -30,7 +30,7 @@ def data_layer(text: str, phase: int = TEST, seed: int = 0, device: str = "cpu",
     cls = layer_class(param.type)
     assert cls is not None
     at = lambda *path: Where("net.prototxt", 1, 2, ".".join(map(str, path)))  # noqa: E731
-    return cls(param, [], Context(phase=phase, random=Random(seed), at=at, device=torch.device(device), **context))
+    return cls(param, [], Context(phase=phase, data_seed=seed, at=at, device=torch.device(device), **context))
 
 
 def reading(text: str, **context: Any) -> ReadingLayer:
@@ -210,7 +210,7 @@ def test_bad_data_params_are_refused_where_they_stand(param: str, place: str, me
 # Without opening data
 
 DATA = 'name: "d" type: "Data" top: "data" top: "label" data_param { source: "x" batch_size: 8 }'
-LIST = 'name: "d" type: "ImageData" top: "data" top: "label" '
+LIST = 'name: "d" type: "ImageData" top: "data" top: "label" image_data_param { source: "x" %s }'
 ROWS = 'name: "d" type: "HDF5Data" top: "data" top: "label" hdf5_data_param { source: "x" batch_size: 8 }'
 CUT = "transform_param { crop_size: 6 mean_value: 1 mean_value: 2 mean_value: 3 }"
 WINDOWS = 'name: "d" type: "WindowData" top: "data" top: "label" window_data_param { source: "x" batch_size: 8 }'
@@ -223,9 +223,9 @@ IMAGE_BATCH, GREY_BATCH, LABELS = [(8, 3, 6, 6), (8,)], [(8, 1, 5, 4), (8,)], [(
         (DATA, {"data": (2, 5)}, LABELS),  # the label follows
         (DATA, {"data": (2, 5), "label": (2, 1)}, [(2, 5), (2, 1)]),
         (DATA + CUT, {}, IMAGE_BATCH),
-        (LIST + "image_data_param { batch_size: 8 new_height: 5 new_width: 4 is_color: false }", {}, GREY_BATCH),
+        (LIST % "batch_size: 8 new_height: 5 new_width: 4 is_color: false", {}, GREY_BATCH),
         (
-            LIST + "image_data_param { batch_size: 8 new_height: 5 new_width: 4 } transform_param { crop_size: 6 }",
+            LIST % "batch_size: 8 new_height: 5 new_width: 4" + "transform_param { crop_size: 6 }",
             {},
             IMAGE_BATCH,
         ),
@@ -241,12 +241,12 @@ def test_shapes_are_known_without_data(text: str, given: Mapping[str, tuple[int,
     ("text", "wanted"),
     [
         (DATA, "--shape data=8,C,H,W"),
-        (LIST + "image_data_param { batch_size: 8 }", "--shape data=8,C,H,W"),
+        (LIST % "batch_size: 8", "--shape data=8,C,H,W"),
         (ROWS, "--shape data=8,..."),
     ],
 )
 def test_a_shape_that_only_the_data_knows_is_asked_for(text: str, wanted: str) -> None:
-    with pytest.raises(SpecError, match=f'the shape of "data" is known by its data only; say {wanted}$'):
+    with pytest.raises(SpecError, match=f'the shape of "data" is known by its data only; say {wanted}, or --data$'):
         data_layer(text, open_data=False)
 
 
@@ -261,7 +261,7 @@ def test_a_net_built_without_data_says_so_when_it_is_run() -> None:
 def image_data(tmp_path: Path, more: str = "", batch_size: int = 4) -> ReadingLayer:
     (tmp_path / "list.txt").write_text((IMAGES / "list.txt").read_text())
     source = f'source: "{tmp_path}/list.txt" root_folder: "{IMAGES}/png/"'
-    return reading(f"{LIST} image_data_param {{ {source} batch_size: {batch_size} {more} }}")
+    return reading(LIST.replace('source: "x"', source) % f"batch_size: {batch_size} {more}")
 
 
 @pytest.mark.parametrize(
@@ -284,7 +284,7 @@ def test_image_data_is_shuffled_anew_each_epoch(tmp_path: Path) -> None:
 def test_image_data_names_a_missing_image_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text("0.png 0\nnix.png 1\n")
     source = f'source: "{tmp_path}/list.txt" root_folder: "{IMAGES}/png/"'
-    layer = reading(LIST + f"image_data_param {{ {source} batch_size: 1 }}")
+    layer = reading(LIST.replace('source: "x"', source) % "batch_size: 1")
     layer.run()
     with pytest.raises(SpecError, match=r'list.txt:2:1: image ".*/png/nix.png" cannot be read: No such file'):
         layer.run()

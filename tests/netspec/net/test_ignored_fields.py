@@ -96,7 +96,8 @@ def test_the_old_places_of_a_transform_mean_nothing_to_a_current_data_layer(net_
         'layer { name: "d" type: "Data" top: "d" data_param { source: "no" batch_size: 2 scale: 0.5 mirror: true } }'
         'layer { name: "i" type: "ImageData" top: "i" top: "l" image_data_param { source: "no" crop_size: 4 } '
         "data_param { prefetch: 2 batch_size: 3 } transform_param { scale: 2 } }"
-        'layer { name: "w" type: "WindowData" top: "w" top: "v" window_data_param { batch_size: 1 scale: 3 } '
+        'layer { name: "w" type: "WindowData" top: "w" top: "v" '
+        'window_data_param { source: "no" batch_size: 1 scale: 3 } '
         "transform_param { crop_size: 4 scale: 2 } }",
         open_data=False,
         given_shapes={"d": (2, 1, 4, 4), "i": (1, 3, 4, 4)},

@@ -83,6 +83,14 @@ def test_compiled_schema_is_that_of_the_proto_file(tmp_path: Path) -> None:
     assert list(fresh.file) == [compiled()]
 
 
+def test_stub_for_type_checkers_is_that_of_the_proto_file(tmp_path: Path) -> None:
+    protoc = pytest.importorskip("grpc_tools.protoc")
+    plugin = Path(sys.executable).with_name("protoc-gen-mypy")
+    arguments = [f"-I{PROTO}", f"--plugin=protoc-gen-mypy={plugin}", f"--mypy_out={tmp_path}", "caffe.proto"]
+    assert protoc.main(["protoc", *arguments]) == 0
+    assert (tmp_path / "caffe_pb2.pyi").read_text() == (PROTO / "caffe_pb2.pyi").read_text()
+
+
 def test_own_reader_of_declarations_agrees_with_protoc() -> None:
     source = (PROTO / "caffe.proto").read_text(encoding="utf-8")
     pools = DescriptorPool(), DescriptorPool()

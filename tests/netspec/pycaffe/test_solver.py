@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import netspec
 import netspec.pycaffe as caffe
 from pycaffe_nets import CLASSES, SMALL
 
@@ -157,3 +158,20 @@ def test_faults_of_the_file_are_exceptions(write: Callable[..., str]) -> None:
         caffe.SGDSolver(write('net: "net.prototxt" base_lr: 0.01 lr_policy: "fxed"', "solver.prototxt"))
     with pytest.raises(ValueError, match=r'unknown solver type "Sgd2"'):
         caffe.get_solver(write('net: "net.prototxt" type: "Sgd2" lr_policy: "fixed"', "solver.prototxt"))
+
+
+def test_debug_info_logs_what_netspecs_own_solver_logs(
+    write: Callable[..., str], caplog: pytest.LogCaptureFixture
+) -> None:
+    write(SMALL.replace("force_backward: true", ""))
+    settings = write(
+        'net: "net.prototxt" base_lr: 0.1 lr_policy: "fixed" debug_info: true display: 1 random_seed: 1', "s.prototxt"
+    )
+    caplog.set_level("INFO")
+    logs = []
+    for solver in (caffe.SGDSolver(settings), netspec.load_solver(settings)):
+        caplog.clear()
+        solver.step(1)
+        logs.append([m for m in caplog.messages if "ward]" in m])
+    assert logs[0] == logs[1]
+    assert len(logs[0]) > 10

@@ -1,11 +1,12 @@
 import math
+import re
 
 import pytest
 
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
-from netspec.solver.lr_policy import check_policy, learning_rate, next_step
+from netspec.solver.lr_policy import learning_rate, next_step, policy_faults
 
 NODE = Place(
     Where("s.prototxt"),
@@ -97,9 +98,9 @@ def test_poly_has_no_rate_beyond_max_iter():
     ],
 )
 def test_what_is_refused_before_the_first_iteration(fields: dict, message: str):
-    with pytest.raises(SpecError, match=message):
-        check_policy(SolverParameter(**fields), NODE)
+    (fault,) = policy_faults(SolverParameter(**fields), NODE)
+    assert re.search(message, str(fault))
 
 
 def test_a_gamma_of_0_is_legal():
-    check_policy(SolverParameter(lr_policy="step", gamma=0, stepsize=1), NODE)
+    assert not list(policy_faults(SolverParameter(lr_policy="step", gamma=0, stepsize=1), NODE))

@@ -1,10 +1,14 @@
 from pathlib import Path
 
 import pytest
+from google.protobuf.message import Message
 
 from netspec.errors import SpecError
+from netspec.graph.filter import with_train_state
+from netspec.proto.reader import read_text
+from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver_text
-from netspec.solver.nets import SolverNet, solver_nets, with_train_state
+from netspec.solver.nets import SolverNet, solver_nets
 
 
 @pytest.fixture(autouse=True)
@@ -116,3 +120,36 @@ def test_a_net_within_the_solver_keeps_its_places():
 def test_what_caffe_refuses(text: str, message: str):
     with pytest.raises(SpecError, match=message):
         nets(text)
+
+
+def test_a_file_is_read_once_however_many_nets_it_holds(monkeypatch: pytest.MonkeyPatch):
+    read: list[str] = []
+
+    def noted(text: str, file: str, message: Message) -> Place:
+        read.append(file)
+        return read_text(text, file, message)
+
+    monkeypatch.setattr("netspec.proto.text.read_text", noted)
+    nets('net: "a.prototxt" test_net: "b.prototxt" test_net: "b.prototxt"' + "test_iter: 1 " * 4 + "test_interval: 1")
+    assert read == ["s.prototxt", "a.prototxt", "b.prototxt"]
+
+
+def test_every_fault_is_told_to_who_asks_for_all():
+    Path("broken.prototxt").write_text("layer {")
+    text = """net: "gone.prototxt" train_net: "broken.prototxt"
+test_net: "broken.prototxt" test_net: "missing.prototxt"
+test_net: "b.prototxt"
+test_iter: 1
+test_state { } test_state { }"""
+    faults: list[SpecError] = []
+    found = solver_nets(*parse_solver_text(text, "s.prototxt"), faults.append)
+    assert [str(fault).partition("; ")[0] for fault in faults] == [
+        "s.prototxt:1:22: found net and train_net, expected exactly one of net, net_param, train_net, train_net_param",
+        's.prototxt:1:1: net "gone.prototxt" is not a file',
+        'broken.prototxt:1:8: the file ends inside "layer" of line 1',
+        's.prototxt:2:29: test_net "missing.prototxt" is not a file',
+        "s.prototxt:4:1: found 1 test_iter, expected 3, one for each test_net and test_net_param (or more)",
+        "s.prototxt:5:1: found 2 test_state, expected none or one for each of the 3 test nets",
+        "s.prototxt: found test_interval 0, expected more than 0, since there is a net to test",
+    ]
+    assert [part.label for part in found] == ["test net #2"]

@@ -1,14 +1,16 @@
-"""The pictures of the report: matrices, precision-recall curves, maps, matches; matplotlib figures, nothing written."""
+"""The pictures of the report: matrices, precision-recall curves, maps, matches; matplotlib figures, nothing written.
+
+They are made without pyplot, which would choose a backend for the whole program. Names of methods and data sets are
+drawn as they are (``parse_math=False``): a dollar sign in them does not begin a formula.
+"""
 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterable
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -16,17 +18,22 @@ from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.transforms import ScaledTranslation
 
 from loopclosure.evaluate import Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import BEST_MATCH, PrecisionRecall
 
-# Told apart by colour-blind readers too (Okabe and Ito).
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+# Color-blind readers can distinguish these too (Okabe and Ito).
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 FOUND, FALSE, MISSED = "#1a9641", "#d7191c", "#9e9e9e"
+LINES = ("-", "--", ":", "-.")  # a second round of the colors is dashed, and so on
+TITLE_WIDTH = 38  # characters that fit above a panel of a grid
+LABEL_WIDTH = 60  # characters of a legend's line that fit below a panel
+LABELS_HEIGHT = 0.5  # inches for the tick labels and the label of the horizontal axis
 NOT_JUDGED = "#ececec"
 SHOWN_CELLS = (
-    700  # a matrix with more rows or columns is drawn by the greatest of each block, or thin loops would vanish
+    700  # of a matrix with more rows or columns the greatest of each block is drawn, or thin loops would vanish
 )
 COLUMNS = 4
 
@@ -43,10 +50,10 @@ STYLE: dict[Any, Any] = {
 
 
 def matrices(evaluation: Evaluation) -> Figure:
-    """Draw the truth and beside it the scores of every method (the paper's figures 5 and 6)."""
+    """Draw the truth and the scores of every method (the paper's Figures 5 and 6)."""
     truth = evaluation.data.truth
     panels = 1 + len(evaluation.outcomes)
-    with plt.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, axes = _grid(panels, 1.0 if truth.hard.shape[0] == truth.hard.shape[1] else 0.9)
         shown = np.where(truth.hard, 2.0, np.where(truth.soft, 1.0, 0.0))
         _draw_matrix(
@@ -57,8 +64,8 @@ def matrices(evaluation: Evaluation) -> Figure:
             scores = np.where(truth.judged & np.isfinite(outcome.scores), outcome.scores, np.nan)
             some = scores[np.isfinite(scores)]
             low, high = np.percentile(some, [1, 99.5]) if len(some) else (0.0, 1.0)
-            _draw_matrix(axis, scores, plt.get_cmap("viridis"), float(low), float(high))
-            axis.set_title(outcome.name)
+            _draw_matrix(axis, scores, matplotlib.colormaps["viridis"], float(low), float(high))
+            _name_panel(axis, outcome)
         references = "earlier frame" if evaluation.data.reference_images is None else "reference"
         for axis in axes:
             axis.set_xlabel(references)
@@ -69,8 +76,9 @@ def matrices(evaluation: Evaluation) -> Figure:
 
 def curves(evaluation: Evaluation) -> Figure:
     """Draw the precision-recall curves of all methods, one panel for each convention."""
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+        axes = figure.subplots(1, 2)
         for axis, kind in zip(axes, ("pairs", "best"), strict=True):
             convention = ""
             for number, outcome in enumerate(evaluation.outcomes):
@@ -86,18 +94,18 @@ def curves(evaluation: Evaluation) -> Figure:
             axis.set_xlim(-0.01, 1.01)
             axis.set_ylim(0, 1.03)
             axis.grid(color="#e6e6e6", linewidth=0.5)
-            axis.legend(title="average precision", fontsize=8, title_fontsize=8, loc="best", alignment="left")
+        _legends_below(figure, axes)
         _state_truth(figure, evaluation)
         return figure
 
 
 def matches(evaluation: Evaluation) -> Figure:
-    """Draw for each method, frame against frame, the loops found, false and missed over the truth."""
-    with plt.rc_context(STYLE):
+    """Draw for each method the found, false and missed loops, frame against frame, over the truth."""
+    with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(evaluation.outcomes), 1.0)
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_matches(axis, outcome, evaluation.data.truth)
-            axis.set_title(outcome.name)
+            _name_panel(axis, outcome)
         _label_left(axes, "query")
         _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
@@ -105,28 +113,28 @@ def matches(evaluation: Evaluation) -> Figure:
 
 
 def has_map(evaluation: Evaluation) -> bool:
-    """Tell whether the loops can be drawn on a trajectory: one sequence, with positions."""
+    """Return whether the loops can be drawn on a trajectory: one sequence, with positions."""
     return evaluation.data.positions is not None and evaluation.data.reference_images is None
 
 
 def maps(evaluation: Evaluation) -> Figure:
-    """Draw for each method the loops found, false and missed as chords of the trajectory."""
+    """Draw for each method the found, false and missed loops as chords of the trajectory."""
     positions = evaluation.data.positions
     assert positions is not None
-    with plt.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(evaluation.outcomes), 1.0)
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_map(axis, outcome, evaluation.data.truth, positions)
-            axis.set_title(outcome.name)
+            _name_panel(axis, outcome)
         _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
         return figure
 
 
 def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split the queries at the best F1 of the best match of each query: numbers of found, false and missed ones.
+    """Return the numbers of the queries found, false and missed at the best F1 of their best matches.
 
-    A query with a loop whose match is wrong is both false and missed, and drawn as both.
+    A query with a loop whose match is wrong is both false and missed, and is drawn as both.
     """
     accepted = (outcome.matches.reference >= 0) & (outcome.matches.score >= outcome.best.best_f1_threshold)
     found = accepted & outcome.matches.right
@@ -136,19 +144,19 @@ def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, n
 
 
 def best_true_references(outcome: Outcome, truth: Truth, queries: np.ndarray) -> np.ndarray:
-    """Return for each of these queries, which have a loop, the true reference that scored best."""
+    """Return for each of these queries, which have a loop, the true reference with the best score."""
     scores = np.where(truth.hard[queries] & truth.judged[queries], outcome.scores[queries], np.nan)
     scores = np.where(np.isnan(scores), np.where(truth.hard[queries] & truth.judged[queries], -np.inf, np.nan), scores)
     return np.nanargmax(scores, axis=1)
 
 
-def _draw_matrix(axis: Axes, values: np.ndarray, colours: Colormap, low: float, high: float) -> None:
+def _draw_matrix(axis: Axes, values: np.ndarray, colors: Colormap, low: float, high: float) -> None:
     rows, columns = values.shape
-    colours = colours.with_extremes(bad=NOT_JUDGED)
+    colors = colors.with_extremes(bad=NOT_JUDGED)
     shown = _greatest_of_blocks(values, -(-max(rows, columns) // SHOWN_CELLS))
     axis.imshow(
         shown,
-        cmap=colours,
+        cmap=colors,
         vmin=low,
         vmax=max(high, low + 1e-12),
         interpolation="nearest" if max(shown.shape) < 250 else "antialiased",
@@ -169,15 +177,37 @@ def _greatest_of_blocks(values: np.ndarray, step: int) -> np.ndarray:
 
 
 def _draw_curve(axis: Axes, curve: PrecisionRecall, name: str, number: int) -> None:
-    """Draw the steps whose area is the average precision, and a dot where precision leaves 1."""
-    colour = COLOURS[number % len(COLOURS)]
-    line = "-" if number < len(COLOURS) else "--"
+    """Draw the steps whose area is the average precision, and a dot where precision falls below 1."""
+    color = COLORS[number % len(COLORS)]
+    line = LINES[number // len(COLORS) % len(LINES)]
     recall, precision = np.append(0.0, curve.recall), np.append(curve.precision[:1], curve.precision)
-    recall = recall[: len(precision)]  # a method that says nothing has no point
+    recall = recall[: len(precision)]  # a method without scores has no point
     area = f"{curve.average_precision:.3f}"
-    axis.plot(recall, precision, line, color=colour, linewidth=1.3, label=f"{area}  {name}", drawstyle="steps-pre")
+    label = textwrap.fill(f"{area}  {name}", LABEL_WIDTH, subsequent_indent=" " * 11)
+    axis.plot(recall, precision, line, color=color, linewidth=1.3, label=label, drawstyle="steps-pre")
     if curve.recall_at_full_precision > 0:
-        axis.plot([curve.recall_at_full_precision], [1.0], "o", color=colour, markersize=4, clip_on=False)
+        axis.plot([curve.recall_at_full_precision], [1.0], "o", color=color, markersize=4, clip_on=False)
+
+
+def _legends_below(figure: Figure, axes: Iterable[Axes]) -> None:
+    """Put the legend of each panel below it, and make the figure higher by the height of the highest legend."""
+    heights = []
+    for axis in axes:
+        below = axis.transAxes + ScaledTranslation(0, -LABELS_HEIGHT, figure.dpi_scale_trans)
+        legend = axis.legend(
+            title="average precision",
+            fontsize=8,
+            title_fontsize=8,
+            loc="upper left",
+            bbox_to_anchor=(0, 0),
+            bbox_transform=below,
+            borderaxespad=0,
+            alignment="left",
+        )
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+        heights.append(legend.get_window_extent().height / figure.dpi)
+    figure.set_figheight(figure.get_figheight() + max(heights))
 
 
 def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray) -> None:
@@ -191,11 +221,11 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
         (found, outcome.matches.reference[found], FOUND, 0.9),
         (false, outcome.matches.reference[false], FALSE, 0.9),
     ]
-    for order, (queries, references, colour, width) in enumerate(lines, start=2):
+    for order, (queries, references, color, width) in enumerate(lines, start=2):
         chords = np.stack([place[queries], place[references]], axis=1)
-        thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords are one blot
-        axis.add_collection(LineCollection(list(chords), colors=colour, linewidths=width * thin, zorder=order))
-        axis.plot(place[queries, 0], place[queries, 1], ".", color=colour, markersize=2.5, zorder=order)
+        thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords would merge
+        axis.add_collection(LineCollection(list(chords), colors=color, linewidths=width * thin, zorder=order))
+        axis.plot(place[queries, 0], place[queries, 1], ".", color=color, markersize=2.5, zorder=order)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel(f"{'xyz'[across]} [m]")
     axis.set_ylabel(f"{'xyz'[along]} [m]")
@@ -205,7 +235,7 @@ def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
     found, false, missed = decisions(outcome, truth)
     rows, columns = np.nonzero(truth.hard & truth.judged)
     axis.plot(columns, rows, ".", color="#d8d8d8", markersize=3, zorder=1)
-    for order, (queries, references, colour) in enumerate(
+    for order, (queries, references, color) in enumerate(
         [
             (missed, best_true_references(outcome, truth, missed), MISSED),
             (found, outcome.matches.reference[found], FOUND),
@@ -213,23 +243,23 @@ def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
         ],
         start=2,
     ):
-        axis.plot(references, queries, ".", color=colour, markersize=4, zorder=order)
+        axis.plot(references, queries, ".", color=color, markersize=4, zorder=order)
     axis.set_xlim(-1, truth.hard.shape[1])
     axis.set_ylim(truth.hard.shape[0], -1)
     axis.set_xlabel("reference")
 
 
 def _loop_legend(figure: Figure) -> None:
-    colours = ((FOUND, "found"), (FALSE, "false"), (MISSED, "missed"))
-    lines = [Line2D([], [], color=colour, linewidth=2, label=label) for colour, label in colours]
+    colors = ((FOUND, "found"), (FALSE, "false"), (MISSED, "missed"))
+    lines = [Line2D([], [], color=color, linewidth=2, label=label) for color, label in colors]
     figure.legend(handles=lines, loc="outside upper center", ncols=3)
 
 
 def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -> None:
-    """Print below the figure what it is judged by, so that it stands by itself."""
-    words = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.sentence}"
-    width = int(figure.get_figwidth() * 22)  # letters of this size that fit into the width
-    figure.supxlabel(textwrap.fill(words, width), fontsize=6.5, color="#777777")
+    """Print the description of the truth below the figure, so that it can be used by itself."""
+    text = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.description}"
+    width = int(figure.get_figwidth() * 22)  # characters of this size that fit into the width
+    figure.supxlabel(textwrap.fill(text, width), fontsize=6.5, color="#777777", parse_math=False)
 
 
 def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
@@ -238,17 +268,21 @@ def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
     columns = -(-panels // rows)
     width = 2.75 if columns > 2 else 3.4
     size = (width * columns, width * ratio * rows + 0.35)
-    layout = ConstrainedLayoutEngine(h_pad=0.07)  # inches: a title stands clear of the panel above
-    figure, axes = plt.subplots(rows, columns, figsize=size, layout=layout, squeeze=False)
-    flat = list(axes.flat)
+    layout = ConstrainedLayoutEngine(h_pad=0.07)  # inches between a title and the panel above
+    figure = Figure(figsize=size, layout=layout)
+    flat = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axis in flat[panels:]:
         axis.remove()
     return figure, flat[:panels]
 
 
-def _label_left(axes: list[Axes], words: str) -> None:
+def _name_panel(axis: Axes, outcome: Outcome) -> None:
+    axis.set_title(textwrap.fill(outcome.name, TITLE_WIDTH), parse_math=False)
+
+
+def _label_left(axes: list[Axes], label: str) -> None:
     """Label the vertical axis of the first panel of each row."""
     for axis in axes:
         place = axis.get_subplotspec()
         if place is not None and place.is_first_col():
-            axis.set_ylabel(words)
+            axis.set_ylabel(label)

@@ -1,0 +1,26 @@
+"""The command line: one module for each command; it parses arguments, shows progress and computes nothing."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from loopclosure.cli import detect, evaluate, similarity
+from loopclosure.cli.run import Commands, run
+
+_COMMANDS = (evaluate, detect, similarity)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage, 130 for Ctrl-C."""
+    return run(parser(), list(sys.argv[1:] if argv is None else argv))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    made = argparse.ArgumentParser(prog="loopclosure", description="Evaluate and detect loop closures.")
+    commands = Commands(made)
+    for command in _COMMANDS:
+        command.add_to(commands)
+    return made

@@ -1,0 +1,57 @@
+"""``loopclosure evaluate``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from loopclosure import evaluate
+from loopclosure.cli.data_set import add_data_set, add_selection, data_set, selection
+from loopclosure.cli.run import Commands, show_progress
+from loopclosure.methods.base import METHODS, MethodContext
+from loopclosure.places.frames import image_paths
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add("evaluate", _evaluate, "run methods on one data set and write a report")
+    add_data_set(p)
+    p.add_argument(
+        "--method",
+        action="append",
+        required=True,
+        metavar="[LABEL=]METHOD",
+        help=f"may be repeated; METHOD is one of {', '.join(METHODS)}, with :settings, or NAME+METHOD: "
+        "features:PATH.npz[:cosine][:whiten=OTHER.npz], seqslam+features:PATH.npz, fabmap:model=words.npz",
+    )
+    p.add_argument(
+        "--train",
+        action="append",
+        default=[],
+        metavar="PATH",
+        help="images for vocabularies, other than those tested: a folder, list or TUM sequence; may be repeated",
+    )
+    add_selection(p, "--train-", "of each --train: ")
+    p.add_argument("--out", required=True, metavar="FOLDER", help="where the report and its parts go")
+    p.add_argument("--title", default="", help="heading of the report")
+    p.add_argument("--seed", type=int, default=0, help="of the methods' random numbers (default: 0)")
+
+
+def _evaluate(a: argparse.Namespace) -> None:
+    # Drawing takes seconds to import, which the other commands need not wait for.
+    from loopclosure.report.files import measures_text
+    from loopclosure.report.page import write_report
+
+    data = data_set(a)
+    context = MethodContext(data.exclude_frames, a.seed)
+    methods = [evaluate.named_method(text, context) for text in a.method]
+    chosen = selection(a, "train_")
+    train: list[Path] = []
+    for source in a.train:
+        images = image_paths(source)
+        train += [images[i] for i in chosen.numbers(len(images))]
+    training = f"{len(train)} images of {', '.join(Path(t).name for t in a.train)}" if train else "no training images"
+    evaluation = evaluate.evaluate(data, methods, train, training, show_progress)
+    page = write_report(evaluation, a.out, a.title, a.command_line)
+    print(measures_text(evaluation))
+    print(f"report: {page}")

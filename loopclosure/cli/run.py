@@ -1,0 +1,64 @@
+"""What every command shares: progress bars, and one line and an exit status for each way in which it can end."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable, Iterable
+
+from tqdm import tqdm
+
+from loopclosure.errors import InputError
+from loopclosure.progress import Item
+
+DONE, FAULT, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130  # exit statuses
+
+
+class WrongUsage(Exception):
+    """Arguments that do not go together."""
+
+
+class Commands:
+    """The commands of a parser."""
+
+    def __init__(self, parser: argparse.ArgumentParser) -> None:
+        self._parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(self, name: str, function: Callable[[argparse.Namespace], None], summary: str) -> argparse.ArgumentParser:
+        """Return the parser of a new command that runs ``function``, to add its own arguments to."""
+        added = self._parsers.add_parser(name, help=summary, description=summary)
+        added.set_defaults(run=function)
+        return added
+
+
+def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
+    """Parse a command line and run the command, which finds the line itself in ``command_line``; return its status."""
+    try:
+        arguments = parser.parse_args(words)
+    except SystemExit as end:  # argparse has said what is wrong, or printed its help
+        return int(end.code or DONE)
+    arguments.command_line = shlex.join([parser.prog, *words])
+    try:
+        arguments.run(arguments)
+        return DONE
+    except InputError as fault:
+        print(fault, file=sys.stderr)
+        return FAULT
+    except WrongUsage as fault:
+        print(f"{parser.prog} {arguments.command}: error: {fault}", file=sys.stderr)
+        return WRONG_USAGE
+    except BrokenPipeError:
+        sys.stderr.close()  # or Python complains once more, at its end
+        return FAULT
+    except OSError as fault:
+        print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
+        return FAULT
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def show_progress(items: Iterable[Item], stage: str, total: int | None = None) -> Iterable[Item]:
+    """Show a bar on a terminal."""
+    return tqdm(items, desc=stage, total=total, disable=None, leave=False, unit="")

@@ -1,0 +1,109 @@
+"""Which images a folder or a list names, in which order, and when they were taken: the rule of docs/images.md.
+
+netspec/features/image_list.py follows the same rule; tests/laws/test_image_lists.py holds both to it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.errors import InputError
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+SUBFOLDERS = ("rgb", "images", "Images")
+_EXPECTED = "expected a folder of images, or a text file that lists them"
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_LINE = re.compile(rf"(?:(?P<stamp>{_NUMBER})\s+)?(?P<name>.+?)(?:\s+[+-]?\d+)?")
+_COMMENT = re.compile(r"\s+#")
+
+
+@dataclass(frozen=True)
+class ImageList:
+    """Image files in order: ``paths``, the ``names`` they are known by, ``stamps`` (N,) [s] where all have one."""
+
+    paths: tuple[Path, ...]
+    names: tuple[str, ...]
+    stamps: np.ndarray | None = None
+
+
+def list_images(source: str | Path) -> ImageList:
+    """Return the images of a folder or of a list. Raises InputError where there are none."""
+    source = Path(source)
+    if not source.is_dir():
+        return _read_list(source)
+    if (source / "rgb.txt").is_file():
+        return _in_time(_read_list(source / "rgb.txt"))
+    for folder in (source, *(source / name for name in SUBFOLDERS)):
+        if images := _images_in(folder):
+            return ImageList(tuple(images), tuple(path.relative_to(source).as_posix() for path in images))
+    raise InputError(f"holds no image; expected files that end in {', '.join(IMAGE_ENDINGS)}", source)
+
+
+def natural_order(name: str) -> tuple[list[str | int], str]:
+    """Return a key by which 2.png comes before 10.png, and a before B."""
+    return [int(part) if k % 2 else part.lower() for k, part in enumerate(re.split(r"(\d+)", name))], name
+
+
+def _images_in(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    found = [
+        path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS and not path.name.startswith(".")
+    ]
+    return sorted((path for path in found if path.is_file()), key=lambda path: natural_order(path.name))
+
+
+def _in_time(images: ImageList) -> ImageList:
+    if images.stamps is None:
+        return images
+    order = np.argsort(images.stamps, kind="stable")
+    return ImageList(tuple(images.paths[i] for i in order), tuple(images.names[i] for i in order), images.stamps[order])
+
+
+def _read_list(path: Path) -> ImageList:
+    if path.suffix.lower() in IMAGE_ENDINGS:
+        raise InputError(f"is a single image; {_EXPECTED}", path)
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as fault:
+        raise InputError(f"cannot be read: {fault.strerror}; {_EXPECTED}", path) from None
+    except UnicodeDecodeError:
+        raise InputError(f"is not UTF-8 text; {_EXPECTED}", path) from None
+    names, stamps = [], []
+    for number, line in enumerate(lines, 1):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        readings = list(_readings(text))
+        for name, stamp in readings:
+            if os.path.isfile(path.parent / name):  # unlike Path.is_file, also for names that no file can have
+                names.append(name)
+                stamps.append(stamp)
+                break
+        else:
+            name = readings[-1][0]
+            raise InputError(f'no such image "{name}" in {path.parent}', path, number, line.index(name) + 1)
+    if not names:
+        raise InputError("lists no image", path)
+    known = np.array(stamps, np.float64) if None not in stamps else None
+    return ImageList(tuple(path.parent / name for name in names), tuple(names), known)
+
+
+def _readings(text: str) -> Iterator[tuple[str, float | None]]:
+    """Yield what a line may mean, name and stamp, in the order in which the readings are tried."""
+    ends = [match.start() for match in _COMMENT.finditer(text)]
+    for line in (text, *(text[:end] for end in reversed(ends))):
+        match = _LINE.fullmatch(line)
+        assert match is not None, "a line is at least a name"
+        stamp = None if match["stamp"] is None else float(match["stamp"])
+        yield line, None
+        if stamp is not None:
+            yield line[match.start("name") :], stamp
+        yield line[: match.end("name")], None
+        yield match["name"], stamp

@@ -1,0 +1,78 @@
+"""One layer without a net around it: to try what it does, and to test it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from netspec.errors import SpecError
+from netspec.layers import Context, Layer, Random, layer_class, unknown_type
+from netspec.layers.base import Shape
+from netspec.net.net import Array
+from netspec.proto.reader import read_text
+from netspec.proto.schema import PHASES, LayerParameter, NetParameter
+from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.upgrade.current import upgrade_net
+
+FILE = "<layer>"  # what errors call the text
+
+
+def layer(
+    text: str,
+    *shapes: Shape,
+    tops: int | None = None,
+    phase: str | int = "TEST",
+    seed: int = 0,
+    device: str | torch.device = "cpu",
+    allow_python: bool = False,
+) -> OneLayer:
+    """Return the layer that ``text``, what stands between the braces of ``layer { }``, describes.
+
+    ``netspec.layer('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }')(x)`` is its top for the bottom ``x``.
+    Bottoms and tops need no names; ``tops`` is how many there are, by default the fewest. The layer is built when the
+    shapes of its bottoms are known: at the first call, or at once where ``shapes`` gives them. Raises SpecError.
+    """
+    number = PHASES[phase] if isinstance(phase, str) else phase
+    context = {"phase": number, "random": Random(seed), "data_seed": seed, "device": torch.device(device)}
+    return OneLayer(partial(make_layer, text, tops=tops, allow_python=allow_python, **context), shapes)
+
+
+class OneLayer(torch.nn.Module):
+    """A layer that is called with its bottoms, tensors or arrays, and returns its top, or a tuple of several.
+
+    ``layer`` is the Layer, with its ``blobs`` and ``top_shapes``; None before it is built.
+    """
+
+    def __init__(self, make: Callable[[Sequence[Shape]], Layer], shapes: Sequence[Shape] = ()) -> None:
+        super().__init__()
+        self._make = make
+        self.layer = make(shapes) if shapes else None
+
+    def forward(self, *bottoms: Array) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        """Return what the layer computes of its bottoms."""
+        tensors = [x if isinstance(x, torch.Tensor) else torch.tensor(np.asarray(x, np.float32)) for x in bottoms]
+        self.layer = self.layer or self._make([tuple(tensor.shape) for tensor in tensors])
+        tops = self.layer.run(*tensors)
+        return tops[0] if len(tops) == 1 else tops
+
+
+def make_layer(text: str, shapes: Sequence[Shape], tops: int | None = None, **context: Any) -> Layer:
+    """Return the built layer of a text for bottoms of these shapes; ``context`` has fields of :class:`Context`."""
+    param = LayerParameter()
+    place = read_text(text, FILE, param)
+    net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Place(place.where), (place,)))
+    (param,) = net.layer
+    at = partial(source.at, 0, layer=param.name, type=param.type)
+    cls = layer_class(param.type)
+    if cls is None:
+        raise SpecError(unknown_type(param.type), at("type"))
+    param.bottom.extend(f"bottom{i}" for i in range(len(param.bottom), len(shapes)))
+    if tops is None:
+        fewest = len(shapes) if cls.same_tops else cls.tops[0]
+        tops = fewest or int(cls.tops[1] is None)
+    param.top.extend(f"top{i}" for i in range(len(param.top), tops))
+    return cls(param, shapes, Context(**{"at": at, **context}))

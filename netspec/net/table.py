@@ -1,0 +1,61 @@
+"""A built net, shown: as a table to read, as JSON for programs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from netspec.net.net import Net
+
+_HEAD = ("layer", "type", "bottoms", "tops", "shapes", "parameters", "MiB", "multiply-adds")
+_WORDS = 5  # columns of words, flush left; then come the numbers
+
+
+def as_json(net: Net) -> dict[str, Any]:
+    """Return ``blobs`` name -> shape, ``params`` layer -> shapes, ``inputs``, ``outputs``."""
+    params = {}
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        if layer.blob_shapes:
+            params[node.name] = [list(shape) for shape in layer.blob_shapes]
+    blobs = {name: list(shape) for name, shape in net.shapes.items()}
+    return {"blobs": blobs, "params": params, "inputs": net.inputs, "outputs": net.outputs}
+
+
+def table(net: Net) -> str:
+    """Return one line per layer: its name and type, its blobs and the shapes of its tops, what it costs; and totals.
+
+    What it costs: learnable numbers ("shared" where an earlier layer has them), memory of its tops, multiply-adds of
+    one forward pass.
+    """
+    rows: list[tuple[str, ...]] = [_HEAD]
+    totals = [0, 0, 0]
+    counted: set[int] = set()
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        parameters = sum(blob.numel() for blob in layer.blobs if id(blob) not in counted)
+        shared = len(layer.blobs) > 0 and parameters == 0
+        counted.update(id(blob) for blob in layer.blobs)
+        memory, work = 4 * sum(map(math.prod, layer.top_shapes)), layer.multiply_adds()
+        totals = [total + cost for total, cost in zip(totals, (parameters, memory, work), strict=True)]
+        shapes = _listed("x".join(map(str, shape)) or "scalar" for shape in layer.top_shapes)
+        blobs = [_listed(net.plan.blobs[v] for v in values) for values in (node.bottoms, node.tops)]
+        rows.append((node.name, node.type, *blobs, shapes, *_printed(parameters, memory, work, shared)))
+    rows.append(("total", "", "", "", "", *_printed(totals[0], totals[1], totals[2])))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(_line(row, widths) for row in rows)
+
+
+def _listed(words: Iterable[str]) -> str:
+    return ", ".join(words) or "-"
+
+
+def _printed(parameters: int, memory: int, work: int, shared: bool = False) -> tuple[str, str, str]:
+    count = "shared" if shared else f"{parameters:,}" if parameters else ""
+    return count, f"{memory / 2**20:.2f}", f"{work:,}" if work else ""
+
+
+def _line(row: tuple[str, ...], widths: list[int]) -> str:
+    words = [cell.ljust(width) for cell, width in zip(row[:_WORDS], widths[:_WORDS], strict=True)]
+    numbers = [cell.rjust(width) for cell, width in zip(row[_WORDS:], widths[_WORDS:], strict=True)]
+    return "  ".join(words + numbers).rstrip()

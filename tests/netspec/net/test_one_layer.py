@@ -1,0 +1,64 @@
+"""One layer, called without a net."""
+
+import numpy as np
+import pytest
+import torch
+
+import netspec
+
+POOL = 'type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }'
+
+
+def test_a_layer_is_a_function_of_its_bottoms() -> None:
+    x = torch.arange(16.0).reshape(1, 1, 4, 4).requires_grad_()
+    pool = netspec.layer(POOL)
+    top = pool(x)
+    assert top.tolist() == [[[[5, 7], [13, 15]]]]
+    top.sum().backward()
+    assert x.grad is not None
+    assert x.grad.sum() == 4
+    assert pool(np.ones((2, 3, 6, 8))).shape == (2, 3, 3, 4)
+
+
+def test_several_tops_are_a_tuple() -> None:
+    first, second = netspec.layer('type: "Slice" slice_param { slice_point: 1 }', tops=2)(np.ones((1, 3, 2)))
+    assert (first.shape, second.shape) == ((1, 1, 2), (1, 2, 2))
+    named = 'type: "Slice" bottom: "x" top: "a" top: "b" slice_param { slice_point: 1 }'
+    assert len(netspec.layer(named)(np.ones((1, 3, 2)))) == 2
+    relu = netspec.layer('type: "Split"', tops=3)
+    assert len(relu(np.ones(2))) == 3
+    assert netspec.layer('type: "Silence"')(np.ones(2)) == ()
+
+
+def test_blobs_are_there_at_once_where_the_shapes_are_given() -> None:
+    text = 'type: "InnerProduct" inner_product_param { num_output: 2 weight_filler { type: "xavier" } }'
+    product = netspec.layer(text, (1, 3))
+    assert product.layer is not None
+    weights, bias = product.layer.blobs
+    torch.testing.assert_close(product(np.eye(3)), weights.T + bias)
+    again = netspec.layer(text, (1, 3), seed=0).layer
+    assert again is not None
+    assert torch.equal(again.blobs[0], weights)
+    assert netspec.layer(text).layer is None
+
+
+def test_a_layer_without_bottoms_a_loss_and_the_training_phase() -> None:
+    made = netspec.layer('type: "DummyData" dummy_data_param { shape { dim: 2 } data_filler { value: 3 } }')()
+    assert made.tolist() == [3, 3]
+    assert netspec.layer('type: "EuclideanLoss"')(np.ones((1, 2)), np.zeros((1, 2))).item() == 1
+    dropped = netspec.layer('type: "Dropout"', phase="TRAIN")(np.ones(1000))
+    assert set(dropped.tolist()) == {0, 2}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('type: "Poolin"', r'^<layer>:1:1: layer "" \(Poolin\): unknown layer type "Poolin"; did you mean "Pooling"'),
+        ('type: "Pooling"\npool_param { }', r'^<layer>:2:1: layer "" \(Pooling\): LayerParameter has no field "pool_p'),
+        ('type: "Pooling"\npooling_param { pad: 1 }', r'^<layer>:2:1: layer "" \(Pooling\): '),
+        ('type: "Concat"', r"found 0 bottom blob\(s\), expected at least 1"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_place(text: str, message: str) -> None:
+    with pytest.raises(netspec.SpecError, match=message):
+        netspec.layer(text)(*[] if "Concat" in text else [np.ones((1, 1, 4, 4))])

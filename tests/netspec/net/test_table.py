@@ -1,0 +1,43 @@
+"""A net printed: one row per layer, with what flows between them."""
+
+from collections.abc import Callable
+
+from netspec.net.net import Net
+from netspec.net.table import as_json
+
+WEIGHTS = 'param { name: "w" } inner_product_param { num_output: 4 bias_term: false }'
+NET = f"""
+name: "towers"
+layer {{ name: "x" type: "Input" top: "a" top: "b" input_param {{ shape {{ dim: 2 dim: 3 }} }} }}
+layer {{ name: "left" type: "InnerProduct" bottom: "a" top: "fa" {WEIGHTS} }}
+layer {{ name: "right" type: "InnerProduct" bottom: "b" top: "fb" {WEIGHTS} }}
+layer {{ name: "loss" type: "EuclideanLoss" bottom: "fa" bottom: "fb" top: "loss" }}
+layer {{ name: "hush" type: "Silence" bottom: "fb" }}
+"""
+
+
+def test_a_net_prints_as_a_table(net_of: Callable[..., Net]) -> None:
+    net = net_of(NET)
+    assert str(net) == repr(net)
+    head, titles, *rows = str(net).splitlines()
+    assert head == "towers, phase TEST"
+    assert titles.split() == ["layer", "type", "bottoms", "tops", "shapes", "parameters", "MiB", "multiply-adds"]
+    assert [" ".join(row.split()) for row in rows] == [
+        "x Input - a, b 2x3, 2x3 0.00",
+        "left InnerProduct a fa 2x4 12 0.00 24",
+        "right InnerProduct b fb 2x4 shared 0.00 24",
+        "fb_right_0_split Split fb fb_right_0_split_0, fb_right_0_split_1 2x4, 2x4 0.00",
+        "loss EuclideanLoss fa, fb_right_0_split_0 loss scalar 0.00",
+        "hush Silence fb_right_0_split_1 - - 0.00",
+        "total 12 0.00 48",
+    ]
+    assert (
+        len({line.index(word) for line, word in zip(rows, ("Input", "InnerP", "InnerP", "Split"), strict=False)}) == 1
+    )
+
+
+def test_a_net_as_data(net_of: Callable[..., Net]) -> None:
+    found = as_json(net_of(NET))
+    assert found["params"] == {"left": [[4, 3]], "right": [[4, 3]]}
+    assert found["blobs"]["fa"] == [2, 4]
+    assert (found["inputs"], found["outputs"]) == (["a", "b"], ["loss"])

@@ -1,0 +1,409 @@
+"""Blobs are memory, as in Caffe, bug for bug: what scripts see between, during and after passes."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netspec.pycaffe as caffe
+from paths import ROOT
+
+INPUT = 'force_backward: true input: "data" input_shape { dim: 1 dim: 3 dim: 12 dim: 12 }\n'
+# The shape of MTCNN's first net: fully convolutional, run on an image pyramid.
+PYRAMID = (
+    INPUT
+    + """
+layer { name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
+  convolution_param { num_output: 10 kernel_size: 3 weight_filler { type: "xavier" } } }
+layer { name: "PReLU1" type: "PReLU" bottom: "conv1" top: "conv1" }
+layer { name: "pool1" type: "Pooling" bottom: "conv1" top: "pool1" pooling_param { kernel_size: 2 stride: 2 } }
+layer { name: "conv4-1" type: "Convolution" bottom: "pool1" top: "conv4-1"
+  convolution_param { num_output: 2 kernel_size: 1 weight_filler { type: "xavier" } } }
+layer { name: "conv4-2" type: "Convolution" bottom: "pool1" top: "conv4-2"
+  convolution_param { num_output: 4 kernel_size: 1 weight_filler { type: "xavier" } } }
+layer { name: "prob1" type: "Softmax" bottom: "conv4-1" top: "prob1" }
+"""
+)
+
+
+def image(*shape: int) -> np.ndarray:
+    return np.random.default_rng(len(shape) + sum(shape)).standard_normal(shape).astype(np.float32)
+
+
+def test_outputs_are_views_that_the_next_pass_changes(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    first = net.forward(data=image(1, 3, 12, 12))["prob1"]
+    before = first.copy()
+    second = net.forward(data=-image(1, 3, 12, 12))["prob1"]
+    assert not np.array_equal(before, first)
+    assert np.array_equal(first, second)
+    assert np.shares_memory(first, second)
+
+
+def test_smaller_shapes_use_the_front_of_one_memory(net_of: Callable[..., caffe.Net]) -> None:
+    """A public MTCNN demo keeps the outputs of all scales: the last one overwrites the front of the others."""
+    net = net_of(PYRAMID)
+    kept = []
+    for size in (40, 28, 20):
+        net.blobs["data"].reshape(1, 3, size, size)
+        net.blobs["data"].data[...] = image(1, 3, size, size)
+        kept.append(net.forward()["prob1"])
+    assert [array.shape[2] for array in kept] == [19, 13, 9]
+    assert np.array_equal(kept[0].reshape(-1)[: kept[2].size], kept[2].reshape(-1))
+    assert np.array_equal(kept[1].reshape(-1)[: kept[2].size], kept[2].reshape(-1))
+
+
+def test_memory_is_as_large_as_its_largest_shape_was(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    net.blobs["data"].reshape(1, 3, 40, 40)
+    net.reshape()  # nothing has run yet, but this much memory is there from now on
+    kept = []
+    for size in (20, 28):
+        net.blobs["data"].reshape(1, 3, size, size)
+        kept.append(net.forward(data=image(1, 3, size, size))["prob1"])
+    assert np.array_equal(kept[0].reshape(-1), kept[1].reshape(-1)[: kept[0].size])
+
+
+def test_grown_memory_is_new_and_old_views_keep_what_they_had(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    old = net.forward(data=image(1, 3, 12, 12))["prob1"]
+    before = old.copy()
+    net.blobs["data"].reshape(1, 3, 30, 30)
+    assert not net.blobs["data"].data.any()
+    new = net.forward(data=image(1, 3, 30, 30))["prob1"]
+    assert new.shape == (1, 2, 14, 14)
+    assert np.array_equal(old, before)
+
+
+def test_reshape_shows_at_once_and_values_stay(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    blob = net.blobs["data"]
+    blob.data[...] = image(1, 3, 12, 12)
+    flat = blob.data.reshape(-1).copy()
+    blob.reshape(2, 3, 4, 4)
+    assert blob.data.shape == (2, 3, 4, 4)
+    assert np.array_equal(blob.data.reshape(-1), flat[:96])
+    blob.reshape(1, 3, 12, 12)
+    assert np.array_equal(blob.data.reshape(-1), flat)
+    assert (blob.num, blob.channels, blob.height, blob.width, blob.count) == (1, 3, 12, 12, 432)
+    blob.reshape(5, 1)
+    assert (blob.num, blob.channels, blob.height, blob.width) == (5, 1, 1, 1)
+
+
+def test_fresh_arrays_and_reused_memory_give_the_same_numbers(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    other = caffe.Net("net.prototxt", caffe.TEST)
+    other.share_with(net)
+    for size in (12, 31, 17, 40, 12):
+        held = [blob.data for blob in net.blobs.values()]  # so that passes write to memory
+        array = image(1, 3, size, size)
+        for one in (net, other):
+            one.blobs["data"].reshape(1, 3, size, size)
+        outputs = net.forward(data=array), other.forward(data=array)
+        for name in net.outputs:
+            assert np.array_equal(outputs[0][name], outputs[1][name])
+        del held
+
+
+def test_in_place_layers_leave_the_last_writers_values(net_of: Callable[..., caffe.Net]) -> None:
+    text = INPUT + (
+        'layer { name: "twice" type: "Power" bottom: "data" top: "x" power_param { scale: 2 } }'
+        'layer { name: "relu" type: "ReLU" bottom: "x" top: "x" }'
+        'layer { name: "more" type: "Power" bottom: "x" top: "x" power_param { shift: 1 } }'
+    )
+    net = net_of(text)
+    data = image(1, 3, 12, 12)
+    assert np.array_equal(net.forward(data=data, end="twice")["x"], 2 * data)
+    assert np.array_equal(net.forward(start="relu", end="relu")["x"], np.maximum(2 * data, 0))
+    view = net.blobs["x"].data
+    net.forward(start="more")
+    assert np.array_equal(view, np.maximum(2 * data, 0) + 1)
+    net.forward()
+    assert np.array_equal(view, np.maximum(2 * data, 0) + 1)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_in_place_layers_keep_what_their_gradient_needs(net_of: Callable[..., caffe.Net], held: bool) -> None:
+    """Scale's gradient reads what it has overwritten: Caffe keeps a copy, however scripts look at the blob."""
+    text = INPUT + (
+        'layer { name: "twice" type: "Power" bottom: "data" top: "x" power_param { scale: 2 } }'
+        'layer { name: "scale" type: "Scale" bottom: "x" top: "x" scale_param { filler { value: 3 } } }'
+    )
+    net = net_of(text, caffe.TRAIN)
+    data = image(1, 3, 12, 12)
+    views = [net.blobs["x"].data, net.blobs["x"].diff] if held else []
+    for _ in range(2):
+        net.forward(data=data)
+        net.clear_param_diffs()
+        net.blobs["x"].diff[...] = 1
+        net.backward()
+        np.testing.assert_allclose(net.params["scale"][0].diff, 2 * data.sum((0, 2, 3)), rtol=1e-4)
+        assert (net.blobs["data"].diff == 6).all()
+    del views
+
+
+def test_split_copies_and_reshaped_blobs_lie_in_one_memory(net_of: Callable[..., caffe.Net]) -> None:
+    text = INPUT + (
+        'layer { name: "x" type: "Power" bottom: "data" top: "x" power_param { scale: 2 } }'
+        'layer { name: "flat" type: "Flatten" bottom: "x" top: "flat" }'
+        'layer { name: "again" type: "Power" bottom: "x" top: "again" }'
+    )
+    net = net_of(text)
+    assert list(net.blobs) == ["data", "x", "x_x_0_split_0", "x_x_0_split_1", "flat", "again"]
+    net.forward(data=image(1, 3, 12, 12))
+    net.blobs["x"].data[...] = 5
+    for name in ("x_x_0_split_0", "x_x_0_split_1", "flat"):
+        assert (net.blobs[name].data == 5).all()
+        assert np.shares_memory(net.blobs[name].data, net.blobs["x"].data)
+    assert not (net.blobs["again"].data == 5).any()
+    net.blobs["flat"].diff[...] = 1
+    assert np.shares_memory(net.blobs["flat"].diff, net.blobs["x_x_0_split_0"].diff)
+    assert not np.shares_memory(net.blobs["flat"].diff, net.blobs["x"].diff)
+    net.blobs["again"].diff[...] = 2
+    net.backward()
+    assert (net.blobs["x"].diff == 3).all()
+    assert (net.blobs["data"].diff == 6).all()
+
+
+def test_dropout_of_the_test_phase_copies(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(INPUT + 'layer { name: "drop" type: "Dropout" bottom: "data" top: "drop" }')
+    net.forward(data=image(1, 3, 12, 12))
+    before = net.blobs["drop"].data.copy()
+    net.blobs["data"].data[...] = 0
+    assert np.array_equal(net.blobs["drop"].data, before)
+
+
+def test_backward_belongs_to_the_last_forward(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(INPUT + 'layer { name: "drop" type: "Dropout" bottom: "data" top: "drop" }', caffe.TRAIN)
+    kept = net.forward(data=np.ones((1, 3, 12, 12)))["drop"] != 0
+    assert 0 < kept.mean() < 1
+    net.blobs["drop"].diff[...] = 1
+    for _ in range(2):
+        assert np.array_equal(net.backward()["data"], 2.0 * kept)
+
+
+def test_backward_reads_what_scripts_wrote_since(net_of: Callable[..., caffe.Net]) -> None:
+    """Caffe's backward reads data and weights where they lie: between the passes, scripts may change them."""
+    text = INPUT + (
+        'layer { name: "relu" type: "ReLU" bottom: "data" top: "relu" }'
+        'layer { name: "fc" type: "InnerProduct" bottom: "relu" top: "fc" inner_product_param { num_output: 2 '
+        'weight_filler { type: "xavier" } } }'
+    )
+    net = net_of(text, caffe.TRAIN)
+    net.forward(data=np.ones((1, 3, 12, 12)))
+    net.blobs["data"].data[0, 0] = -1
+    net.blobs["relu"].data[...] = 4
+    net.params["fc"][0].data[...] = 3
+    net.blobs["fc"].diff[...] = 1
+    net.backward()
+    assert (net.params["fc"][0].diff == 4).all()
+    assert (net.blobs["relu"].diff == 6).all()
+    assert (net.blobs["data"].diff[0, 0] == 0).all()
+    assert (net.blobs["data"].diff[0, 1:] == 6).all()
+
+
+def test_what_needs_no_gradient_is_passed_over(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID.replace("force_backward: true", ""), caffe.TEST)
+    net.forward(data=image(1, 3, 12, 12))
+    net.blobs["prob1"].diff[...] = 1
+    net.blobs["data"].diff[...] = 9
+    assert (net.backward()["data"] == 9).all()  # no loss, nothing to learn from: Caffe leaves every diff alone
+    assert not net.params["conv1"][0].diff.any()
+
+
+def test_guided_backpropagation(net_of: Callable[..., caffe.Net]) -> None:
+    """Layer by layer, negative gradients cut off at each ReLU."""
+    text = INPUT + "".join(
+        f'layer {{ name: "c{i}" type: "Convolution" bottom: "{bottom}" top: "c{i}" convolution_param {{ num_output: 4 '
+        f'kernel_size: 3 weight_filler {{ type: "xavier" }} }} }} '
+        f'layer {{ name: "r{i}" type: "ReLU" bottom: "c{i}" top: "c{i}" }}'
+        for i, bottom in enumerate(("data", "c0"))
+    )
+    net = net_of(text)
+    net.forward(data=image(1, 3, 12, 12))
+    plain = {}
+    net.blobs["c1"].diff[...] = image(1, 4, 8, 8)
+    net.backward(start="c1", end="c0")
+    plain["data"] = net.blobs["data"].diff.copy()
+    net.blobs["c1"].diff[...] = np.maximum(image(1, 4, 8, 8), 0)
+    net.backward(start="r1", end="r1")
+    masked = net.blobs["c1"].diff.copy()
+    assert (masked[net.blobs["c1"].data == 0] == 0).all()
+    net.backward(start="c1", end="c1")
+    np.maximum(net.blobs["c0"].diff, 0, out=net.blobs["c0"].diff)
+    guided = net.backward(start="r0", end="c0")["data"]
+    assert guided.any()
+    assert not np.allclose(guided, plain["data"])
+
+
+def test_deep_dream_climbs(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    source, target = net.blobs["data"], net.blobs["pool1"]
+    source.reshape(1, 3, 24, 24)
+    source.data[0] = image(3, 24, 24)
+    norms = []
+    for _ in range(10):
+        net.forward(end="pool1")
+        norms.append(float((target.data**2).sum()))
+        target.diff[:] = target.data
+        net.backward(start="pool1")
+        gradient = source.diff[0]
+        source.data[:] += 0.5 / np.abs(gradient).mean() * gradient * 0.1
+    assert norms == sorted(norms)
+
+
+def test_net_surgery(net_of: Callable[..., caffe.Net], write: Callable[..., str]) -> None:
+    """An InnerProduct's weights, poured into a convolution, give the same scores at each place."""
+    dense = net_of(
+        INPUT + 'layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc" inner_product_param '
+        '{ num_output: 5 weight_filler { type: "xavier" } bias_filler { type: "uniform" } } }'
+    )
+    write(
+        INPUT + 'layer { name: "fc-conv" type: "Convolution" bottom: "data" top: "fc-conv" convolution_param '
+        "{ num_output: 5 kernel_size: 12 } }",
+        "conv.prototxt",
+    )
+    conv = caffe.Net("conv.prototxt", caffe.TEST)
+    conv.params["fc-conv"][0].data.flat = dense.params["fc"][0].data.flat
+    conv.params["fc-conv"][1].data[...] = dense.params["fc"][1].data
+    data = image(1, 3, 12, 12)
+    expected = dense.forward(data=data)["fc"]
+    np.testing.assert_allclose(conv.forward(data=data)["fc-conv"][..., 0, 0], expected, rtol=1e-4, atol=1e-5)
+    conv.blobs["data"].reshape(1, 3, 20, 20)
+    assert conv.forward(data=image(1, 3, 20, 20))["fc-conv"].shape == (1, 5, 9, 9)
+    conv.save("surgery.caffemodel")
+    again = caffe.Net("conv.prototxt", caffe.TEST, weights="surgery.caffemodel")
+    assert np.array_equal(again.params["fc-conv"][0].data, conv.params["fc-conv"][0].data)
+
+
+def test_shared_parameters_are_one_memory(net_of: Callable[..., caffe.Net]) -> None:
+    layer = (
+        'layer {{ name: "{0}" type: "InnerProduct" bottom: "data" top: "{0}" param {{ name: "w" }} '
+        'inner_product_param {{ num_output: 2 bias_term: false weight_filler {{ type: "xavier" }} }} }}'
+    )
+    net = net_of(INPUT + layer.format("a") + layer.format("b"))
+    assert np.shares_memory(net.params["a"][0].data, net.params["b"][0].data)
+    net.params["b"][0].data[...] = 1
+    net.params["a"][0].diff[...] = 2
+    assert (net.params["a"][0].data == 1).all()
+    assert (net.params["b"][0].diff == 2).all()
+
+
+def test_views_of_parameters_see_weights_that_are_read(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    net.save("one.caffemodel")
+    view = net.params["conv1"][0].data
+    before = view.copy()
+    view[...] = 0
+    net.copy_from("one.caffemodel")
+    assert np.array_equal(view, before)
+
+
+def test_a_net_can_have_attributes(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    net.transformer = net.mean = 5
+    assert net.mean == 5
+
+
+def test_hooks_are_told_each_layer(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    told: list[tuple[str, int]] = []
+    for which in ("before_forward", "after_forward", "before_backward", "after_backward"):
+        getattr(net, which)(lambda layer, which=which: told.append((which, layer)))
+    net.forward(start="pool1", end="pool1_pool1_0_split")
+    net.backward(start="pool1", end="pool1")
+    assert told == [
+        ("before_forward", 3), ("after_forward", 3), ("before_forward", 4), ("after_forward", 4),
+        ("before_backward", 3), ("after_backward", 3),
+    ]  # fmt: skip
+
+
+def test_forward_backward_all(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(PYRAMID)
+    net.blobs["data"].reshape(2, 3, 12, 12)
+    net.reshape()
+    data, tops = image(5, 3, 12, 12), {name: np.ones((5, *net.blobs[name].shape[1:])) for name in net.outputs}
+    outputs, diffs = net.forward_backward_all(blobs=["pool1"], diffs=["conv1"], data=data, **tops)
+    assert {name: array.shape for name, array in outputs.items()} == {
+        "conv4-2": (5, 4, 5, 5), "prob1": (5, 2, 5, 5), "pool1": (5, 10, 5, 5)
+    }  # fmt: skip
+    assert {name: array.shape for name, array in diffs.items()} == {"data": (5, 3, 12, 12), "conv1": (5, 10, 10, 10)}
+    net.blobs["data"].reshape(1, 3, 12, 12)
+    for i in range(5):
+        net.forward(data=data[i : i + 1])
+        net.backward(**{name: top[:1] for name, top in tops.items()})
+        np.testing.assert_allclose(diffs["data"][i], net.blobs["data"].diff[0], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("code", "kind", "message"),
+    [
+        ('net.blobs["dta"]', KeyError, 'no blob "dta" in this net; did you mean "data"?'),
+        ('net.blobs["nothing"]', KeyError, "it has: data, conv1, pool1"),
+        ('net.params["conv9"]', KeyError, "it has: conv1, PReLU1, conv4-1, conv4-2"),
+        ('net.forward(end="pool9")', ValueError, 'no layer "pool9" in this net; did you mean "pool1"?'),
+        ("net.forward(image=1)", ValueError, "Input blob arguments do not match net inputs. Found image, expected dat"),
+        ("net.backward(pool1=1)", ValueError, "Top diff arguments do not match net outputs. Found pool1, expected co"),
+        ("net.forward(data=np.ones((2, 3, 12, 12)))", ValueError, "Input is not batch sized: found shape (2, 3, 12, 1"),
+        ("net.forward(data=np.ones((1, 3, 9, 12)))", ValueError, "from shape (1,3,9,12) into shape (1,3,12,12)"),
+        ("net.blobs['data'].data[...] = np.ones((1, 4, 12, 12))", ValueError, "(1,4,12,12) into shape (1,3,12,12)"),
+        ("net.blobs['data'].reshape(1, -3)", ValueError, "found shape (1, -3), expected no size below 0"),
+        ("net.blobs['data'].reshape(1, 2.5)", TypeError, "float"),
+        ("net.set_input_arrays(np.ones(1), np.ones(1))", RuntimeError, "if the first layer is a MemoryDataLayer"),
+        ("net.copy_from('nowhere.caffemodel')", RuntimeError, "Could not open file nowhere.caffemodel"),
+        ("caffe.Net('nowhere.prototxt', caffe.TEST)", RuntimeError, "Could not open file nowhere.prototxt"),
+        ("net.blobs['data'].reshape(1, 3, 1, 1); net.forward()", ValueError, 'net.prototxt:4:3: layer "conv1" (Con'),
+        ("net.blobs['data'].reshape(1, 4, 9, 9); net.forward()", ValueError, "(1, 4, 9, 9) does not suit the filters"),
+        ("net.params['conv1'][0].reshape(99, 99)", ValueError, "this blob has 270 numbers, and cannot become one of 9"),
+        ("net.blobs['data'].reshape(1, 1, 1, 1, 1); net.blobs['data'].num", ValueError, "num_axes() <= 4"),
+    ],
+)
+def test_bad_use_is_answered_and_the_net_lives(
+    net_of: Callable[..., caffe.Net], code: str, kind: type[Exception], message: str
+) -> None:
+    net = net_of(PYRAMID)
+    with pytest.raises(kind) as fault:
+        exec(code, {"net": net, "np": np, "caffe": caffe})
+    assert message in str(fault.value)
+    net.blobs["data"].reshape(1, 3, 12, 12)
+    assert net.forward()["prob1"].sum() == pytest.approx(25, rel=1e-4)
+
+
+ROUNDS = """
+import netspec.pycaffe as caffe
+net = caffe.Net("net.prototxt", caffe.TRAIN)
+solver = None
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+
+def rounds(count):
+    for i in range(count):
+        size = 12 + 4 * (i % 5)
+        net.blobs["data"].reshape(1 + i % 2, 3, size, size)
+        net.blobs["data"].data[...] = i % 7
+        out = net.forward()
+        if i % 3:
+            net.backward()
+        if i % 50 == 0:
+            held = [blob.data for blob in net.blobs.values()]
+
+rounds(300)
+before = resident()
+rounds(2000)
+print(resident() - before)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads the process's size from /proc")
+def test_memory_does_not_grow(write: Callable[..., str], tmp_path: Path) -> None:
+    write(PYRAMID)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "GLOG_minloglevel": "2", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", ROUNDS], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) < 4e6, f"{int(done.stdout)} bytes more after 2000 rounds"
