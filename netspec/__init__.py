@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 from netspec.errors import SpecError
@@ -19,6 +21,12 @@ if TYPE_CHECKING:
     from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights
     from netspec.solver.solver import Solver, load_solver
+
+# How idle OpenMP threads wait, which is read when torch is loaded: asleep. GNU's runtime has them spin for a while, and
+# that takes the cores from a second training on the machine (tools/benchmark_side_by_side.py). A user's choice stays.
+_WAITS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
+if "torch" not in sys.modules and not any(name in os.environ for name in _WAITS):
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 _HOMES = {
     "use_dialect": "netspec.dialects",

@@ -13,6 +13,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from typing_extensions import override
+
 logger = logging.getLogger("netspec")
 
 
@@ -44,8 +46,8 @@ def silent() -> Iterator[None]:
 class GlogFormatter(logging.Formatter):
     """Format records as the glog of Caffe's time did: exactly four blank-separated fields before the message."""
 
+    @override
     def format(self, record: logging.LogRecord) -> str:
-        """Return the record as one line."""
         moment = time.localtime(record.created)
         micros = int(record.created % 1 * 1e6)
         stamp = f"{time.strftime('%m%d %H:%M:%S', moment)}.{micros:06d}"

@@ -5,9 +5,11 @@ a CPU of the kind that Caffe ran on. Without that file it is "all".
 """
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+import lmdb
 import numpy as np
 import torch
 
@@ -17,8 +19,9 @@ from netspec.graph.filter import with_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
-from netspec.proto.schema import PHASES
+from netspec.proto.schema import PHASES, Datum
 from netspec.proto.text import parse_net
+from paths import GOLDEN
 
 Arrays = Mapping[str, np.ndarray]
 SAMPLED, EVERY = 40_000, 97  # of arrays of so many values, the files of the examples have every 97th
@@ -124,3 +127,24 @@ def train(solver: netspec.Solver, iterations: int) -> list[float]:
     solver.on_iteration = lambda: losses.append(solver.loss)
     solver.step(iterations)
     return losses
+
+
+def lay_out_examples(folder: Path) -> Path:
+    """Put ``examples/`` into a folder, as the paths in its prototxt files want it: the records are in LMDBs there."""
+    source = GOLDEN / "examples"
+    shutil.copytree(source, folder / "examples")
+    for name, prefix in {"mnist": "mnist", "siamese": "mnist_siamese"}.items():
+        records = np.load(source / name / "records.npz")
+        for kind in ("train", "test"):
+            path = folder / "examples" / name / f"{prefix}_{kind}_lmdb"
+            _write_datums(path, records[kind], records[f"{kind}_label"])
+    return folder
+
+
+def _write_datums(path: Path, images: np.ndarray, labels: np.ndarray) -> None:
+    """Write images (N, C, H, W) and labels (N,) as Datums."""
+    channels, height, width = images.shape[1:]
+    with lmdb.open(str(path), map_size=2**26) as environment, environment.begin(write=True) as transaction:
+        for i, (image, label) in enumerate(zip(images, labels, strict=True)):
+            datum = Datum(channels=channels, height=height, width=width, data=image.tobytes(), label=int(label))
+            transaction.put(b"%08d" % i, datum.SerializeToString())

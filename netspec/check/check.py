@@ -14,12 +14,12 @@ import torch
 
 from netspec import log
 from netspec.check.lint import missing_data, net_advice, solver_advice
-from netspec.errors import SpecError, Where, did_you_mean
+from netspec.errors import SpecError
 from netspec.graph.filter import with_state, with_train_state
 from netspec.layers.base import Shape
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
+from netspec.net.options import BuildOptions, not_to_be_given
 from netspec.net.weights import load_weights
 from netspec.proto.schema import TEST, NetParameter, PhaseValue, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
@@ -77,7 +77,7 @@ def check_file(
         solver = with_train_state(solver, level, stages)
         return _check_solver(solver, node, path, given or solver.weights, manner)
     checked = _check_net(with_state(net, phase, level, stages), source, str(path), given, manner)
-    checked.faults += _not_to_be_given(manner.shapes, [net], path)
+    checked.faults += not_to_be_given(manner.shapes, [net], path)
     return [checked]
 
 
@@ -119,7 +119,7 @@ def _check_solver(
     except SpecError as fault:
         faults.append(fault)
     described = solver_nets(solver, node, faults.append)
-    faults += _not_to_be_given(manner.shapes, [part.net for part in described], path)
+    faults += not_to_be_given(manner.shapes, [part.net for part in described], path)
     parts = [
         _check_net(part.net, part.source, part.label, weights, manner, seed_of(max(solver.random_seed, 0), part.label))
         for part in described
@@ -134,18 +134,3 @@ def _check_solver(
     if not faults and not any(part.faults for part in parts):
         advice = list(solver_advice(solver, node, nets))
     return [Checked(str(path), None, faults, advice), *parts]
-
-
-def _not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
-    """Return a fault for each given shape of a blob that no data layer (or Python layer) makes."""
-    makers = [layer for net in nets for layer in net.layer if not layer.bottom or layer.type == "Python"]
-    blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
-    known = ", ".join(blobs) or "none"
-    return [
-        SpecError(
-            f'--shape names "{name}"{did_you_mean(name, blobs) or ";"} the blobs of data layers: {known}',
-            Where(str(path)),
-        )
-        for name in shapes
-        if name not in blobs
-    ]

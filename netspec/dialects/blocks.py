@@ -5,15 +5,19 @@ Where two forks have different layers of one name (BN, Upsample), the fields tha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.layers import Layer, register
 from netspec.layers.activation import Activation
-from netspec.layers.base import Shape
+from netspec.layers.base import Affine, Shape, rounded
+from netspec.layers.normalization import onnx_centered, torch_batch_norm
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.convolution import Convolution
 from netspec.proto.schema import TRAIN, value
 
@@ -82,17 +86,33 @@ class Axpy(Layer):
 
     bottoms = (3, 3)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of x."""
         a, x, y = bottom_shapes
         if len(a) < 2 or a[:2] != x[:2] or any(size != 1 for size in a[2:]) or x != y:
             message = f"found shapes {a}, {x} and {y}, expected (N, C, 1, 1) and twice (N, C, ...)"
             raise self.error(message, "bottom")
         return [x]
 
+    @override
     def forward(self, a: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        """Return the sums."""
         return torch.addcmul(y, a.reshape(*a.shape[:2], *(1,) * (x.dim() - 2)), x)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        a, x, y = bottoms
+        missing = list(range(len(self.bottom_shapes[0]), len(self.bottom_shapes[1])))
+        if missing:
+            a = graph.node("Unsqueeze", a, graph.constant(missing))
+        return graph.node("Add", graph.node("Mul", a, x), y)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        a, x, y = bottoms
+        missing = len(self.bottom_shapes[1]) - len(self.bottom_shapes[0])
+        if missing:
+            a = code.call(f"{{a}}[..., {', '.join(['None'] * missing)}]", a=a)
+        return code.call("{a} * {x} + {y}", a=a, x=x, y=y)
 
 
 @register("ReLU6", "relu6_param")
@@ -106,17 +126,30 @@ class ReLU6(Activation):
 
     gradient_reads = frozenset({"bottom"})
 
+    @override
     def setup(self) -> None:
-        """Read the slope of the negative side."""
         self.slope: float = value(self.param, "relu6_param").negative_slope
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the rectified bottom."""
         return torch.where(x >= 6, 6, F.leaky_relu(x, self.slope) if self.slope else F.relu(x))
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * self.slope).where(bottom < 6, 0)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.slope == 0:
+            return graph.node("Clip", *bottoms, graph.constant(0.0), graph.constant(6.0))
+        leaky = graph.node("LeakyRelu", *bottoms, alpha=self.slope)
+        return graph.node("Min", leaky, graph.constant(6.0))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.slope == 0:
+            return code.call("F.relu6({x})", x=bottoms[0])
+        return code.call("F.leaky_relu({x}, {slope}).clamp(max=6)", x=bottoms[0], slope=self.slope)
 
 
 @register("DepthwiseConvolution", "convolution_param")
@@ -130,6 +163,7 @@ class DepthwiseConvolution(Convolution):
     Fork: yonghenglh6/DepthwiseConvolution
     """
 
+    @override
     def setup(self) -> None:
         """Set up as Convolution; refuse filters over more than one channel."""
         super().setup()
@@ -153,8 +187,8 @@ class ConvolutionDepthwise(Convolution):
     tops = (1, 1)
     ignores = frozenset({"convolution_param.group"})
 
+    @override
     def setup(self) -> None:
-        """Read the geometry, add the filters and the bias."""
         self.read_geometry()
         if self.spatial_axes != 2:
             raise self.error(f"found a bottom of shape {self.bottom_shapes[0]}, expected (N, C, H, W)", "bottom")
@@ -176,17 +210,27 @@ class ShuffleChannel(Layer):
     Fork: farmingyard/ShuffleNet, shuffle_channel_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         shape, self.group = bottom_shapes[0], value(self.param, "shuffle_channel_param").group
         if len(shape) < 2 or self.group < 1 or shape[1] % self.group:
             message = f"found a bottom of shape {shape}, expected channels that are a multiple of group, {self.group}"
             raise self.error(message, "shuffle_channel_param", "group")
         return [shape]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the shuffled channels."""
         return data.unflatten(1, (self.group, -1)).transpose(1, 2).flatten(1, 2)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        channels = self.bottom_shapes[0][1]
+        dealt = graph.reshape(bottoms[0], [0, self.group, channels // self.group, -1])
+        return graph.reshape_to_top(graph.node("Transpose", dealt, perm=[0, 2, 1, 3]))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("F.channel_shuffle({x}, {groups})", x=bottoms[0], groups=self.group)
 
 
 @register("Interp", "interp_param")
@@ -205,8 +249,8 @@ class Interp(Layer):
     bottoms = (1, 2)
     label_bottoms = frozenset({1})
 
+    @override
     def setup(self) -> None:
-        """Check that the new size is given in one way."""
         param: Any = value(self.param, "interp_param")
         factors = [name for name in ("shrink_factor", "zoom_factor") if param.HasField(name)]
         explicit = [name for name in ("height", "width") if param.HasField(name)]
@@ -223,8 +267,8 @@ class Interp(Layer):
                 message = f"{name} must be 0, or negative to cut off pixels, found {getattr(param, name)}"
                 raise self.error(message, "interp_param", name)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of the resized maps."""
         param, shape = value(self.param, "interp_param"), bottom_shapes[0]
         if any(len(each) != 4 for each in bottom_shapes):
             raise self.error(f"found bottoms of shapes {bottom_shapes}, expected 4 axes (N, C, H, W)", "bottom")
@@ -240,12 +284,45 @@ class Interp(Layer):
             size = tuple(length + (length - 1) * (param.zoom_factor - 1) for length in shrunk)
         return [(*shape[:2], *size)]
 
+    @override
     def forward(self, data: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-        """Return the resized maps."""
         param = value(self.param, "interp_param")
         cut = [param.pad_beg, param.pad_end] * 2
         inner = F.pad(data, cut) if any(cut) else data
         return F.interpolate(inner, self.top_shapes[0][2:], mode="bilinear", align_corners=True)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        param, (data, *like) = value(self.param, "interp_param"), bottoms
+        if param.pad_beg or param.pad_end:
+            start, end = graph.constant([-param.pad_beg] * 2), graph.constant([param.pad_end or 2**62] * 2)
+            data = graph.node("Slice", data, start, end, graph.constant([2, 3]))
+        if like:
+            size = graph.shape_of(like[0], 2, 4)
+        elif param.HasField("height"):
+            size = graph.constant([param.height, param.width])
+        else:
+            one, zoom = graph.constant([1, 1]), graph.constant([param.zoom_factor] * 2)
+            last = graph.node("Sub", graph.shape_of(data, 2, 4), one)
+            steps = graph.node("Mul", graph.node("Div", last, graph.constant([param.shrink_factor] * 2)), zoom)
+            size = graph.node("Add", steps, one)
+        sizes = graph.node("Concat", graph.shape_of(data, 0, 2), size, axis=0)
+        grid = {"mode": "linear", "coordinate_transformation_mode": "align_corners"}
+        return graph.node("Resize", data, "", "", sizes, **grid)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        param, (x, *like) = value(self.param, "interp_param"), bottoms
+        cut = (param.pad_beg, param.pad_end) * 2
+        if any(cut):
+            x = code.call("F.pad({x}, {cut})", x=x, cut=cut)
+        template = 'F.interpolate({x}, size={size}, mode="bilinear", align_corners=True)'
+        if like:
+            return code.call(template.replace("{size}", "{y}.shape[2:]"), x=x, y=like[0])
+        if None not in code.sizes(0)[2:] or param.HasField("height"):
+            return code.call(template, x=x, size=tuple(self.top_shapes[0][2:]))
+        size = "[(n - 1) // {shrink} * {zoom} + 1 for n in {x}.shape[2:]]"
+        return code.call(template.replace("{size}", size), x=x, shrink=param.shrink_factor, zoom=param.zoom_factor)
 
 
 class _Unpool(torch.autograd.Function):
@@ -282,8 +359,8 @@ class Upsample(Layer):
     bottoms = (1, 2)
     label_bottoms = frozenset({1})
 
+    @override
     def setup(self) -> None:
-        """Check that the new size is given in one way."""
         param = value(self.param, "upsample_param")
         given = {field.name for field, _ in param.ListFields()}
         masked = len(self.bottom_shapes) == 2
@@ -300,8 +377,8 @@ class Upsample(Layer):
             if getattr(param, name) and along != 2:
                 raise self.error(f"{name} needs a scale of 2, found {along}", "upsample_param", name)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of the enlarged maps."""
         param, shape = value(self.param, "upsample_param"), bottom_shapes[0]
         if len(shape) != 4 or any(other != shape for other in bottom_shapes):
             message = f"found bottoms of shapes {bottom_shapes}, expected (N, C, H, W), and the mask's the same"
@@ -313,6 +390,7 @@ class Upsample(Layer):
             raise self.error(f"the top would have no pixel, {size[0]} x {size[1]}", "upsample_param")
         return [(*shape[:2], *size)]
 
+    @override
     def forward(self, data: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Return the enlarged maps; raise SpecError for a mask of another size."""
         if mask is None:
@@ -324,6 +402,38 @@ class Upsample(Layer):
             raise self.error(message, "bottom", 1)
         top: torch.Tensor = _Unpool.apply(data.flatten(2), index.flatten(2), height * width)
         return top.reshape(self.top_shapes[0])
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if len(bottoms) == 1:
+            scales = graph.constant([1.0, 1.0, float(self.scale_h), float(self.scale_w)])
+            grid = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+            return graph.node("Resize", *bottoms, "", scales, **grid)
+        for axis in (2, 3):
+            graph.size(0, axis, "its mask counts the pixels of the enlarged map")
+        values = graph.reshape(bottoms[0], [0, 0, -1])
+        mask = graph.cast(graph.reshape(bottoms[1], [0, 0, -1]), "int64")
+        pixels = graph.constant([math.prod(self.top_shapes[0][2:])])
+        shape = graph.node("Concat", graph.shape_of(bottoms[0], 0, 2), pixels, axis=0)
+        empty = graph.node("Expand", graph.constant(0.0), shape)
+        return graph.reshape_to_top(graph.node("ScatterElements", empty, mask, values, axis=2))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        scale = (self.scale_h, self.scale_w)
+        if len(bottoms) == 1:
+            factor = self.scale_h if self.scale_h == self.scale_w else scale
+            return code.call("F.interpolate({x}, scale_factor={factor})", x=bottoms[0], factor=factor)
+        if None in code.sizes(0)[2:] and value(self.param, "upsample_param").HasField("upsample_h") is False:
+            cut = (value(self.param, "upsample_param").pad_out_h, value(self.param, "upsample_param").pad_out_w)
+            sides = [f"{{x}}.shape[{2 + k}] * {scale[k]}{' - 1' if cut[k] else ''}" for k in (0, 1)]
+            return code.call(
+                f"{code.function(unpool)}({{x}}, {{mask}}, ({', '.join(sides)}))", x=bottoms[0], mask=bottoms[1]
+            )
+        size = tuple(self.top_shapes[0][2:])
+        return code.call(
+            f"{code.function(unpool)}({{x}}, {{mask}}, {{size}})", x=bottoms[0], mask=bottoms[1], size=size
+        )
 
 
 @register("BN", "bn_param")
@@ -344,8 +454,8 @@ class BN(Layer):
     Fork: hszhao/PSPNet and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add slopes, biases and moving averages."""
         param, shape = value(self.param, "bn_param"), self.bottom_shapes[0]
         if not 2 <= len(shape) <= 4:
             raise self.error(f"found a bottom of shape {shape}, expected (N, C, H, W), 2 to 4 axes", "bottom")
@@ -368,6 +478,7 @@ class BN(Layer):
             self.add_blob(size, value=float(param.frozen))
             self.not_learned = frozenset(range(4) if param.frozen else (2, 3))
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape; its channels must stay as many."""
         shape = bottom_shapes[0]
@@ -375,6 +486,7 @@ class BN(Layer):
             raise self.error(f"bottom of shape {shape} has not the {self.channels} channels seen first", "bottom")
         return [shape]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalised values; in training also move the averages."""
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (0, 1))
@@ -394,3 +506,57 @@ class BN(Layer):
         with torch.no_grad():
             for i, batch in ((2, mean), (3, variance)):
                 self.blob(i).mul_(momentum).add_(batch.reshape(self.blob_shapes[i]), alpha=1 - momentum)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
+        slope, bias = graph.blob(0, shape), graph.blob(1, shape)
+        if not self.by_batch and not self.moving:
+            return graph.node("Add", graph.node("Mul", *bottoms, slope), bias)
+        if not self.by_batch:
+            blobs = [graph.blob(i, (self.channels,)) for i in range(4)]
+            return graph.node("BatchNormalization", *bottoms, *blobs, epsilon=self.eps)
+        centered, variance = onnx_centered(graph, bottoms[0], len(self.bottom_shapes[0]))
+        length = graph.node("Sqrt", graph.node("Add", variance, graph.constant(self.eps)))
+        return graph.node("Add", graph.node("Mul", graph.node("Div", centered, length), slope), bias)
+
+    @override
+    def as_affine(self) -> Affine | None:
+        if self.by_batch:
+            return None
+        slope, bias = (self.blob_in_double(i).reshape(-1) for i in (0, 1))
+        if not self.moving:
+            return slope, bias
+        mean, variance = (self.blob_in_double(i).reshape(-1) for i in (2, 3))
+        scale = slope * (variance + self.eps).rsqrt()
+        return scale, bias - mean * scale
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        axes = len(self.bottom_shapes[0])
+        weight, bias = (self.blob(i).reshape(-1) for i in (0, 1))
+        shape = (self.channels, *(1,) * (axes - 2))
+        if self.by_batch:
+            template = "F.batch_norm({x}, None, None, training=True, eps={eps}) * {y} + {z}"
+            return code.call(
+                template,
+                x=bottoms[0],
+                eps=rounded(self.eps),
+                y=code.parameter(0, shape, "slope"),
+                z=code.parameter(1, shape, "bias"),
+            )
+        if not self.moving:
+            return code.call(
+                "{x} * {y} + {z}", x=bottoms[0], y=code.parameter(0, shape, "slope"), z=code.parameter(1, shape, "bias")
+            )
+        mean, variance = (self.blob(i).reshape(-1) for i in (2, 3))
+        state = {"weight": weight, "bias": bias, "running_mean": mean, "running_var": variance}
+        state["num_batches_tracked"] = torch.zeros((), dtype=torch.long)
+        norm = torch_batch_norm(code, axes, state, self.channels, rounded(self.eps))
+        return code.call("{norm}({x})", norm=norm, x=bottoms[0])
+
+
+def unpool(x, mask, size):
+    """Bring each value to the pixel of a larger map that the mask names; the others are 0."""
+    empty = x.new_zeros(*x.shape[:2], size[0] * size[1])
+    return empty.scatter(2, mask.flatten(2).long(), x.flatten(2)).unflatten(2, size)

@@ -10,11 +10,13 @@ from functools import reduce
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.layers import Layer, common, register
-from netspec.layers.base import Shape
-from netspec.layers.loss.base import Loss
-from netspec.proto.schema import value
+from netspec.layers.base import Shape, rounded
+from netspec.layers.loss.base import BATCH_SIZE, Loss, onnx_normalized_sum
+from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.proto.schema import TRAIN, value
 
 DECLARATIONS = """
 message ROIPoolingParameter {
@@ -50,10 +52,30 @@ class Dropout(common.Dropout):
     Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/dropout_layer.cpp
     """
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the values that are kept, scaled in the one phase or the other."""
         top = super().forward(data)
         return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        top = super().to_onnx(graph, *bottoms)
+        if value(self.param.dropout_param, "scale_train"):
+            return top
+        return graph.node("Mul", *bottoms, graph.constant(1 - self.ratio))
+
+    @property
+    @override
+    def passes_on(self) -> bool:
+        return super().passes_on and bool(value(self.param.dropout_param, "scale_train"))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if value(self.param.dropout_param, "scale_train"):
+            return super().to_torch(code, *bottoms)
+        if self.phase == TRAIN:
+            raise self.refusal("PyTorch", "torch's dropout scales in training, this one in testing")
+        return code.call("{x} * {kept}", x=bottoms[0], kept=1 - self.ratio)
 
 
 class _RegionPooling(Layer):
@@ -98,8 +120,8 @@ class ROIPooling(_RegionPooling):
     Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/roi_pooling_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Check the number of bins."""
         param = value(self.param, "roi_pooling_param")
         for name in ("pooled_h", "pooled_w"):
             if getattr(param, name) < 1:
@@ -107,12 +129,12 @@ class ROIPooling(_RegionPooling):
         self.bins = (param.pooled_h, param.pooled_w)
         self.scale: float = param.spatial_scale
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of all regions' bins."""
         return [(self.check_regions(bottom_shapes), bottom_shapes[0][1], *self.bins)]
 
+    @override
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
-        """Return the maxima."""
         images, channels, height, width = maps.shape
         with torch.no_grad():
             regions = regions.reshape(-1, 5)
@@ -137,6 +159,15 @@ class ROIPooling(_RegionPooling):
         steps = torch.arange(count + 1, dtype=first.dtype, device=first.device) * (length / count)[:, None]
         ends = torch.stack([steps[:, :-1].floor(), steps[:, 1:].ceil()], dim=2) + first[:, None, None]
         return ends.clamp(0, size).long()
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        regions = graph.reshape(bottoms[1], [-1, 5])
+        return graph.node("MaxRoiPool", bottoms[0], regions, pooled_shape=self.bins, spatial_scale=self.scale)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        raise self.refusal("PyTorch", "PyTorch has no pooling of regions; torchvision's roi_pool is near to it")
 
 
 Table = tuple[torch.Tensor, torch.Tensor]  # values and the pixels that they come from
@@ -197,14 +228,17 @@ class PSROIPooling(_RegionPooling):
     Fork: daijifeng001/caffe-rfcn, src/caffe/layers/psroi_pooling_layer.cpp
     """
 
+    not_exported = "there is no position-sensitive pooling of regions"
+
+    @override
     def setup(self) -> None:
-        """Check the sizes."""
         param = value(self.param, "psroi_pooling_param")
         for name in ("output_dim", "group_size"):
             if getattr(param, name) < 1:
                 raise self.error(f"{name} must be given and be at least 1", "psroi_pooling_param", name)
         self.channels, self.bins, self.scale = param.output_dim, param.group_size, param.spatial_scale
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of all regions' bins; the map must have a channel for each."""
         regions = self.check_regions(bottom_shapes)
@@ -214,8 +248,8 @@ class PSROIPooling(_RegionPooling):
             raise self.error(message, "bottom", 0)
         return [(regions, self.channels, self.bins, self.bins)]
 
+    @override
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
-        """Return the means."""
         with torch.no_grad():
             regions = regions.reshape(-1, 5)
             image = self.images_of(regions, maps.shape[0])
@@ -259,13 +293,14 @@ class SmoothL1Loss(Loss):
     bottoms = (2, 4)
     label_bottoms = frozenset({2, 3})
 
+    @override
     def setup(self) -> None:
-        """Read sigma."""
         sigma = value(self.param, "smooth_l1_loss_param").sigma
         if sigma <= 0:
             raise self.error(f"sigma must be above 0, found {sigma:g}", "smooth_l1_loss_param", "sigma")
         self.knee = 1 / (sigma * sigma)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the scalar top's shape; the bottoms must be of one shape, but for ones at its end."""
         full = [(*shape, 1, 1, 1)[: max(4, len(shape))] for shape in bottom_shapes]
@@ -275,11 +310,49 @@ class SmoothL1Loss(Loss):
                 raise self.error(message, "bottom", i)
         return super().reshape(bottom_shapes)
 
+    @override
     def forward(self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         inside, outside = (*(weight.detach().reshape_as(predictions) for weight in weights), None, None)[:2]
         difference = predictions - targets.reshape_as(predictions)
         if inside is not None:
             difference = difference * inside
         losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=self.knee)
         return (losses if outside is None else losses * outside).sum() / len(predictions)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        predictions, *others = bottoms
+        shape = graph.shape_of(predictions)
+        aligned = [
+            bottom if self.bottom_shapes[i] == self.bottom_shapes[0] else graph.node("Reshape", bottom, shape)
+            for i, bottom in enumerate(others, 1)
+        ]
+        difference = graph.node("Sub", predictions, aligned[0])
+        if len(aligned) > 1:
+            difference = graph.node("Mul", difference, aligned[1])
+        length = graph.node("Abs", difference)
+        knee = graph.constant(self.knee)
+        square = graph.node("Mul", graph.node("Mul", difference, difference), graph.constant(0.5 / self.knee))
+        linear = graph.node("Sub", length, graph.constant(0.5 * self.knee))
+        losses = graph.node("Where", graph.node("Less", length, knee), square, linear)
+        if len(aligned) > 2:
+            losses = graph.node("Mul", losses, aligned[2])
+        return onnx_normalized_sum(graph, losses, "", BATCH_SIZE)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if len(set(self.bottom_shapes)) > 1:
+            raise self.refusal("PyTorch", "it is exported for bottoms of one shape")
+        knee = rounded(self.knee)
+        if len(bottoms) == 2:
+            template = 'F.smooth_l1_loss({x}, {y}, beta={knee}, reduction="sum") / {x}.shape[0]'
+            return code.call(template, x=bottoms[0], y=bottoms[1], knee=knee)
+        template = f"{code.function(weighted_smooth_l1_loss)}({', '.join(bottoms)}, beta={{knee}})"
+        return code.call(template, knee=knee)
+
+
+def weighted_smooth_l1_loss(predictions, targets, inside, outside=1.0, beta=1.0):
+    """Return the smooth L1 loss of weighted differences, weighted and summed up, / N."""
+    x, y = inside * predictions, inside * targets
+    losses = F.smooth_l1_loss(x, y, beta=beta, reduction="none")
+    return (outside * losses).sum() / predictions.shape[0]

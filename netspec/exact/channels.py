@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
+from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.accumulate import ParameterSums
@@ -29,10 +30,10 @@ class ChannelProducts(ParameterSums):
     """
 
     @staticmethod
+    @override
     def forward(
         ctx: Any, values: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, in_place: bool
     ) -> torch.Tensor:
-        """Return the products, and the bias added."""
         ParameterSums.keep(ctx, values, (factors, bias), in_place)
         tops = values.clone() if factors is None else values * factors.view(-1, 1)
         return tops if bias is None else tops.add_(bias.view(-1, 1))
@@ -40,6 +41,7 @@ class ChannelProducts(ParameterSums):
     @staticmethod
     @once_differentiable
     @one_thread()
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of values, factors and bias, where they are asked for."""
         values, factors, _ = ctx.saved_tensors
@@ -100,13 +102,14 @@ class Slopes(ParameterSums):
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, values: torch.Tensor, slopes: torch.Tensor, in_place: bool) -> torch.Tensor:
-        """Return the rectified values."""
         ParameterSums.keep(ctx, values, (slopes,), in_place)
         return torch.where(values > 0, values, values * slopes.view(-1, 1))
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of values and slopes, where they are asked for."""
         values, slopes = ctx.saved_tensors
@@ -132,8 +135,8 @@ class BatchNormalization(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
+    @override
     def forward(ctx: Any, values: torch.Tensor, eps: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the normalized values and what they were normalized by."""
         count = values.numel() // values.shape[1]
         mean = _channel_sums(values, 1 / count)
         centered = values - mean[:, None]
@@ -147,6 +150,7 @@ class BatchNormalization(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     @one_thread()
+    @override
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
         """Return the gradient of the values: (d - mean(d) - mean(d y) y) / deviation, for the gradient d of y."""
         tops, deviation = ctx.saved_tensors
@@ -167,8 +171,8 @@ class RowNormalization(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
+    @override
     def forward(ctx: Any, rows: torch.Tensor, eps: float | None) -> torch.Tensor:
-        """Return the normalized rows."""
         centered = rows - _row_means(rows)
         if eps is None:
             ctx.save_for_backward()
@@ -181,8 +185,8 @@ class RowNormalization(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     @one_thread()
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Return the gradient of the rows."""
         diff = diff.contiguous()
         if not ctx.saved_tensors:
             return diff - _row_means(diff), None

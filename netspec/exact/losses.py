@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
+from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.blas import add_sums, array, dots, one_thread, sum_in_order
@@ -33,15 +34,15 @@ class Logarithm(torch.autograd.Function):
     """Return natural logarithms."""
 
     @staticmethod
+    @override
     def forward(ctx: Any, values: torch.Tensor) -> torch.Tensor:
-        """Return the logarithms."""
         ctx.save_for_backward(values)
         return libm.log(values)
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
-        """Return the gradient divided by the values."""
         (values,) = ctx.saved_tensors
         return diff / values
 
@@ -53,14 +54,15 @@ class SigmoidCrossEntropy(torch.autograd.Function):
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, x: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the losses."""
         ctx.save_for_backward(x, target)
         positive = (x >= 0).to(x.dtype)
         return libm.log(1 + libm.exp(x - 2 * x * positive)) - x * (target - positive)
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Return sigmoid(x) - target times the losses' gradient."""
         x, target = ctx.saved_tensors
@@ -78,8 +80,8 @@ class Infogain(torch.autograd.Function):
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, scores: torch.Tensor, gain: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the losses, their logarithms of no less than ``least``, and p."""
         p = softmax(scores)
         ctx.save_for_backward(p, gain)
         ctx.mark_non_differentiable(p)
@@ -87,6 +89,7 @@ class Infogain(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
         """Return the scores' gradient, for losses that go into one sum; it takes no notice of ``least``."""
         p, gain = ctx.saved_tensors

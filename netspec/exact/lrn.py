@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
+from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.pointwise import Pointwise
@@ -45,8 +46,8 @@ class AcrossChannels(torch.autograd.Function):
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, maps: torch.Tensor, size: int, alpha: float, beta: float, k: float) -> torch.Tensor:
-        """Return the normalized values."""
         base = _forward_sums(maps * maps, size, alpha / size, k)
         ctx.save_for_backward(maps, base)
         ctx.settings = size, alpha, beta
@@ -54,8 +55,8 @@ class AcrossChannels(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradient of the maps."""
         maps, base = ctx.saved_tensors
         size, alpha, beta = ctx.settings
         roots = libm.power(base, -beta)

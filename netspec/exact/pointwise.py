@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
+from typing_extensions import override
 
 from netspec.exact import libm
 
@@ -19,10 +20,10 @@ class Pointwise(torch.autograd.Function):
     """Apply ``compute(bottom)``; its gradient is ``gradient(bottom, top, diff)``, as Caffe computes it."""
 
     @staticmethod
+    @override
     def forward(
         ctx: Any, bottom: torch.Tensor, compute: Callable[[torch.Tensor], torch.Tensor], gradient: Gradient
     ) -> torch.Tensor:
-        """Return the top."""
         top = compute(bottom)
         ctx.gradient = gradient
         ctx.save_for_backward(bottom, top)
@@ -30,8 +31,8 @@ class Pointwise(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None, None]:
-        """Return the gradient of the bottom."""
         return ctx.gradient(*ctx.saved_tensors, diff), None, None
 
 
@@ -52,10 +53,10 @@ class CellUpdate(torch.autograd.Function):
     """
 
     @staticmethod
+    @override
     def forward(
         ctx: Any, cell: torch.Tensor, gates: torch.Tensor, keep: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the next cell and hidden state."""
         i, f, o = (_sigmoid(gate) for gate in gates.chunk(4, -1)[:3])
         f, g = keep * f, _tanh(gates.chunk(4, -1)[3])
         following = f * cell + i * g
@@ -65,8 +66,8 @@ class CellUpdate(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, cell_diff: torch.Tensor, hidden_diff: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Return the gradients of the cell and of the gates."""
         cell, i, f, o, g, squashed = ctx.saved_tensors
         total = cell_diff + hidden_diff * o * (1 - squashed * squashed)
         gates = (

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
+from typing_extensions import override
 
 from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import Values, add_sums, array, gemm, one_thread
@@ -85,6 +86,7 @@ class ColumnProducts(ParameterSums):
     """
 
     @staticmethod
+    @override
     def forward(
         ctx: Any,
         maps: torch.Tensor,
@@ -107,6 +109,7 @@ class ColumnProducts(ParameterSums):
     @staticmethod
     @once_differentiable
     @one_thread()
+    @override
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, _ = ctx.saved_tensors
@@ -139,6 +142,7 @@ class SpreadProducts(ParameterSums):
     """
 
     @staticmethod
+    @override
     def forward(
         ctx: Any,
         maps: torch.Tensor,
@@ -149,7 +153,6 @@ class SpreadProducts(ParameterSums):
         in_place: bool,
         size: Axes,
     ) -> torch.Tensor:
-        """Return the maps that the pixels add up to."""
         maps = maps.contiguous()
         ParameterSums.keep(ctx, maps, (weight, bias), in_place)
         ctx.sliding, ctx.group = sliding, group
@@ -165,6 +168,7 @@ class SpreadProducts(ParameterSums):
     @staticmethod
     @once_differentiable
     @one_thread()
+    @override
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, _ = ctx.saved_tensors
@@ -193,15 +197,15 @@ class Columns(torch.autograd.Function):
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, maps: torch.Tensor, sliding: Filter) -> torch.Tensor:
-        """Return the columns."""
         ctx.sliding, ctx.size = sliding, maps.shape[2:]
         return torch.stack([sliding.columns(image) for image in maps])
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Return the maps' gradient."""
         return torch.stack([ctx.sliding.spread(columns, ctx.size) for columns in diff.contiguous()]), None
 
 
@@ -221,6 +225,7 @@ class VectorProducts(ParameterSums):
     """
 
     @staticmethod
+    @override
     def forward(
         ctx: Any,
         vectors: torch.Tensor,
@@ -229,7 +234,6 @@ class VectorProducts(ParameterSums):
         transposed: bool,
         in_place: bool,
     ) -> torch.Tensor:
-        """Return the products."""
         vectors = vectors.contiguous()
         ParameterSums.keep(ctx, vectors, (weight, bias), in_place)
         ctx.transposed = transposed
@@ -241,6 +245,7 @@ class VectorProducts(ParameterSums):
     @staticmethod
     @once_differentiable
     @one_thread()
+    @override
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of vectors, weight and bias, where they are asked for."""
         vectors, weight, _ = ctx.saved_tensors
@@ -270,10 +275,10 @@ class ChosenRows(ParameterSums):
     """
 
     @staticmethod
+    @override
     def forward(
         ctx: Any, index: torch.Tensor, rows: torch.Tensor, bias: torch.Tensor | None, in_place: bool
     ) -> torch.Tensor:
-        """Return the rows."""
         ParameterSums.keep(ctx, index, (rows, bias), in_place)
         tops = rows[index]
         return tops if bias is None else tops.add_(bias)
@@ -281,6 +286,7 @@ class ChosenRows(ParameterSums):
     @staticmethod
     @once_differentiable
     @one_thread()
+    @override
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         """Return the gradients of rows and bias, where they are asked for."""
         rows_sums, bias_sums = sums = ParameterSums.sums(ctx)

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
+from typing_extensions import override
 
 from netspec.exact.blas import dots, one_thread, sum_in_order, sum_of_magnitudes
 
@@ -16,12 +17,13 @@ class SumInOrder(torch.autograd.Function):
     """Sum up along an axis, one value after the other (a plain loop of Caffe's)."""
 
     @staticmethod
+    @override
     def forward(ctx: Any, values: torch.Tensor, axis: int) -> torch.Tensor:
-        """Return the sums, without that axis."""
         ctx.shape, ctx.axis = values.shape, axis
         return sum_in_order(values, axis)
 
     @staticmethod
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Return each sum's gradient for each of its terms."""
         return diff.unsqueeze(ctx.axis).expand(ctx.shape), None
@@ -32,12 +34,13 @@ class RowSums(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
+    @override
     def forward(ctx: Any, rows: torch.Tensor, factor: float) -> torch.Tensor:
-        """Return the sums."""
         ctx.shape, ctx.factor = rows.shape, factor
         return dots(rows.unsqueeze(2), torch.full_like(rows, factor).unsqueeze(2)).squeeze(1)
 
     @staticmethod
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Return each sum's gradient, times the factor, for each of its terms."""
         return (diff * ctx.factor).unsqueeze(1).expand(ctx.shape), None
@@ -48,15 +51,15 @@ class RowSquares(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
+    @override
     def forward(ctx: Any, rows: torch.Tensor) -> torch.Tensor:
-        """Return the sums."""
         ctx.save_for_backward(rows)
         return dots(rows.unsqueeze(2), rows.unsqueeze(2)).squeeze(1)
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
-        """Return twice the values times their sum's gradient."""
         (rows,) = ctx.saved_tensors
         return rows * (2 * diff).unsqueeze(1)
 
@@ -66,15 +69,15 @@ class RowMagnitudes(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
+    @override
     def forward(ctx: Any, rows: torch.Tensor) -> torch.Tensor:
-        """Return the sums."""
         ctx.save_for_backward(rows)
         return torch.stack([sum_of_magnitudes(row) for row in rows])
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
-        """Return the signs of the values times their sum's gradient."""
         (rows,) = ctx.saved_tensors
         return rows.sign() * diff.unsqueeze(1)
 
@@ -86,14 +89,15 @@ class Copies(torch.autograd.Function):
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, values: torch.Tensor, count: int) -> tuple[torch.Tensor, ...]:
         """Return the tensors; they share their memory."""
         ctx.set_materialize_grads(False)
         return tuple(values.view_as(values) for _ in range(count))
 
     @staticmethod
+    @override
     def backward(ctx: Any, *diffs: torch.Tensor | None) -> tuple[torch.Tensor | None, None]:
-        """Return the sum of the gradients that there are."""
         found = [diff for diff in diffs if diff is not None]
         return sum(found[1:], found[0]) if found else None, None
 
@@ -105,14 +109,14 @@ class Tiles(torch.autograd.Function):
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, values: torch.Tensor, count: int) -> torch.Tensor:
-        """Return the copies."""
         return values.unsqueeze(1).repeat(1, count, 1)
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Return the sum of the copies' gradients, the first one's first."""
         return sum_in_order(diff, 1), None
 
 
@@ -125,8 +129,8 @@ class Product(torch.autograd.Function):
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, stable: bool, *bottoms: torch.Tensor) -> torch.Tensor:
-        """Return the product."""
         ctx.stable = stable
         top = _product(bottoms)
         ctx.save_for_backward(top, *bottoms)
@@ -134,8 +138,8 @@ class Product(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Return the gradients of the bottoms."""
         top, *bottoms = ctx.saved_tensors
         found: list[torch.Tensor | None] = []
         for i, (bottom, asked) in enumerate(zip(bottoms, ctx.needs_input_grad[1:], strict=True)):

@@ -5,31 +5,34 @@ Caffe: the neuron layers, include/caffe/layers/neuron_layer.hpp
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 
 
 class Activation(Layer):
     """Base of the layers whose top has its bottom's shape."""
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         return bottom_shapes
 
 
 class Rounded(Activation):
     """Base of the activations that torch's functions round otherwise than the C library's, which Caffe calls."""
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom."""
         return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
@@ -41,6 +44,21 @@ class Rounded(Activation):
         raise NotImplementedError
 
 
+def scaled_and_shifted(graph: OnnxGraph, value: str, scale: float, shift: float) -> str:
+    """Return scale value + shift as nodes, without those that change nothing."""
+    if scale != 1:
+        value = graph.node("Mul", value, graph.constant(float(scale)))
+    return graph.node("Add", value, graph.constant(float(shift))) if shift else value
+
+
+def torch_scaled_and_shifted(code: TorchCode, value: str, scale: float, shift: float) -> str:
+    """Return the expression of scale value + shift, without what changes nothing."""
+    template = ("{scale} * {x}" if scale != 1 else "{x}") + (
+        " + {shift}" if shift > 0 else " - {shift}" if shift else ""
+    )
+    return code.call(template, x=value, scale=float(scale), shift=abs(float(shift)))
+
+
 @register("ReLU", "relu_param")
 class ReLU(Activation):
     """max(x, 0) + negative_slope min(x, 0); the gradient at 0 is the negative side's.
@@ -50,18 +68,28 @@ class ReLU(Activation):
     Caffe: src/caffe/layers/relu_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the slope of the negative side."""
         self.slope: float = self.param.relu_param.negative_slope
         self.gradient_reads = frozenset({"sign" if self.slope >= 0 else "bottom"})  # the top's sign is the bottom's
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the rectified bottom."""
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * self.slope)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("LeakyRelu", *bottoms, alpha=self.slope) if self.slope else graph.node("Relu", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.slope:
+            return code.call("F.leaky_relu({x}, {slope})", x=bottoms[0], slope=self.slope)
+        return code.call("F.relu({x})", x=bottoms[0])
 
 
 @register("PReLU", "prelu_param")
@@ -74,20 +102,32 @@ class PReLU(Activation):
     Caffe: src/caffe/layers/prelu_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the slopes."""
         p = self.param.prelu_param
         shape = self.bottom_shapes[0]
         if len(shape) < 2:
             raise self.error(f"bottom has shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
         self.add_blob(() if p.channel_shared else shape[1:2], p.filler if p.HasField("filler") else None, 0.25)
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the rectified bottom."""
         slopes = self.blob(0)
         if self.is_exact(x):
             return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.context.accumulate_in_place).reshape(x.shape)
         return F.prelu(x, slopes.reshape(-1))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        slopes = math.prod(self.blob_shapes[0])
+        spatial = len(self.bottom_shapes[0]) - 2
+        return graph.node("PRelu", *bottoms, graph.blob(0, (slopes, *(1,) * (spatial if self.blob_shapes[0] else 0))))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        slopes = self.blob(0).reshape(-1)
+        slope = code.module("nn.PReLU({channels})", {"weight": slopes}, channels=len(slopes))
+        return code.call("{slope}({x})", slope=slope, x=bottoms[0])
 
 
 @register("ELU", "elu_param")
@@ -99,23 +139,33 @@ class ELU(Rounded):
     Caffe: src/caffe/layers/elu_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the scale of the negative side."""
         self.alpha: float = self.param.elu_param.alpha
         self.gradient_reads = frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         # exp(x) - 1 as Caffe computes it, not the more exact expm1.
         return torch.where(x > 0, x, self.alpha * (torch.exp(x.clamp(max=0)) - 1))
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return torch.where(x > 0, x, self.alpha * (libm.exp(x.clamp(max=0)) - 1))
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Elu", *bottoms, alpha=self.alpha)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.alpha == 1:
+            return code.call("F.elu({x})", x=bottoms[0])
+        return code.call("F.elu({x}, alpha={alpha})", x=bottoms[0], alpha=self.alpha)
 
 
 @register("Sigmoid", "sigmoid_param")
@@ -129,17 +179,25 @@ class Sigmoid(Rounded):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return torch.sigmoid(x)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return libm.sigmoid(x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return (diff * top * (1 - top.double())).to(diff.dtype)  # 1. is a double to C, and so are its results
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Sigmoid", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.sigmoid({x})", x=bottoms[0])
 
 
 @register("TanH", "tanh_param")
@@ -153,17 +211,25 @@ class TanH(Rounded):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return torch.tanh(x)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return libm.tanh(x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return tanh_gradient(bottom, top, diff)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Tanh", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.tanh({x})", x=bottoms[0])
 
 
 @register("AbsVal")
@@ -175,9 +241,17 @@ class AbsVal(Activation):
     Caffe: src/caffe/layers/absval_layer.cpp
     """
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the absolute values."""
         return x.abs()
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Abs", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.abs({x})", x=bottoms[0])
 
 
 @register("Power", "power_param")
@@ -193,22 +267,22 @@ class Power(Rounded):
 
     gradient_reads = frozenset({"bottom", "top"})
 
+    @override
     def setup(self) -> None:
-        """Read power, scale and shift."""
         p = self.param.power_param
         self.power: float = p.power
         self.scale: float = p.scale
         self.shift: float = p.shift
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         if self.power * self.scale == 0:
             return torch.full_like(x, self.shift).pow(self.power)
         inner = self._inner(x)
         return inner if self.power == 1 else inner.pow(self.power)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         inner = torch.full_like(x, self.shift) if self.power * self.scale == 0 else self._inner(x)
         return inner.clone() if self.power == 1 else libm.power(inner, self.power)
 
@@ -217,8 +291,8 @@ class Power(Rounded):
             x = x * self.scale
         return x + self.shift if self.shift != 0 else x
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         slope = self.power * self.scale
         if slope == 0 or self.power == 1:
             return diff * slope
@@ -229,6 +303,20 @@ class Power(Rounded):
             return diff * (top / self._inner(bottom) * slope)
         at_zero = slope * bottom.pow(self.power - 1)
         return diff * torch.where(bottom == 0, at_zero, top / bottom * self.power)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.power * self.scale == 0:
+            return graph.node("Expand", graph.constant(self.shift**self.power), graph.shape_of(bottoms[0]))
+        value = scaled_and_shifted(graph, bottoms[0], self.scale, self.shift)
+        return value if self.power == 1 else graph.node("Pow", value, graph.constant(self.power))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.power * self.scale == 0:
+            return code.call("torch.full_like({x}, {value})", x=bottoms[0], value=self.shift**self.power)
+        value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
+        return value if self.power == 1 else code.call("torch.pow({x}, {power})", x=value, power=self.power)
 
 
 def _log(base: float) -> float:
@@ -247,6 +335,7 @@ class Exp(Rounded):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def setup(self) -> None:
         """Read scale, shift and the base, which must be positive or -1."""
         p = self.param.exp_param
@@ -256,12 +345,12 @@ class Exp(Rounded):
         self.scale = log_base * p.scale
         self.shift = log_base * p.shift
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return torch.exp(x * self.scale + self.shift)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         p = self.param.exp_param
         if p.shift == 0:
             return libm.exp(x * self.scale)
@@ -269,9 +358,17 @@ class Exp(Rounded):
         # Caffe makes 0 * infinity of what a large shift would bring back to a number.
         return libm.exp(x * self.scale) * factor if factor.isfinite() else self.as_torch(x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return diff * top * self.scale
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Exp", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.exp({x})", x=torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift))
 
 
 @register("Log", "log_param")
@@ -285,6 +382,7 @@ class Log(Rounded):
 
     gradient_reads = frozenset({"bottom"})
 
+    @override
     def setup(self) -> None:
         """Read scale, shift and the base, which must be -1, or positive and not 1."""
         p = self.param.log_param
@@ -298,17 +396,27 @@ class Log(Rounded):
         self.scale: float = p.scale
         self.shift: float = p.shift
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return torch.log(x * self.scale + self.shift) * self.base_scale
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return libm.log(x * self.scale + self.shift) * self.base_scale
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return diff * (libm.power(bottom * self.scale + self.shift, -1) * self.slope)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        logarithm = graph.node("Log", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
+        return scaled_and_shifted(graph, logarithm, self.base_scale, 0)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
+        return torch_scaled_and_shifted(code, code.call("torch.log({x})", x=value), self.base_scale, 0)
 
 
 @register("BNLL")
@@ -322,18 +430,26 @@ class BNLL(Rounded):
 
     gradient_reads = frozenset({"bottom"})
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return F.softplus(x, threshold=50)  # above it the result is x, in double precision too
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return (x.clamp(min=0) + libm.log(1 + libm.exp(-x.abs()).double())).to(x.dtype)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         growth = libm.exp(bottom.clamp(max=50))
         return (diff * growth / (growth.double() + 1)).to(diff.dtype)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Softplus", *bottoms)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("F.softplus({x})", x=bottoms[0])
 
 
 @register("Threshold", "threshold_param")
@@ -345,13 +461,21 @@ class Threshold(Activation):
     Caffe: src/caffe/layers/threshold_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the threshold."""
         self.threshold: float = self.param.threshold_param.threshold
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return zeros and ones."""
         return (x > self.threshold).to(x.dtype)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.cast(graph.node("Greater", *bottoms, graph.constant(self.threshold)), "float32")
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.gt({x}, {threshold}).to({x}.dtype)", x=bottoms[0], threshold=self.threshold)
 
 
 @register("Clip", "clip_param")
@@ -365,8 +489,8 @@ class Clip(Activation):
 
     gradient_reads = frozenset({"bottom"})
 
+    @override
     def setup(self) -> None:
-        """Read min and max, both required."""
         p = self.param.clip_param
         for name in ("min", "max"):
             if not p.HasField(name):
@@ -374,13 +498,22 @@ class Clip(Activation):
         self.low: float = p.min
         self.high: float = p.max
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the clipped bottom."""
         return x.clamp(max=self.high).clamp(min=self.low)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         return diff * ((bottom >= self.low) & (bottom <= self.high))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Clip", *bottoms, graph.constant(self.low), graph.constant(max(self.low, self.high)))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        high = max(self.low, self.high)
+        return code.call("torch.clamp({x}, {low}, {high})", x=bottoms[0], low=self.low, high=high)
 
 
 @register("Swish", "swish_param")
@@ -394,19 +527,30 @@ class Swish(Rounded):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def setup(self) -> None:
-        """Read the sigmoid's scale."""
         self.beta: float = self.param.swish_param.beta
 
+    @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_torch`."""
         return x * torch.sigmoid(self.beta * x)
 
+    @override
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Rounded.as_caffe`."""
         return x * libm.sigmoid(self.beta * x)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         inner, gate = self.beta * top, libm.sigmoid(self.beta * bottom)
         return (diff * (inner + gate * (1 - inner.double()))).to(diff.dtype)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        gate = graph.node("Sigmoid", scaled_and_shifted(graph, bottoms[0], self.beta, 0))
+        return graph.node("Mul", *bottoms, gate)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.beta == 1:
+            return code.call("F.silu({x})", x=bottoms[0])
+        return code.call("{x} * torch.sigmoid({beta} * {x})", x=bottoms[0], beta=self.beta)

@@ -15,13 +15,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL, switch
 from netspec.graph import Report, raise_fault
 from netspec.layers import fillers
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TEST
 
 MOST = 2**31 - 1  # numbers that a blob of Caffe's can hold (Blob::Reshape)
@@ -30,6 +33,29 @@ MOST = 2**31 - 1  # numbers that a blob of Caffe's can hold (Blob::Reshape)
 def shape_string(shape: Sequence[int]) -> str:
     """Return a shape as Caffe prints it, ``64 20 24 24 (737280)`` (Caffe: Blob::shape_string)."""
     return "".join(f"{d} " for d in shape) + f"({math.prod(shape)})"
+
+
+Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (C,) in double: y = scale x + shift
+
+
+@dataclass(frozen=True)
+class Absorbed:
+    """A layer that also does what another did: its LayerParameter and its learned blobs, in double."""
+
+    param: Any
+    blobs: tuple[torch.Tensor, ...]
+
+
+def rounded(value: float) -> float:
+    """Return a number of a float32 field as it was written: the shortest that float32 rounds to it."""
+    return float(str(np.float32(value)))
+
+
+def copy_of(param: Any) -> Any:
+    """Return a copy of a LayerParameter."""
+    copy = type(param)()
+    copy.CopyFrom(param)
+    return copy
 
 
 class Random:
@@ -108,6 +134,9 @@ class Layer(torch.nn.Module):
     gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (of it), "top": see net/in_place.py
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
+    reads_data: ClassVar[bool] = False  # its tops are records; exported nets take them as inputs
+    counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
+    not_exported: ClassVar[str] = "its class does not define it"  # the reason, where it cannot be exported
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
         super().__init__()
@@ -134,8 +163,8 @@ class Layer(torch.nn.Module):
         """Return the shapes of the tops for bottoms of these shapes; may keep geometry on ``self``."""
         raise NotImplementedError
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
-        """Return the tops."""
         raise NotImplementedError
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
@@ -163,6 +192,52 @@ class Layer(torch.nn.Module):
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one forward pass at the present shapes (0 where they are not counted)."""
         return 0
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
+        """Write the layer into an ONNX graph, given the values of its bottoms; return those of its tops.
+
+        What the nodes compute must be what ``forward`` computes, at every size that ``graph`` leaves free.
+        """
+        raise self.refusal("ONNX")
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+        """Write the layer as source for PyTorch, given the expressions of its bottoms; return those of its tops."""
+        raise self.refusal("PyTorch")
+
+    @property
+    def passes_on(self) -> bool:
+        """Whether every top is the bottom, unchanged."""
+        return False
+
+    def as_affine(self) -> Affine | None:
+        """Return the map that the layer is, if it only scales and shifts the channels, axis 1, of its bottom."""
+        return None
+
+    @property
+    def absorbs(self) -> bool:
+        """Whether :meth:`absorb` is possible."""
+        return False
+
+    @property
+    def absorbs_before(self) -> bool:
+        """Whether :meth:`absorb_before` is possible."""
+        return False
+
+    def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+        """Return the layer that scales and shifts the channels of its top, axis 1, as well."""
+        raise NotImplementedError
+
+    def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+        """Return the layer that scales and shifts the channels of its bottom, axis 1, before its own work."""
+        raise NotImplementedError
+
+    def blob_in_double(self, index: int) -> torch.Tensor:
+        """Return a copy of a learned blob in double precision, on the CPU."""
+        return self.blob(index).detach().cpu().double()
+
+    def refusal(self, target: str, reason: str = "") -> SpecError:
+        """Return the error of a layer that cannot be exported, with the reason."""
+        return self.error(f"cannot be exported to {target}: {reason or self.not_exported}")
 
     def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Reshape if the bottoms' shapes changed, run ``forward``, return a tuple."""

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 
 import torch
 from torch.nn import functional as F
+from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
 from netspec.exact.products import ChosenRows, VectorProducts
-from netspec.layers.base import Layer, Shape
+from netspec.layers.base import Absorbed, Layer, Shape, copy_of
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TRAIN
 
 
@@ -26,8 +28,8 @@ class InnerProduct(Layer):
     Caffe: src/caffe/layers/inner_product_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the weights and the bias."""
         param = self.param.inner_product_param
         if param.num_output < 1:
             raise self.error("num_output must be at least 1", "inner_product_param", "num_output")
@@ -40,6 +42,7 @@ class InnerProduct(Layer):
     def _axis(self, shape: Shape) -> int:
         return self.canonical_axis(self.param.inner_product_param.axis, shape, "inner_product_param", "axis")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the axes before ``axis`` and num_output; refuse vectors of another length than the weights'."""
         shape = bottom_shapes[0]
@@ -50,8 +53,8 @@ class InnerProduct(Layer):
             raise self.error(message, "bottom")
         return [(*shape[: self.axis], self.param.inner_product_param.num_output)]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the products."""
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed = self.param.inner_product_param.transpose
         if self.is_exact(data, small=weight.numel() <= SMALL_PRODUCT):
@@ -59,9 +62,45 @@ class InnerProduct(Layer):
             return VectorProducts.apply(vectors, weight, bias, transposed, in_place).reshape(self.top_shapes[0])
         return F.linear(data.flatten(self.axis), weight.t() if transposed else weight, bias)
 
+    @override
     def multiply_adds(self) -> int:
-        """Return values out times values in."""
         return math.prod(self.top_shapes[0]) * self.inputs
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        vectors = bottoms[0]
+        if (self.axis, len(self.bottom_shapes[0])) != (1, 2):
+            vectors = graph.node("Flatten", vectors, axis=self.axis)
+        bias = [graph.blob(1)] if len(self.blobs) > 1 else []
+        transposed = int(not self.param.inner_product_param.transpose)
+        top = graph.node("Gemm", vectors, graph.blob(0), *bias, transB=transposed)
+        return top if self.axis == 1 else graph.reshape_to_top(top)
+
+    @property
+    @override
+    def absorbs(self) -> bool:
+        return self.axis == 1
+
+    @override
+    def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+        param = copy_of(self.param)
+        param.inner_product_param.bias_term = True
+        outputs = param.inner_product_param.num_output
+        bias = self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros(outputs, dtype=torch.double)
+        factors = scale.expand(outputs)
+        factors = factors if param.inner_product_param.transpose else factors[:, None]
+        return Absorbed(param, (self.blob_in_double(0) * factors, scale * bias + shift))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        weight = self.blob(0).t() if self.param.inner_product_param.transpose else self.blob(0)
+        state = {"weight": weight, **({"bias": self.blob(1)} if len(self.blobs) > 1 else {})}
+        bias = "" if len(self.blobs) > 1 else ", bias=False"
+        template = f"nn.Linear({{in_channels}}, {{out_channels}}{bias})"
+        linear = code.module(template, state, in_channels=self.inputs, out_channels=weight.shape[0])
+        flat = len(self.bottom_shapes[0]) == self.axis + 1
+        vectors = bottoms[0] if flat else code.call(f"{{x}}.flatten({self.axis or ''})", x=bottoms[0])
+        return code.call("{linear}({x})", linear=linear, x=vectors)
 
 
 @register("Dropout", "dropout_param")
@@ -73,23 +112,41 @@ class Dropout(Layer):
     Caffe: src/caffe/layers/dropout_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the ratio."""
         self.ratio: float = self.param.dropout_param.dropout_ratio
         if not 0 <= self.ratio < 1:
             message = f"dropout_ratio must be at least 0 and less than 1, found {self.ratio:g}"
             raise self.error(message, "dropout_param", "dropout_ratio")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         return bottom_shapes
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the values that are kept, scaled; in the test phase the bottom itself."""
         if self.phase != TRAIN:
             return data
         kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
         return data * kept.mul_(1 / (1 - self.ratio))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.phase == TRAIN:
+            raise self.refusal("ONNX", "it draws random numbers in the training phase")
+        return graph.node("Identity", *bottoms)
+
+    @property
+    @override
+    def passes_on(self) -> bool:
+        return self.phase != TRAIN
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.phase != TRAIN:
+            return bottoms[0]
+        return code.call("F.dropout({x}, {ratio}, self.training)", x=bottoms[0], ratio=self.ratio)
 
 
 @register("Embed", "embed_param")
@@ -105,8 +162,8 @@ class Embed(Layer):
 
     label_bottoms = frozenset({0})
 
+    @override
     def setup(self) -> None:
-        """Add the rows and the bias."""
         param = self.param.embed_param
         for name in ("num_output", "input_dim"):
             if getattr(param, name) < 1:
@@ -115,10 +172,11 @@ class Embed(Layer):
         if param.bias_term:
             self.add_blob((param.num_output,), param.bias_filler)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape and num_output."""
         return [(*bottom_shapes[0], self.param.embed_param.num_output)]
 
+    @override
     def forward(self, indices: torch.Tensor) -> torch.Tensor:
         """Return the rows; raise SpecError for an index that is none."""
         rows, index = self.param.embed_param.input_dim, indices.long()
@@ -132,3 +190,16 @@ class Embed(Layer):
             return tops.reshape(self.top_shapes[0])
         top = F.embedding(index, weight)
         return top if bias is None else top + bias
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        top = graph.node("Gather", graph.blob(0), graph.cast(bottoms[0], "int64"), axis=0)
+        return graph.node("Add", top, graph.blob(1)) if len(self.blobs) > 1 else top
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        rows, width = self.blob_shapes[0]
+        template = "nn.Embedding({rows}, {out_channels})"
+        table = code.module(template, {"weight": self.blob(0)}, rows=rows, out_channels=width)
+        top = code.call("{table}({x}.long())", table=table, x=bottoms[0])
+        return code.call("{x} + {bias}", x=top, bias=code.parameter(1)) if len(self.blobs) > 1 else top

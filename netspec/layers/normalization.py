@@ -8,12 +8,14 @@ from typing import Any
 
 import torch
 from torch.nn import functional as F
+from typing_extensions import override
 
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization, ChannelProducts, RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.base import Layer, Shape
+from netspec.layers.base import Absorbed, Affine, Layer, Shape, copy_of, rounded
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TEST
 
 ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
@@ -38,6 +40,7 @@ class BatchNorm(Layer):
 
     default_param_lr = 0.0
 
+    @override
     def setup(self) -> None:
         """Add the sums, all zero; refuse a ``param`` that would have them learned."""
         param = self.param.batch_norm_param
@@ -54,6 +57,7 @@ class BatchNorm(Layer):
         for shape in ((self.channels,), (self.channels,), (1,)):
             self.add_blob(shape)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape; its channels must stay as many."""
         shape = bottom_shapes[0]
@@ -61,15 +65,20 @@ class BatchNorm(Layer):
             raise self.error(f"bottom of shape {shape} has not the {self.channels} channels seen first", "bottom")
         return [shape]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalised values; in training also add the batch's statistics to the sums."""
         return self._by_past(data) if self.use_global_stats else self._by_batch(data)
 
-    def _by_past(self, data: torch.Tensor) -> torch.Tensor:
+    def past(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the mean and the variance of each channel, (C,), that the sums stand for."""
         with torch.no_grad():
             weight = self.blob(2)
             factor = torch.where(weight == 0, 0, 1 / weight)
-            mean, variance = self.blob(0) * factor, self.blob(1) * factor
+            return self.blob(0) * factor, self.blob(1) * factor
+
+    def _by_past(self, data: torch.Tensor) -> torch.Tensor:
+        mean, variance = self.past()
         eps = self.param.batch_norm_param.eps
         if self._is_exact(data):
             return (data - _along(mean, 1, data)) / _along(libm.sqrt(variance + eps), 1, data)
@@ -100,6 +109,74 @@ class BatchNorm(Layer):
 
     def _is_exact(self, data: torch.Tensor) -> bool:
         return self.is_exact(data, small=math.prod(data.shape[1:]) <= SMALL_ITEM)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        eps = self.param.batch_norm_param.eps
+        if self.use_global_stats:
+            ones, zeros = torch.ones(self.channels), torch.zeros(self.channels)
+            constants = [graph.constant(values) for values in (ones, zeros, *self.past())]
+            return graph.node("BatchNormalization", *bottoms, *constants, epsilon=eps)
+        centered, variance = onnx_centered(graph, bottoms[0], len(self.bottom_shapes[0]))
+        return graph.node("Div", centered, graph.node("Sqrt", graph.node("Add", variance, graph.constant(eps))))
+
+    @override
+    def as_affine(self) -> Affine | None:
+        if not self.use_global_stats:
+            return None
+        weight = self.blob_in_double(2)
+        factor = torch.where(weight == 0, 0, 1 / weight)
+        scale = (self.blob_in_double(1) * factor + self.param.batch_norm_param.eps).rsqrt()
+        return scale, -self.blob_in_double(0) * factor * scale
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        eps = rounded(self.param.batch_norm_param.eps)
+        if not self.use_global_stats:
+            return code.call("F.batch_norm({x}, None, None, training=True, eps={eps})", x=bottoms[0], eps=eps)
+        mean, variance = self.past()
+        count = {"num_batches_tracked": torch.zeros((), dtype=torch.long)}
+        state = {"running_mean": mean, "running_var": variance, **count}
+        norm = torch_batch_norm(code, len(self.bottom_shapes[0]), state, self.channels, eps)
+        return code.call("{norm}({x})", norm=norm, x=bottoms[0])
+
+
+def torch_batch_norm(code: TorchCode, axes: int, state: dict[str, torch.Tensor], channels: int, eps: float) -> str:
+    """Add torch's batch normalization by the past for so many axes, scaling where ``state`` has a weight."""
+    options = ("" if eps == 1e-5 else ", eps={eps}") + ("" if "weight" in state else ", affine=False")
+    template = f"nn.BatchNorm{max(1, axes - 2)}d({{channels}}{options})"
+    numbers = {"channels": channels, **({} if eps == 1e-5 else {"eps": eps})}
+    return code.module(template, state, **numbers)
+
+
+def spatial_response_norm(x, size, alpha, beta):
+    """Divide by a power of 1 + alpha times the mean square of size x size pixels."""
+    mean = F.avg_pool2d(x * x, size, stride=1, padding=size // 2)
+    return x / (1 + alpha * mean).pow(beta)
+
+
+def center(x, axes):
+    """Subtract the mean over some axes."""
+    return x - x.mean(axes, keepdim=True)
+
+
+def standardize(x, axes, eps):
+    """Subtract the mean over some axes and divide by the standard deviation plus eps."""
+    variance, mean = torch.var_mean(x, axes, correction=0, keepdim=True)
+    return (x - mean) / (variance.sqrt() + eps)
+
+
+def onnx_centered(graph: OnnxGraph, data: str, axes: int) -> tuple[str, str]:
+    """Write a batch of so many axes less the mean of each channel, and its biased variance."""
+    centered = graph.node("Sub", data, _onnx_channel_means(graph, data, axes))
+    return centered, _onnx_channel_means(graph, graph.node("Mul", centered, centered), axes)
+
+
+def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
+    # One after the other: OpenCV 5.0 gets means over axes that do not lie side by side wrong.
+    for part in ([0], list(range(2, axes))):
+        data = graph.node("ReduceMean", data, graph.constant(part), keepdims=1) if part else data
+    return data
 
 
 def _normalize(data: torch.Tensor, eps: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -160,6 +237,27 @@ class _Affine(Layer):
         tops = ChannelProducts.apply(values, factors, bias, self.context.accumulate_in_place)
         return tops.reshape(data.shape)
 
+    def onnx_operand(self, graph: OnnxGraph, bottoms: Sequence[str], blob: int, axis: int) -> str:
+        """Return the second bottom, or else a learned blob, laid over the first bottom's axes from ``axis`` on."""
+        axes = len(self.bottom_shapes[0]) - axis
+        if len(bottoms) == 1:
+            shape = self.blob_shapes[blob]
+            return graph.blob(blob, (*shape, *(1,) * (axes - len(shape))))
+        given = len(self.bottom_shapes[1])
+        if given == axes:
+            return bottoms[1]
+        return graph.node("Unsqueeze", bottoms[1], graph.constant(list(range(given, axes))))
+
+    def torch_operand(self, code: TorchCode, bottoms: Sequence[str], blob: int, axis: int) -> str:
+        """Return the expression of the second bottom, or else of a learned blob, laid over axes from ``axis`` on."""
+        axes = len(self.bottom_shapes[0]) - axis
+        if len(bottoms) == 1:
+            shape = self.blob_shapes[blob]
+            name = "" if len(self.blobs) == 1 else ("scale", "bias")[blob]
+            return code.parameter(blob, (*shape, *(1,) * (axes - len(shape))), name)
+        missing = axes - len(self.bottom_shapes[1])
+        return code.call(f"{{x}}[..., {', '.join(['None'] * missing)}]", x=bottoms[1]) if missing else bottoms[1]
+
 
 @register("Scale", "scale_param")
 class Scale(_Affine):
@@ -173,8 +271,8 @@ class Scale(_Affine):
     Caffe: src/caffe/layers/scale_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the factors, 1 unless a filler is given, and the bias."""
         param = self.param.scale_param
         shape = self.bottom_shapes[1] if len(self.bottom_shapes) > 1 else self.learned_shape(param, "scale_param")
         if len(self.bottom_shapes) == 1:
@@ -182,13 +280,13 @@ class Scale(_Affine):
         if param.bias_term:
             self.add_blob(shape, param.bias_filler)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the first bottom's shape."""
         self.axis = self.locate(bottom_shapes, self.param.scale_param, "scale_param")
         return [bottom_shapes[0]]
 
+    @override
     def forward(self, data: torch.Tensor, factors: torch.Tensor | None = None) -> torch.Tensor:
-        """Return the products, and the bias added."""
         scale = self.blob(0) if factors is None else factors
         bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
         by_channel = self.axis == 1 and scale.dim() == 1
@@ -200,6 +298,48 @@ class Scale(_Affine):
             return torch.batch_norm(data, scale, bias, zero, one, False, 0.0, 0.0, torch.backends.cudnn.enabled)
         top = data * _along(scale, self.axis, data)
         return top if bias is None else top + _along(bias, self.axis, data)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        top = graph.node("Mul", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
+        if not self.param.scale_param.bias_term:
+            return top
+        return graph.node("Add", top, self.onnx_operand(graph, bottoms[:1], len(self.blobs) - 1, self.axis))
+
+    @property
+    def _by_channel(self) -> bool:
+        return len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
+
+    @override
+    def as_affine(self) -> Affine | None:
+        if not self._by_channel:
+            return None
+        scale = self.blob_in_double(0)
+        return scale, self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros_like(scale)
+
+    @property
+    @override
+    def absorbs_before(self) -> bool:
+        return self._by_channel
+
+    @override
+    def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+        own = self.as_affine()
+        assert own is not None
+        param = copy_of(self.param)
+        param.scale_param.bias_term = True
+        return Absorbed(param, (own[0] * scale, own[0] * shift + own[1]))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self._by_channel:
+            scale = self.blob(0)
+            if code.affine(bottoms[0], scale, self.blob(1) if len(self.blobs) > 1 else torch.zeros_like(scale)):
+                return bottoms[0]
+        top = code.call("{x} * {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))
+        if not self.param.scale_param.bias_term:
+            return top
+        return code.call("{x} + {y}", x=top, y=self.torch_operand(code, bottoms[:1], len(self.blobs) - 1, self.axis))
 
 
 @register("Bias", "bias_param")
@@ -213,23 +353,38 @@ class Bias(_Affine):
     Caffe: src/caffe/layers/bias_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Add the bias, 0 unless a filler says otherwise."""
         param = self.param.bias_param
         if len(self.bottom_shapes) == 1:
             self.add_blob(self.learned_shape(param, "bias_param"), param.filler)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the first bottom's shape."""
         self.axis = self.locate(bottom_shapes, self.param.bias_param, "bias_param")
         return [bottom_shapes[0]]
 
+    @override
     def forward(self, data: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-        """Return the sums."""
         operand = self.blob(0) if bias is None else bias
         if self.is_exact(data):
             return self.apply_exactly(data, None, operand, self.axis)
         return data + _along(operand, self.axis, data)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Add", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
+
+    @override
+    def as_affine(self) -> Affine | None:
+        if len(self.bottom_shapes) > 1 or self.axis != 1 or len(self.blob_shapes[0]) != 1:
+            return None
+        shift = self.blob_in_double(0)
+        return torch.ones_like(shift), shift
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("{x} + {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))
 
 
 @register("LRN", "lrn_param")
@@ -244,22 +399,22 @@ class LRN(Layer):
     Caffe: src/caffe/layers/lrn_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Refuse an even local_size."""
         if self.param.lrn_param.local_size % 2 == 0:
             message = f"local_size must be odd, found {self.param.lrn_param.local_size}"
             raise self.error(message, "lrn_param", "local_size")
         if self.param.lrn_param.norm_region != ACROSS_CHANNELS:
             self.ignores = frozenset({"lrn_param.k"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         if len(bottom_shapes[0]) != 4:
             raise self.error(f"LRN needs a bottom of 4 axes (N, C, H, W), found shape {bottom_shapes[0]}", "bottom")
         return bottom_shapes
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the normalised values."""
         param = self.param.lrn_param
         size, reach = param.local_size, param.local_size // 2
         if self.is_exact(data):
@@ -277,6 +432,31 @@ class LRN(Layer):
             base = 1 + param.alpha * F.avg_pool2d(squares, size, stride=1, padding=reach)
         return data * base.pow(-param.beta)
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        param = self.param.lrn_param
+        size, reach = param.local_size, param.local_size // 2
+        if param.norm_region == ACROSS_CHANNELS:
+            return graph.node("LRN", *bottoms, size=size, alpha=param.alpha, beta=param.beta, bias=param.k)
+        squares = graph.node("Mul", *bottoms, *bottoms)
+        window = {"kernel_shape": [size] * 2, "pads": [reach] * 4, "count_include_pad": 1}
+        mean = graph.node("Mul", graph.node("AveragePool", squares, **window), graph.constant(param.alpha))
+        base = graph.node("Add", mean, graph.constant(1.0))
+        return graph.node("Mul", *bottoms, graph.node("Pow", base, graph.constant(-param.beta)))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        param, (x,) = self.param.lrn_param, bottoms
+        alpha, beta = rounded(param.alpha), rounded(param.beta)
+        if param.norm_region == ACROSS_CHANNELS:
+            usual = {"alpha": 1e-4, "beta": 0.75, "k": 1.0}
+            given = {"alpha": alpha, "beta": beta, "k": rounded(param.k)}
+            given = {name: number for name, number in given.items() if number != usual[name]}
+            options = "".join(f", {name}={{{name}}}" for name in given)
+            return code.call(f"F.local_response_norm({{x}}, {{size}}{options})", x=x, size=param.local_size, **given)
+        template = f"{code.function(spatial_response_norm)}({{x}}, {{size}}, {{alpha}}, {{beta}})"
+        return code.call(template, x=x, size=param.local_size, alpha=alpha, beta=beta)
+
 
 @register("MVN", "mvn_param")
 class MVN(Layer):
@@ -289,15 +469,15 @@ class MVN(Layer):
     Caffe: src/caffe/layers/mvn_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape, filled up to four axes."""
         shape = bottom_shapes[0]
         if len(shape) > 4:
             raise self.error(f"MVN takes up to 4 axes (N, C, H, W), found shape {shape}", "bottom")
         return [(*shape, *(1,) * (4 - len(shape)))]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the normalised maps."""
         param, shape = self.param.mvn_param, self.top_shapes[0]
         outer = 1 if param.across_channels else 2
         maps = data.reshape(math.prod(shape[:outer]), math.prod(shape[outer:]))
@@ -308,6 +488,31 @@ class MVN(Layer):
         else:
             top = maps - maps.mean(dim=1, keepdim=True)
         return top.reshape(shape)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        param, (data,) = self.param.mvn_param, bottoms
+        missing = list(range(len(self.bottom_shapes[0]), 4))
+        if missing:
+            data = graph.node("Unsqueeze", data, graph.constant(missing))
+        axes = graph.constant(list(range(1 if param.across_channels else 2, 4)))
+        top = graph.node("Sub", data, graph.node("ReduceMean", data, axes, keepdims=1))
+        if not param.normalize_variance:
+            return top
+        variance = graph.node("ReduceMean", graph.node("Mul", top, top), axes, keepdims=1)
+        return graph.node("Div", top, graph.node("Add", graph.node("Sqrt", variance), graph.constant(param.eps)))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        param, x = self.param.mvn_param, bottoms[0]
+        missing = 4 - len(self.bottom_shapes[0])
+        if missing:
+            x = code.call(f"{{x}}[..., {', '.join(['None'] * missing)}]", x=x)
+        function = code.function(standardize if param.normalize_variance else center)
+        axes = (1, 2, 3) if param.across_channels else (2, 3)
+        if not param.normalize_variance:
+            return code.call(f"{function}({{x}}, {{axes}})", x=x, axes=axes)
+        return code.call(f"{function}({{x}}, {{axes}}, eps={{eps}})", x=x, axes=axes, eps=rounded(param.eps))
 
 
 class _Standardize(torch.autograd.Function):

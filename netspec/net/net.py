@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec import log
 from netspec.errors import SpecError, Where
@@ -202,6 +203,7 @@ class Net(torch.nn.Module):
 
     # Running
 
+    @override
     def forward(self, **inputs: Array) -> dict[str, torch.Tensor]:
         """Run the net and return its output blobs; ``inputs`` are the values of the blobs in ``self.inputs``."""
         return self._run(inputs)[1]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer, Random, layer_class, unknown_type
@@ -52,8 +53,8 @@ class OneLayer(torch.nn.Module):
         self._make = make
         self.layer = make(shapes) if shapes else None
 
+    @override
     def forward(self, *bottoms: Array) -> torch.Tensor | tuple[torch.Tensor, ...]:
-        """Return what the layer computes of its bottoms."""
         tensors = [x if isinstance(x, torch.Tensor) else torch.tensor(np.asarray(x, np.float32)) for x in bottoms]
         self.layer = self.layer or self._make([tuple(tensor.shape) for tensor in tensors])
         tops = self.layer.run(*tensors)

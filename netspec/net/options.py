@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
 
+from netspec.errors import SpecError, Where, did_you_mean
 from netspec.exact import CHOICES, SMALL
 from netspec.graph import Report, raise_fault
 from netspec.layers.base import Shape
+from netspec.proto.schema import NetParameter
 
 
 @dataclass(frozen=True)
@@ -40,3 +43,18 @@ class BuildOptions:
     def __post_init__(self) -> None:
         if self.exact not in CHOICES:
             raise ValueError(f"found exact {self.exact!r}, expected {', '.join(map(repr, CHOICES))}")
+
+
+def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
+    """Return a fault for each given shape of a blob that no data layer (or Python layer) makes."""
+    makers = [layer for net in nets for layer in net.layer if not layer.bottom or layer.type == "Python"]
+    blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
+    known = ", ".join(blobs) or "none"
+    return [
+        SpecError(
+            f'--shape names "{name}"{did_you_mean(name, blobs) or ";"} the blobs of data layers: {known}',
+            Where(str(path)),
+        )
+        for name in shapes
+        if name not in blobs
+    ]

@@ -265,6 +265,7 @@ class Net:
         """Copy the weights of a .caffemodel, binary or HDF5, into the layers of the same names."""
         if not Path(weights).is_file():
             raise RuntimeError(f"Could not open file {weights}")
+        self.passes.upload()
         load_weights(self.passes.net, weights)
 
     def load_hdf5(self, weights: FilePath) -> None:
@@ -277,10 +278,12 @@ class Net:
 
     def save(self, path: FilePath) -> None:
         """Write the layers and their weights in binary form, whatever the file's name ends with."""
+        self.passes.upload()
         write_binary(self.passes.net, path)
 
     def save_hdf5(self, path: FilePath, write_diff: bool = False) -> None:
         """Write the weights as HDF5; with ``write_diff`` their gradients too."""
+        self.passes.upload()
         write_hdf5(self.passes.net, path, write_diff)
 
     # Of 2014, when phase and mode were a net's

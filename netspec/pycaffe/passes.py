@@ -10,6 +10,7 @@ Caffe: Net::ForwardFromTo, Net::BackwardFromTo, Net::Reshape (src/caffe/net.cpp)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 
@@ -21,8 +22,16 @@ from netspec.layers.utility.python import Python
 from netspec.net.net import Net
 
 AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
-Tape = tuple[list[torch.Tensor], tuple[torch.Tensor, ...]]  # what a layer has read, what it returned
 Hook = Callable[[int], object]
+
+
+@dataclass(frozen=True)
+class _Tape:
+    """One run of a layer watched by autograd: copies of what it read, the tensors that held it, what it returned."""
+
+    leaves: list[torch.Tensor]
+    holders: list[torch.Tensor]
+    made: tuple[torch.Tensor, ...]
 
 
 class Passes:
@@ -43,11 +52,15 @@ class Passes:
         }
         self._layers: list[Layer] = list(net.layers)
         self.params = [_parameters(layer) for layer in self._layers]
-        self._tapes: list[Tape | None] = [None] * len(self._layers)
+        self._tapes: list[_Tape | None] = [None] * len(self._layers)
         for i in range(len(self._layers)):
             self._wire(i)
         self.bottoms = [[self.blobs[b] for b in ids] for ids in self.bottom_ids]
         self.tops = [[self.blobs[b] for b in ids] for ids in self.top_ids]
+        self._losses = [
+            [(top, weight) for top, weight in zip(tops, weights, strict=True) if weight]
+            for tops, weights in zip(self.tops, net.loss_weights, strict=True)
+        ]
         self._kept = [layer.filled_once() for layer in self._layers]
         self._records = [self._is_recorded(i) for i in range(len(self._layers))]
         for i in range(len(self._layers)):
@@ -87,9 +100,8 @@ class Passes:
         for top, constant in zip(self.tops[i], self._kept[i], strict=False):
             if constant is not None:
                 top.data_memory.put(constant.clone())
-        for top, weight in zip(self.tops[i], self.net.loss_weights[i], strict=True):
-            if weight:
-                top.diff_memory.put(torch.full(top.shape, weight, device=self.net.device))
+        for top, weight in self._losses[i]:
+            top.diff_memory.put(torch.full(top.shape, weight, device=self.net.device))
 
     def _is_recorded(self, i: int) -> bool:
         """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
@@ -103,16 +115,18 @@ class Passes:
     @torch.no_grad()
     def forward(self, start: int, end: int) -> torch.Tensor:
         """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses, a scalar."""
-        self._upload()
+        self.upload()
         loss: torch.Tensor | None = None
+        before, after = self.hooks["before_forward"], self.hooks["after_forward"]
         for i in range(start, end + 1):
-            self._call_hooks("before_forward", i)
+            for hook in before:
+                hook(i)
             self._forward(i)
-            for top, weight in zip(self.tops[i], self.net.loss_weights[i], strict=True):
-                if weight:
-                    term = self.net.weighted_sum(top.data_memory.tensor(top.shape), weight)
-                    loss = term if loss is None else loss + term
-            self._call_hooks("after_forward", i)
+            for top, weight in self._losses[i]:
+                term = self.net.weighted_sum(top.data_memory.tensor(top.shape), weight)
+                loss = term if loss is None else loss + term
+            for hook in after:
+                hook(i)
         return torch.zeros((), device=self.net.device) if loss is None else loss
 
     @torch.no_grad()
@@ -121,12 +135,14 @@ class Passes:
 
         Bottoms' diffs are overwritten, those of learnable blobs added to. Layers that need none are passed over.
         """
-        self._upload()
+        self.upload()
         for i in range(start, end - 1, -1):
-            self._call_hooks("before_backward", i)
+            for hook in self.hooks["before_backward"]:
+                hook(i)
             if self.net.backward_plan.layers[i]:
                 self._backward(i)
-            self._call_hooks("after_backward", i)
+            for hook in self.hooks["after_backward"]:
+                hook(i)
 
     def reshape(self) -> None:
         """Give every blob the shape that follows from those of the inputs, and compute nothing."""
@@ -135,6 +151,7 @@ class Passes:
 
     def share_with(self, other: Passes) -> None:
         """Use the learnable blobs of another net (Caffe: ShareTrainedLayersWith); their gradients stay apart."""
+        other.upload()
         mine = {layer.param.name: layer for layer in reversed(self._layers)}
         for theirs in other._layers:
             layer = mine.get(theirs.param.name)
@@ -150,16 +167,13 @@ class Passes:
     @torch.no_grad()
     def clear_param_diffs(self) -> None:
         """Set the gradients of all learnable blobs to 0, where they are."""
-        self._upload()
+        self.upload()
         for learnable in self.net.learnable:
             if learnable.parameter.grad is not None:
                 learnable.parameter.grad.zero_()
 
-    def _call_hooks(self, which: str, i: int) -> None:
-        for hook in self.hooks[which]:
-            hook(i)
-
-    def _upload(self) -> None:
+    def upload(self) -> None:
+        """Bring to the GPU what scripts wrote to learnable blobs, before anything else reads or writes these."""
         if self.net.device.type != "cpu":
             for blobs in self.params:
                 for blob in blobs:
@@ -192,42 +206,47 @@ class Passes:
         if layer.shares:
             self._reshape(i)
             return
-        values = [blob.data_memory.tensor(blob.shape) for blob in bottoms]
         if self._records[i]:
-            values, made = self._tapes[i] = self._record(i, values)
+            tape = self._tapes[i] = self._record(i)
+            values, made = tape.leaves, tape.made
         else:
+            values = [blob.data_memory.tensor(blob.shape) for blob in bottoms]
             made = layer.run(*values)
         kept = self._kept[i] or [None] * len(made)
-        taken = {tensor.untyped_storage().data_ptr() for tensor in (*values, *layer.blobs)}
+        taken = _storages(values or list(layer.blobs))
         for top, tensor, constant in zip(tops, made, kept, strict=True):
             if constant is None:
-                aliased = tensor.untyped_storage().data_ptr() in taken
-                top.put_data(tensor.detach().clone() if aliased else tensor.detach())
+                top.put_data(_apart(tensor.detach(), taken))
 
-    def _record(self, i: int, values: Sequence[torch.Tensor]) -> Tape:
-        """Run layer ``i`` watched by autograd; return what it read and what it returned."""
-        leaves = []
-        for value, blob, wanted in zip(values, self.bottoms[i], self.net.backward_plan.bottoms[i], strict=True):
-            in_place = any(top is blob for top in self.tops[i])
-            leaf = value.clone() if in_place and blob.data_memory.is_watched() else value.detach()
-            leaves.append(leaf.requires_grad_(wanted))
+    def _record(self, i: int) -> _Tape:
+        """Run layer ``i`` watched by autograd."""
+        leaves, holders = [], []
+        for blob, wanted in zip(self.bottoms[i], self.net.backward_plan.bottoms[i], strict=True):
+            memory = blob.data_memory
+            value = memory.tensor(blob.shape)
+            overwritten = memory.is_watched() and self._is_in_place(i, blob)
+            leaves.append((value.clone() if overwritten else value.detach()).requires_grad_(wanted))
+            holders.append(memory.holder(blob.count))
         with torch.enable_grad():
-            return leaves, self._layers[i].run(*leaves)
+            return _Tape(leaves, holders, self._layers[i].run(*leaves))
 
-    def _tape(self, i: int) -> Tape:
+    def _tape(self, i: int) -> _Tape:
         """Return the record of the last forward pass of layer ``i``, its bottoms' values as they are now in memory.
 
         A layer that has not run, or on other shapes, runs for it.
         """
         tape, bottoms = self._tapes[i], self.bottoms[i]
-        if tape is None or any(leaf.shape != blob.shape for leaf, blob in zip(tape[0], bottoms, strict=True)):
-            return self._record(i, [blob.data_memory.tensor(blob.shape) for blob in bottoms])
-        for leaf, blob in zip(tape[0], bottoms, strict=True):
-            now = blob.data_memory.tensor(blob.shape)
-            in_place = any(top is blob for top in self.tops[i])  # such a layer has kept what it needs
-            if not in_place and now.data_ptr() != leaf.data_ptr():
-                leaf.data.copy_(now)
+        if tape is None or any(leaf.shape != blob.shape for leaf, blob in zip(tape.leaves, bottoms, strict=True)):
+            return self._record(i)
+        for leaf, holder, blob in zip(tape.leaves, tape.holders, bottoms, strict=True):
+            kept = self._is_in_place(i, blob) or blob.data_memory.holder(blob.count) is holder
+            if not kept:
+                leaf.data.copy_(blob.data_memory.tensor(blob.shape))
         return tape
+
+    def _is_in_place(self, i: int, blob: Blob) -> bool:
+        """Return whether layer ``i`` writes over one of its bottoms: then it has kept what its gradient needs."""
+        return any(top is blob for top in self.tops[i])
 
     def _backward(self, i: int) -> None:
         layer, bottoms, tops = self._layers[i], self.bottoms[i], self.tops[i]
@@ -244,18 +263,29 @@ class Passes:
                 bottom, top = (blob.data_memory.tensor(blob.shape) for blob in (bottoms[0], tops[0]))
                 bottoms[0].diff_memory.put(layer.caffes_gradient(bottom, top, diffs[0]))
             return
-        leaves, made = self._tape(i)
-        ends = [(top, diff) for top, diff in zip(made, diffs, strict=True) if top.requires_grad]
-        for leaf in leaves:
+        tape = self._tape(i)
+        ends = [(top, diff) for top, diff in zip(tape.made, diffs, strict=True) if top.requires_grad]
+        for leaf in tape.leaves:
             leaf.grad = None
         if ends:
             torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends], retain_graph=True)
-        taken = {diff.untyped_storage().data_ptr() for diff in diffs}
-        for blob, leaf, asked in zip(bottoms, leaves, wanted, strict=True):
+        taken = _storages(diffs)
+        for blob, leaf, asked in zip(bottoms, tape.leaves, wanted, strict=True):
             if asked:
                 diff = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
-                blob.diff_memory.put(diff.clone() if diff.untyped_storage().data_ptr() in taken else diff)
+                blob.diff_memory.put(_apart(diff, taken))
                 leaf.grad = None
+
+
+def _storages(tensors: Sequence[torch.Tensor]) -> set[int]:
+    """Return where tensors lie in main memory. (What views show of a GPU's tensors is a copy.)"""
+    return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.device.type == "cpu"}
+
+
+def _apart(tensor: torch.Tensor, taken: set[int]) -> torch.Tensor:
+    """Return a tensor, or a copy of one that lies where others do."""
+    aliased = tensor.device.type == "cpu" and tensor.untyped_storage().data_ptr() in taken
+    return tensor.clone() if aliased else tensor
 
 
 def _parameters(layer: Layer) -> BlobVec:

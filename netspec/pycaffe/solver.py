@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+from typing_extensions import override
 
 from netspec import log
 from netspec.net import net as core
@@ -33,43 +34,55 @@ class _Training(core_solver.Solver):
         super().__init__(*arguments, **options)
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
 
+    @override
     def _build(self, described: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
         if role == TRAIN_NET and mode.multiprocess():
             rank, ranks = mode.solver_rank(), mode.solver_count()
             role = f"rank {rank}" if rank else role
         return super()._build(described, role, device, rank, ranks)
 
+    @override
     def check_inputs(self) -> None:
         """Do nothing: a net's inputs are what its input blobs hold."""
 
+    @override
     def clear_gradients(self) -> None:
         """Zero the gradients where they are: views of them stay valid."""
         self.shown[self.net].clear_param_diffs()
 
+    @override
     def train_pass(self) -> tuple[torch.Tensor, Outputs]:
-        """Run the training net forward and backward; return its loss and outputs."""
         loss, outputs = self.test_pass(self.net)
         self.shown[self.net].passes.backward(len(self.net.layers) - 1, 0)
         return loss, outputs
 
+    @override
     def test_pass(self, net: core.Net) -> tuple[torch.Tensor, Outputs]:
-        """Run a net forward; return its loss and outputs."""
         shown = self.shown[net]
         loss = shown.passes.forward(0, len(net.layers) - 1)
         blobs = {name: shown.blobs[name] for name in shown.outputs}
         return loss, {name: blob.data_memory.tensor(blob.shape) for name, blob in blobs.items()}
 
+    @override
     def debugged(self, net: core.Net) -> AbstractContextManager[None]:
-        """Log the passes within."""
         return debug_info(self.shown[net].passes)
 
+    @override
+    def apply_update(self) -> None:
+        """Move the weights, from the values and gradients that scripts may have written."""
+        self.shown[self.net].passes.upload()
+        super().apply_update()
+
+    @override
     def test_all(self) -> None:
         """Test, in the root's process."""
         if mode.root_solver():
             super().test_all()
 
+    @override
     def snapshot(self) -> tuple[str, str]:
         """Take a snapshot, in the root's process."""
+        self.shown[self.net].passes.upload()
         return super().snapshot() if mode.root_solver() else ("", "")
 
 

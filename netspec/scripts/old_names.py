@@ -1,4 +1,4 @@
-"""Names that NumPy, SciPy, scikit-image and Python itself have dropped since old scripts were written, given back.
+"""What NumPy, SciPy, scikit-image, lmdb and Python itself have dropped since old scripts were written, given back.
 
 Only a program that `netspec run` runs gets them: each module gets its names when it is imported, and only those that it
 has not.
@@ -220,6 +220,59 @@ def _skimage_color(color: Any) -> None:
         _give(color, old, getattr(color, new))
 
 
+# ---- lmdb ----
+
+
+def _lmdb(lmdb: Any) -> None:
+    """Let keys be text, as they were in Python 2; only bytes are taken today."""
+    whole, transaction = lmdb.open, lmdb.Transaction
+
+    def open(*arguments: Any, **named: Any) -> _Environment:
+        return _Environment(whole(*arguments, **named))
+
+    def begin(env: Any, *arguments: Any, **named: Any) -> _Transaction:
+        return _Transaction(transaction(getattr(env, "real", env), *arguments, **named))
+
+    lmdb.open, lmdb.Environment, lmdb.Transaction = open, open, begin
+
+
+class _Proxy:
+    """Hands everything on to an object of lmdb, whose classes cannot be derived from."""
+
+    def __init__(self, real: Any) -> None:
+        self.real = real
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.real, name)
+
+    def __enter__(self) -> Any:
+        self.real.__enter__()
+        return self
+
+    def __exit__(self, *fault: Any) -> Any:
+        return self.real.__exit__(*fault)
+
+
+class _Environment(_Proxy):
+    def begin(self, *arguments: Any, **named: Any) -> _Transaction:
+        return _Transaction(self.real.begin(*arguments, **named))
+
+
+class _Transaction(_Proxy):
+    def put(self, key: Any, value: Any, *arguments: Any, **named: Any) -> bool:
+        return self.real.put(_bytes(key), _bytes(value), *arguments, **named)
+
+    def get(self, key: Any, *arguments: Any, **named: Any) -> Any:
+        return self.real.get(_bytes(key), *arguments, **named)
+
+    def delete(self, key: Any, *arguments: Any, **named: Any) -> bool:
+        return self.real.delete(_bytes(key), *arguments, **named)
+
+
+def _bytes(text: Any) -> Any:
+    return text.encode() if isinstance(text, str) else text
+
+
 # ---- Python ----
 
 
@@ -240,5 +293,6 @@ _PATCHES: dict[str, Callable[[Any], None]] = {
     "scipy.ndimage": _scipy_ndimage,
     "skimage.io": _skimage_io,
     "skimage.color": _skimage_color,
+    "lmdb": _lmdb,
     "unittest.case": _unittest_case,
 }

@@ -2,7 +2,6 @@
 
 import logging
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,29 +9,20 @@ from pathlib import Path
 import pytest
 import threadpoolctl
 
+from fresh_dialects import fresh_dialects
 from netspec.cli import main
 from netspec.graph.filter import with_state
-from netspec.layers import registry
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
-from netspec.proto.dialect import files as dialect_files
-from netspec.proto.dialect import registry as dialect
 from netspec.proto.text import parse_net_text
 from paths import GOLDEN
 
 
 @pytest.fixture
 def leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Dialects for one test: registry and schema are afterwards as they were before."""
-    assert dialect.active() == []
-    monkeypatch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
-    yield
-    for name in dialect.active():
-        dialect.deactivate(name)
-    own = [file.module for file in dialect_files.known_files().values()]
-    for name in [name for name in sys.modules if name in own or name.startswith("netspec_dialect_")]:
-        del sys.modules[name]
+    """Let a test use dialects; switch them off when it is done."""
+    yield from fresh_dialects(monkeypatch)
 
 
 @pytest.fixture(scope="session")

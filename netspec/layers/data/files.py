@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import torch
+from typing_extensions import override
 
 from netspec import log
 from netspec.data.database import open_reader
@@ -42,6 +43,7 @@ class ReadingLayer(Layer):
 
     bottoms = (0, 0)
     tops = (2, 2)
+    reads_data = True
     group: ClassVar[str]  # the field with the layer's own settings
 
     def open(self) -> Source | None:
@@ -60,6 +62,7 @@ class ReadingLayer(Layer):
         if not p.source:
             yield self.error("source is missing: where is the data?", self.group, "source")
 
+    @override
     def construct(self) -> None:
         """Look at the settings; faults are gathered, so that all are reported. Files are opened if there are none."""
         self.faults = list(self.wrong_settings())
@@ -75,8 +78,8 @@ class ReadingLayer(Layer):
             self.faults.append(fault)
             return None
 
+    @override
     def setup(self) -> None:
-        """Open the files, or find out the shapes without them."""
         self.batch_size: int = getattr(self.param, self.group).batch_size
         self._source: Source | None = None
         self._feed: Feed[Batch] | None = None
@@ -104,8 +107,8 @@ class ReadingLayer(Layer):
         advice = f"say --shape {blob}={example}, or --data"
         return self.error(f'the shape of "{blob}" is known by its data only; {advice}', "top")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         return self._shapes
 
     @property
@@ -128,18 +131,18 @@ class ReadingLayer(Layer):
         """Return the keys (or file names) of the records of an iteration, one a row of the tops."""
         return self.source.keys(iteration)
 
+    @override
     def restart(self, iteration: int = 0) -> None:
-        """Return to the first record, or to the first one of ``iteration``."""
         if self._feed:
             self._feed.restart(iteration)
 
+    @override
     def close(self) -> None:
-        """Stop the threads that read ahead."""
         if self._feed:
             self._feed.close()
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the next batch."""
         if self._feed is None:
             raise self.error("this net was built without opening its data, so it cannot run")
         tops, wraps = self._feed.next()
@@ -204,20 +207,20 @@ class Data(ReadingLayer):
     group = "data_param"
     ignores = frozenset(f"data_param.{name}" for name in MOVED)
 
+    @override
     def wrong_settings(self) -> Iterator[SpecError]:
-        """Yield what is wrong with data_param and transform_param."""
         yield from super().wrong_settings()
         yield from contradictions(self.param.transform_param, self.context.at)
 
+    @override
     def construct(self) -> None:
-        """Open the database."""
         super().construct()
         if self.opens_data and self._sound:
             p = self.param.data_param
             self._reader = self.attempt(open_reader, p.source, BACKENDS[p.backend], self.place)
 
+    @override
     def open(self) -> Source | None:
-        """Read the first record, which sets the shape."""
         p, reader = self.param.data_param, self._reader
         transformer = self.attempt(self.transformer)
         if reader is None or transformer is None:
@@ -230,6 +233,7 @@ class Data(ReadingLayer):
         self.log_size(source, "data_layer.cpp:45")
         return source
 
+    @override
     def known_shape(self) -> Shape | None:
         """Return a shape where crop_size gives height and width, and one mean_value a channel their number."""
         p = self.param.transform_param
@@ -237,8 +241,8 @@ class Data(ReadingLayer):
             return (self.batch_size, len(p.mean_value), p.crop_size, p.crop_size)
         return None
 
+    @override
     def log_restart(self) -> None:
-        """Say so as Caffe does."""
         log.info("data_layer.cpp:73", "Restarting data prefetching from start.")
 
 
@@ -254,14 +258,15 @@ class ImageData(ReadingLayer):
     group = "image_data_param"
     ignores = frozenset(f"image_data_param.{name}" for name in MOVED)
 
+    @override
     def wrong_settings(self) -> Iterator[SpecError]:
-        """Yield what is wrong with image_data_param and transform_param."""
         p = self.param.image_data_param
         if bool(p.new_height) != bool(p.new_width):
             yield self.error("new_height and new_width must be given together", self.group)
         yield from super().wrong_settings()
         yield from contradictions(self.param.transform_param, self.context.at)
 
+    @override
     def open(self) -> Source | None:
         """Read the list; its first image sets the shape."""
         p = self.param.image_data_param
@@ -281,6 +286,7 @@ class ImageData(ReadingLayer):
         self.log_size(source, "image_data_layer.cpp:90")
         return source
 
+    @override
     def known_shape(self) -> Shape | None:
         """Return the shape where crop_size, or new_height and new_width, give height and width."""
         p, crop = self.param.image_data_param, self.param.transform_param.crop_size
@@ -299,14 +305,15 @@ class HDF5Data(ReadingLayer):
     tops = (1, None)
     group = "hdf5_data_param"
 
+    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         """Yield what is wrong with hdf5_data_param; there is no transform_param."""
         yield from super().wrong_settings()
         if self.param.HasField("transform_param"):
             yield self.error("HDF5Data does not transform data; take transform_param away", "transform_param")
 
+    @override
     def open(self) -> Source | None:
-        """Look into all the files for their rows."""
         from netspec.data.hdf5 import Hdf5Source
 
         p, context = self.param.hdf5_data_param, self.context
@@ -314,6 +321,7 @@ class HDF5Data(ReadingLayer):
         tops = self.param.top
         return Hdf5Source(p.source, tops, p.batch_size, p.shuffle, seed, self.stream, self.place, rank, ranks)
 
+    @override
     def shapes_without_data(self) -> list[Shape]:
         """Return the shapes given by the caller; the prototxt says nothing of them."""
         for top in self.param.top:
@@ -337,8 +345,8 @@ class WindowData(ReadingLayer):
         | {f"transform_param.{name}" for name in ("scale", "force_color", "force_gray")}
     )
 
+    @override
     def wrong_settings(self) -> Iterator[SpecError]:
-        """Yield what is wrong with window_data_param and transform_param."""
         from netspec.data.windows import wrong_means
 
         p, crop = self.param.window_data_param, self.param.transform_param.crop_size
@@ -353,8 +361,8 @@ class WindowData(ReadingLayer):
             yield self.error(message, self.group, "context_pad")
         yield from wrong_means(self.param.transform_param, self.context.at)
 
+    @override
     def open(self) -> Source | None:
-        """Read the window file."""
         from netspec.data.windows import WindowSource, read_window_file, window_mean
 
         p, transform, context = self.param.window_data_param, self.param.transform_param, self.context
@@ -365,6 +373,7 @@ class WindowData(ReadingLayer):
         seed, rank, ranks = context.data_seed, context.rank, context.ranks
         return WindowSource(p, transform, file, mean, context.at, seed, self.stream, rank, ranks)
 
+    @override
     def known_shape(self) -> Shape:
         """Return the shape; the prototxt says all of it."""
         crop: int = self.param.transform_param.crop_size
@@ -382,9 +391,10 @@ class HDF5Output(Layer):
 
     bottoms = (2, 2)
     tops = (0, 0)
+    not_exported = "it writes a file"
 
+    @override
     def setup(self) -> None:
-        """Create the file, so that one that cannot be written stops the run before it begins."""
         name = self.param.hdf5_output_param.file_name
         place = ("hdf5_output_param", "file_name")
         if not name:
@@ -397,8 +407,8 @@ class HDF5Output(Layer):
 
             self._sink = Hdf5Sink(name, self.context.at(*place))
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Check that both bottoms have as many rows."""
         data, label = bottom_shapes
         if max(len(data), len(label)) > 4:
             raise self.error(f"found shapes {data} and {label}; at most 4 axes can be saved", "bottom")
@@ -406,13 +416,13 @@ class HDF5Output(Layer):
             raise self.error(f"data has {data[:1]} rows, label {label[:1]}; expected as many", "bottom")
         return ()
 
+    @override
     def close(self) -> None:
-        """Close the file."""
         if self._sink is not None:
             self._sink.close()
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Write the rows."""
         assert self._sink is not None, "built without opening data"
         data, label = (bottom.detach().cpu().numpy() for bottom in bottoms)
         self._sink.append(data, label)

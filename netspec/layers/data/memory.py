@@ -7,12 +7,14 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec import log
 from netspec.errors import SpecError
 from netspec.layers import fillers
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import FillerParameter
 
 T = TypeVar("T")
@@ -30,8 +32,8 @@ class Input(Layer):
     tops = (1, None)
     is_input = True
 
+    @override
     def setup(self) -> None:
-        """Read the shapes."""
         shapes: list[Shape] = [tuple(shape.dim) for shape in self.param.input_param.shape]
         given = self.context.given_shapes
         if not shapes and all(top in given for top in self.param.top):
@@ -41,19 +43,27 @@ class Input(Layer):
         shapes = shapes * self.num_tops if len(shapes) == 1 else shapes
         self.shapes = [given.get(top, shape) for top, shape in zip(self.param.top, shapes, strict=True)]
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shapes."""
         return self.shapes
 
+    @override
     def missing_input(self) -> SpecError:
-        """A solver calls its nets without inputs."""
         blobs = " and ".join(f'"{top}"' for top in self.param.top)
         advice = "a layer that reads data (Data, ImageData, HDF5Data, ...) must make them"
         return self.error(f"nothing fills {blobs} while a solver runs; {advice}")
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return zeros, which is what Caffe's blobs hold until the caller fills them."""
         return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        return [graph.input(i) for i in range(self.num_tops)]
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        return [code.input(i) for i in range(self.num_tops)]
 
 
 @register("DummyData", "dummy_data_param")
@@ -66,10 +76,11 @@ class DummyData(Layer):
 
     bottoms = (0, 0)
     tops = (1, None)
+    not_exported = "its values are random"
     OLD_AXES = ("num", "channels", "height", "width")
 
+    @override
     def setup(self) -> None:
-        """Read the shapes and fillers, and fill the blobs that stay as they are."""
         self.shapes = [self.possible(shape) for shape in self._read_shapes()]
         given = list(self.param.dummy_data_param.data_filler)
         self._fillers = self._one_a_top(given or [FillerParameter()], "data_filler")
@@ -87,16 +98,16 @@ class DummyData(Layer):
             except ValueError as fault:
                 yield self.error(str(fault), "dummy_data_param", "data_filler", i)
 
+    @override
     def filled_once(self) -> Sequence[torch.Tensor | None]:
-        """Return the constant blobs."""
         return self._constants
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shapes."""
         return self.shapes
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the constant blobs, and the others filled anew."""
         generator = self.context.random.on("cpu")
         return tuple(self._fill(i, generator) if kept is None else kept for i, kept in enumerate(self._constants))
 
@@ -120,6 +131,21 @@ class DummyData(Layer):
             raise self.error(message, "dummy_data_param", field)
         return values * self.num_tops if len(values) == 1 else values
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        return [graph.node("Identity", graph.constant(values)) for values in self._fixed("ONNX")]
+
+    def _fixed(self, target: str) -> list[torch.Tensor]:
+        """Return the tops, which must be constant."""
+        fixed = [blob for blob in self._constants if blob is not None]
+        if len(fixed) < self.num_tops:
+            raise self.refusal(target)
+        return fixed
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        return [code.buffer(values) for values in self._fixed("PyTorch")]
+
 
 @register("MemoryData", "memory_data_param", "transform_param")
 class MemoryData(Layer):
@@ -132,9 +158,10 @@ class MemoryData(Layer):
 
     bottoms = (0, 0)
     tops = (2, 2)
+    reads_data = True
 
+    @override
     def setup(self) -> None:
-        """Read the shape."""
         p = self.param.memory_data_param
         self.shape: Shape = (p.batch_size, p.channels, p.height, p.width)
         if min(self.shape) <= 0:
@@ -143,8 +170,8 @@ class MemoryData(Layer):
         self._arrays: tuple[torch.Tensor, torch.Tensor] | None = None
         self._next = 0
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shapes."""
         return self.shape, self.shape[:1]
 
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
@@ -160,17 +187,17 @@ class MemoryData(Layer):
         self._arrays = torch.from_numpy(data), torch.from_numpy(labels)
         self._next = 0
 
+    @override
     def missing_input(self) -> SpecError | None:
-        """Images and labels come from the program."""
         message = "has no data yet; call set_input_arrays(data, labels) on it first"
         return self.error(message) if self._arrays is None else None
 
+    @override
     def restart(self) -> None:
-        """Return to the first image."""
         self._next = 0
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the next batch."""
         if fault := self.missing_input():
             raise fault
         assert self._arrays is not None

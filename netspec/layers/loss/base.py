@@ -10,9 +10,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from netspec.exact.sums import SumInOrder
 from netspec.layers.base import Layer, Shape
+from netspec.layers.targets import OnnxGraph
 
 FULL, VALID, BATCH_SIZE, NONE = 0, 1, 2, 3  # caffe.proto: enum LossParameter.NormalizationMode
 
@@ -24,8 +26,8 @@ class Loss(Layer):
     is_loss = True
     label_bottoms = frozenset({1})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         data, label = bottom_shapes[:2]
         if data[:1] != label[:1]:
             raise self.error(f"found bottoms of shapes {data} and {label}, expected the same number of items", "bottom")
@@ -36,13 +38,13 @@ class Floor(torch.autograd.Function):
     """max(x, floor) whose gradient also passes below the floor, as in Caffe's losses."""
 
     @staticmethod
+    @override
     def forward(ctx: Any, x: torch.Tensor, floor: float) -> torch.Tensor:
-        """Return the floored values."""
         return x.clamp(min=floor)
 
     @staticmethod
+    @override
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Return the gradient as it came."""
         return grads[0], None
 
 
@@ -73,6 +75,23 @@ class Classified(Layer):
     def scores_and_labels(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return scores as (outer, classes, inner) and integer labels as (outer, inner)."""
         return scores.reshape(self.outer, self.classes, self.inner), labels.reshape(self.outer, self.inner).long()
+
+    def onnx_scores_and_labels(self, graph: OnnxGraph, scores: str, labels: str) -> tuple[str, str]:
+        """Write scores as (outer, classes, inner) and integer labels as (outer, 1, inner)."""
+        inner = self.inner if None not in graph.sizes(0)[1:] else -1
+        outer = -1 if inner > 0 else 0  # a free size after axis 0: then the classes are axis 1
+        scores = graph.reshape(scores, [outer, self.classes, inner])
+        shape = graph.node(
+            "Concat", graph.shape_of(scores, 0, 1), graph.constant([1]), graph.shape_of(scores, 2), axis=0
+        )
+        return scores, graph.cast(graph.node("Reshape", labels, shape), "int64")
+
+    def onnx_valid(self, graph: OnnxGraph, labels: str, ignore_label: int | None) -> tuple[str, str]:
+        """Write which labels count, as 0 or 1 (empty: all of them), and the labels with 0 for those that do not."""
+        if ignore_label is None:
+            return "", labels
+        valid = graph.cast(graph.node("Not", graph.node("Equal", labels, graph.constant(ignore_label))), "int64")
+        return graph.cast(valid, "float32"), graph.node("Mul", labels, valid)
 
     def valid(self, labels: torch.Tensor, ignore_label: int | None) -> torch.Tensor | None:
         """Return which labels count (None: all of them); refuse one that is no class."""
@@ -114,3 +133,21 @@ def normalizer(mode: int, outer: int, inner: int, valid: torch.Tensor | None) ->
     if mode == VALID and valid is not None:
         return valid.sum().clamp(min=1)
     return float(max(1, {FULL: outer * inner, VALID: outer * inner, BATCH_SIZE: outer, NONE: 1}[mode]))
+
+
+def onnx_normalized_sum(graph: OnnxGraph, losses: str, valid: str, mode: int) -> str:
+    """Write the sum of losses (outer, ...), divided as :func:`normalizer` says; an empty ``valid``: all count."""
+    if valid:
+        losses = graph.node("Mul", losses, valid)
+    if mode == VALID and valid:
+        counted = graph.node("Max", graph.node("ReduceSum", valid, keepdims=0), graph.constant(1.0))
+        return graph.node("Div", graph.node("ReduceSum", losses, keepdims=0), counted)
+    if mode in (FULL, VALID):
+        return graph.node("ReduceMean", losses, keepdims=0)
+    total = graph.node("ReduceSum", losses, keepdims=0)
+    return total if mode == NONE else graph.node("Div", total, onnx_items(graph, losses))
+
+
+def onnx_items(graph: OnnxGraph, value: str) -> str:
+    """Write the number of items, the size of axis 0, as a floating-point scalar."""
+    return graph.cast(graph.node("Squeeze", graph.shape_of(value, 0, 1)), "float32")

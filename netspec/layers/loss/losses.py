@@ -13,15 +13,18 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from google.protobuf.message import DecodeError
+from typing_extensions import override
 
 from netspec.data.blobs import to_array
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.blas import dots, sum_in_order
 from netspec.exact.losses import Infogain, Logarithm, SigmoidCrossEntropy, softmax
 from netspec.exact.sums import RowMagnitudes, RowSquares
-from netspec.layers.base import Shape
+from netspec.layers.base import Shape, rounded
 from netspec.layers.loss.base import (
     BATCH_SIZE,
+    FULL,
+    NONE,
     VALID,
     Classified,
     Floor,
@@ -29,9 +32,12 @@ from netspec.layers.loss.base import (
     ignore_label,
     normalization_mode,
     normalizer,
+    onnx_items,
+    onnx_normalized_sum,
     total,
 )
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import BlobProto
 
 FLT_MIN = 1.17549435e-38  # SoftmaxWithLoss takes no logarithm of less
@@ -61,6 +67,7 @@ class _NegativeLogOfSoftmax(torch.autograd.Function):
     """-log p of the labels' classes, p being the softmax; the logarithm is of no less than FLT_MIN."""
 
     @staticmethod
+    @override
     def forward(ctx: Any, scores: torch.Tensor, label: torch.Tensor, exact: bool) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the losses (outer, inner) and p, for scores (outer, classes, inner) and labels (outer, inner)."""
         p = softmax(scores) if exact else F.softmax(scores, 1)
@@ -70,6 +77,7 @@ class _NegativeLogOfSoftmax(torch.autograd.Function):
         return -(libm.log(chosen) if exact else chosen.log()), p
 
     @staticmethod
+    @override
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
         """Return (p - 1 at the label's class) times the losses' gradient."""
         p, label = ctx.saved_tensors
@@ -92,15 +100,17 @@ class SoftmaxWithLoss(SoftmaxLoss):
     Caffe: src/caffe/layers/softmax_loss_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
         """Read the ignored label and the normalisation (default VALID)."""
         self.ignore_label = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, VALID)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         return self.reshape_tops(bottom_shapes, self.param.softmax_param.axis, "softmax_param", "axis")
 
+    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
@@ -108,6 +118,31 @@ class SoftmaxWithLoss(SoftmaxLoss):
         exact = self.is_exact(x, small=math.prod(x.shape[1:]) <= SMALL_ITEM)
         losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, exact)
         return (self.sum_up(losses, valid, exact), p.reshape(scores.shape))[: self.num_tops]
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        scores, labels = self.onnx_scores_and_labels(graph, *bottoms)
+        valid, labels = self.onnx_valid(graph, labels, self.ignore_label)
+        softmax = graph.node("Softmax", scores, axis=1)
+        chosen = graph.node("GatherElements", softmax, labels, axis=1)
+        losses = graph.node("Neg", graph.node("Log", graph.node("Max", chosen, graph.constant(FLT_MIN))))
+        loss = onnx_normalized_sum(graph, losses, valid, self.normalization)
+        return (loss,) if self.num_tops == 1 else (loss, graph.reshape_to_top(softmax, 1))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        scores, labels = self.bottom_shapes
+        y = bottoms[1] if labels == (scores[0], *scores[2:]) else code.call("{y}.squeeze(1)", y=bottoms[1])
+        if scores[1] != self.classes or labels not in ((scores[0], *scores[2:]), (scores[0], 1, *scores[2:])):
+            raise self.refusal("PyTorch", "it is exported for scores (N, C, ...) and labels (N, ...) or (N, 1, ...)")
+        if self.ignore_label is None and self.normalization in (FULL, VALID):
+            loss = code.call("F.cross_entropy({x}, {y}.long())", x=bottoms[0], y=y)
+        else:
+            divisor = {FULL: "all", VALID: "counted", BATCH_SIZE: "items", NONE: "none"}[self.normalization]
+            options = {} if self.ignore_label is None else {"ignore": self.ignore_label}
+            given = ", ".join([f'divide_by="{divisor}"', *(f"{name}={{{name}}}" for name in options)])
+            loss = code.call(f"{code.function(softmax_loss)}({{x}}, {{y}}, {given})", x=bottoms[0], y=y, **options)
+        return (loss,) if self.num_tops == 1 else (loss, code.call("F.softmax({x}, dim=1)", x=bottoms[0]))
 
 
 @register("InfogainLoss", "infogain_loss_param", "loss_param")
@@ -125,8 +160,10 @@ class InfogainLoss(SoftmaxLoss):
     """
 
     bottoms = (2, 3)
+    not_exported = "PyTorch has no loss with a matrix of weights"
     label_bottoms = frozenset({1, 2})
 
+    @override
     def setup(self) -> None:
         """Read the ignored label, the normalisation (default VALID) and, without a third bottom, the matrix."""
         loss_param, source = self.param.loss_param, self.param.infogain_loss_param.source
@@ -153,8 +190,8 @@ class InfogainLoss(SoftmaxLoss):
             raise self.error(message, "infogain_loss_param", "source") from None
         return torch.tensor(values, device=self.context.device)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         axis = self.param.infogain_loss_param.axis
         shapes = self.reshape_tops(bottom_shapes, axis, "infogain_loss_param", "axis")
         if len(bottom_shapes) == 3:
@@ -168,6 +205,7 @@ class InfogainLoss(SoftmaxLoss):
             message = f"found an infogain matrix of shape {shape}, expected {self.classes} x {self.classes} numbers"
             raise self.error(message, *path)
 
+    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor, *given: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
@@ -186,6 +224,24 @@ class InfogainLoss(SoftmaxLoss):
             loss, p = self.sum_up(losses, valid, exact=False), log_p.detach().exp()
         return (loss, p.reshape(scores.shape))[: self.num_tops]
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        scores, labels = self.onnx_scores_and_labels(graph, *bottoms[:2])
+        valid, labels = self.onnx_valid(graph, labels, self.ignore_label)
+        if len(bottoms) == 3:
+            matrix = graph.reshape(bottoms[2], [self.classes, self.classes])
+        elif self.matrix is not None:
+            matrix = graph.constant(self.matrix.reshape(self.classes, self.classes))
+        else:
+            raise self.refusal("ONNX", "the infogain matrix was not read")
+        log_p = graph.node("LogSoftmax", scores, axis=1)
+        floored = graph.node("Max", log_p, graph.constant(math.log(LOG_THRESHOLD)))
+        rows = graph.node("Gather", matrix, graph.node("Squeeze", labels, graph.constant([1])), axis=0)
+        weighted = graph.node("Mul", graph.node("Transpose", rows, perm=[0, 2, 1]), floored)
+        losses = graph.node("Neg", graph.node("ReduceSum", weighted, graph.constant([1]), keepdims=1))
+        loss = onnx_normalized_sum(graph, losses, valid, self.normalization)
+        return (loss,) if self.num_tops == 1 else (loss, graph.reshape_to_top(graph.node("Exp", log_p), 1))
+
 
 @register("MultinomialLogisticLoss")
 class MultinomialLogisticLoss(Loss, Classified):
@@ -197,20 +253,31 @@ class MultinomialLogisticLoss(Loss, Classified):
     Caffe: src/caffe/layers/multinomial_logistic_loss_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         data, labels = bottom_shapes
         self.reshape_scores([(data[0], math.prod(data[1:])), labels], 1)
         return shapes
 
+    @override
     def forward(self, probabilities: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         p, label = self.scores_and_labels(probabilities, labels)
         self.valid(label, None)
         chosen = Floor.apply(p.gather(1, label.unsqueeze(1)), LOG_THRESHOLD)
         exact = self.is_exact(chosen)
         return -total(Logarithm.apply(chosen) if exact else chosen.log(), exact) / self.outer
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        p, labels = self.onnx_scores_and_labels(graph, *bottoms)
+        chosen = graph.node("Max", graph.node("GatherElements", p, labels, axis=1), graph.constant(LOG_THRESHOLD))
+        return onnx_normalized_sum(graph, graph.node("Neg", graph.node("Log", chosen)), "", BATCH_SIZE)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        template = "F.nll_loss(torch.log({x}.flatten(1).clamp(min={least})), {y}.flatten().long())"
+        return code.call(template, x=bottoms[0], y=bottoms[1], least=LOG_THRESHOLD)
 
 
 @register("HingeLoss", "hinge_loss_param")
@@ -227,15 +294,15 @@ class HingeLoss(Loss, Classified):
 
     L2 = 2  # caffe.proto: enum HingeLossParameter.Norm
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         data, labels = bottom_shapes
         self.reshape_scores([(data[0], math.prod(data[1:])), labels], 1)
         return shapes
 
+    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         x, label = self.scores_and_labels(scores, labels)
         self.valid(label, None)
         sign = torch.ones_like(x).scatter(1, label.unsqueeze(1), -1)
@@ -244,6 +311,24 @@ class HingeLoss(Loss, Classified):
         if self.is_exact(margins):
             return (RowSquares if squared else RowMagnitudes).apply(margins.reshape(1, -1))[0] / self.outer
         return (margins.square() if squared else margins).sum() / self.outer
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        x, labels = self.onnx_scores_and_labels(graph, *bottoms)
+        classes = graph.constant(torch.arange(self.classes).reshape(-1, 1))
+        of_label = graph.cast(graph.node("Equal", labels, classes), "float32")
+        sign = graph.node("Sub", graph.constant(1.0), graph.node("Mul", of_label, graph.constant(2.0)))
+        margins = graph.node("Relu", graph.node("Add", graph.constant(1.0), graph.node("Mul", sign, x)))
+        if self.param.hinge_loss_param.norm == self.L2:
+            margins = graph.node("Mul", margins, margins)
+        return onnx_normalized_sum(graph, margins, "", BATCH_SIZE)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        norm = 2 if self.param.hinge_loss_param.norm == self.L2 else 1
+        return code.call(
+            f"{code.function(hinge_loss)}({{x}}, {{y}}, norm={{norm}})", x=bottoms[0], y=bottoms[1], norm=norm
+        )
 
 
 @register("SigmoidCrossEntropyLoss", "loss_param", "sigmoid_param")
@@ -256,21 +341,21 @@ class SigmoidCrossEntropyLoss(Loss):
     Caffe: src/caffe/layers/sigmoid_cross_entropy_loss_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Read the ignored label and the normalisation."""
         self.ignore_label = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, BATCH_SIZE)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         data, target = bottom_shapes
         if math.prod(data) != math.prod(target):
             raise self.error(f"found bottoms of shapes {data} and {target}, expected the same count", "bottom")
         return shapes
 
+    @override
     def forward(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         targets = targets.detach().reshape(x.shape)
         valid = None if self.ignore_label is None else targets.long() != self.ignore_label
         exact = self.is_exact(x)
@@ -281,6 +366,33 @@ class SigmoidCrossEntropyLoss(Loss):
         if valid is not None:
             losses = losses.where(valid, 0)
         return total(losses, exact) / normalizer(self.normalization, x.shape[0], math.prod(x.shape[1:]), valid)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        x, targets = bottoms
+        if self.bottom_shapes[0] != self.bottom_shapes[1]:
+            targets = graph.node("Reshape", targets, graph.shape_of(x))
+        softplus = graph.node("Softplus", graph.node("Neg", graph.node("Abs", x)))
+        linear = graph.node("Sub", graph.node("Relu", x), graph.node("Mul", x, targets))
+        valid = ""
+        if self.ignore_label is not None:
+            ignored = graph.node("Equal", graph.cast(targets, "int64"), graph.constant(self.ignore_label))
+            valid = graph.cast(graph.node("Not", ignored), "float32")
+        return onnx_normalized_sum(graph, graph.node("Add", linear, softplus), valid, self.normalization)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.ignore_label is not None:
+            raise self.refusal("PyTorch", "torch's cross entropy of sigmoids ignores no label")
+        x, y = bottoms
+        if self.bottom_shapes[0] != self.bottom_shapes[1]:
+            y = code.call("{y}.reshape({x}.shape)", x=x, y=y)
+        if self.normalization in (FULL, VALID):
+            return code.call("F.binary_cross_entropy_with_logits({x}, {y})", x=x, y=y)
+        total = 'F.binary_cross_entropy_with_logits({x}, {y}, reduction="sum")'
+        if self.normalization == NONE:
+            return code.call(total, x=x, y=y)
+        return code.call(f"{code.function(sigmoid_loss)}({{x}}, {{y}})", x=x, y=y)
 
 
 @register("EuclideanLoss")
@@ -295,20 +407,34 @@ class EuclideanLoss(Loss):
 
     label_bottoms = frozenset()
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         a, b = bottom_shapes
         if math.prod(a[1:]) != math.prod(b[1:]):
             raise self.error(f"found bottoms of shapes {a} and {b}, expected as many numbers an item", "bottom")
         return shapes
 
+    @override
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         difference = a - b.reshape(a.shape)
         exact = self.is_exact(difference)
         squares = RowSquares.apply(difference.reshape(1, -1))[0] if exact else difference.square().sum()
         return squares / (2 * a.shape[0])
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms)
+        difference = graph.node("Sub", a, b)
+        total = graph.node("ReduceSum", graph.node("Mul", difference, difference), keepdims=0)
+        return graph.node("Div", total, graph.node("Mul", onnx_items(graph, a), graph.constant(2.0)))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        x, y = bottoms
+        if self.bottom_shapes[0] != self.bottom_shapes[1]:
+            x, y = (code.call("{x}.flatten(1)", x=bottom) for bottom in bottoms)
+        return code.call("({x} - {y}).square().sum() / (2 * {x}.shape[0])", x=x, y=y)
 
 
 class _Contrastive(torch.autograd.Function):
@@ -355,8 +481,8 @@ class ContrastiveLoss(Loss):
     bottoms = (3, 3)
     label_bottoms = frozenset({2})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape."""
         shapes = super().reshape(bottom_shapes)
         a, b, label = bottom_shapes
         for i, shape in enumerate((a, b)):
@@ -368,12 +494,33 @@ class ContrastiveLoss(Loss):
             raise self.error(f"found labels of shape {label}, expected one a pair: ({a[0]},)", "bottom", 2)
         return shapes
 
+    @override
     def forward(self, a: torch.Tensor, b: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         p = self.param.contrastive_loss_param
         similar = label.reshape(-1).long() != 0
         exact = self.is_exact(a, small=True)
         return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version, exact)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        p = self.param.contrastive_loss_param
+        a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms[:2])
+        difference = graph.node("Sub", a, b)
+        squared = graph.node("ReduceSum", graph.node("Mul", difference, difference), graph.constant([1]), keepdims=0)
+        distance = squared if p.legacy_version else graph.node("Sqrt", squared)
+        dissimilar = graph.node("Relu", graph.node("Sub", graph.constant(p.margin), distance))
+        if not p.legacy_version:
+            dissimilar = graph.node("Mul", dissimilar, dissimilar)
+        label = graph.cast(graph.reshape(bottoms[2], [-1]), "int64")
+        losses = graph.node("Where", graph.node("Equal", label, graph.constant(0)), dissimilar, squared)
+        return graph.node("Mul", graph.node("ReduceMean", losses, keepdims=0), graph.constant(0.5))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        p = self.param.contrastive_loss_param
+        function = code.function(legacy_contrastive_loss if p.legacy_version else contrastive_loss)
+        template = f"{function}({', '.join(bottoms)}, margin={{margin}})"
+        return code.call(template, margin=rounded(p.margin))
 
 
 @register("Accuracy", "accuracy_param")
@@ -392,13 +539,13 @@ class Accuracy(Classified):
     bottoms = (2, 2)
     tops = (1, 2)
 
+    @override
     def setup(self) -> None:
-        """Read top_k and the ignored label."""
         self.top_k: int = self.param.accuracy_param.top_k
         self.ignore_label = ignore_label(self.param.accuracy_param)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         self.reshape_scores(bottom_shapes, self.param.accuracy_param.axis, "accuracy_param", "axis")
         if self.top_k > self.classes:
             raise self.error(
@@ -407,6 +554,7 @@ class Accuracy(Classified):
         return [(), (self.classes,)][: self.num_tops]
 
     @torch.no_grad()
+    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the accuracy and, where there is a second top, that of each class."""
         x, label = self.scores_and_labels(scores, labels)
@@ -423,3 +571,82 @@ class Accuracy(Classified):
         hits = zeros.scatter_add(0, label.flatten(), right.flatten())
         occurrences = zeros.scatter_add(0, label.flatten(), valid.to(x.dtype).flatten())
         return accuracy, hits / occurrences.clamp(min=1)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        x, labels = self.onnx_scores_and_labels(graph, *bottoms)
+        counted, known = self.onnx_valid(graph, labels, self.ignore_label)
+        own = graph.node("GatherElements", x, known, axis=1)
+        as_good = graph.cast(graph.node("GreaterOrEqual", x, own), "float32")
+        rank = graph.node("ReduceSum", as_good, graph.constant([1]), keepdims=1)
+        right = graph.cast(graph.node("LessOrEqual", rank, graph.constant(float(self.top_k))), "float32")
+        accuracy = onnx_normalized_sum(graph, right, counted, VALID)
+        if self.num_tops == 1:
+            return (accuracy,)
+        classes = graph.constant(torch.arange(self.classes).reshape(-1, 1))
+        of_class = graph.cast(graph.node("Equal", labels, classes), "float32")  # an ignored label may be one, too
+        of_class = graph.node("Mul", of_class, counted) if counted else of_class
+        axes = graph.constant([0, 2])
+        occurrences = graph.node("ReduceSum", of_class, axes, keepdims=0)
+        hits = graph.node("ReduceSum", graph.node("Mul", of_class, right), axes, keepdims=0)
+        return accuracy, graph.node("Div", hits, graph.node("Max", occurrences, graph.constant(1.0)))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+        if self.num_tops > 1 or self.inner != math.prod(self.bottom_shapes[0][2:]):
+            raise self.refusal("PyTorch", "it is exported for scores (N, C, ...), without the accuracy of each class")
+        function = code.function(accuracy)
+        template = f"{function}({', '.join(bottoms)}, top_k={{top_k}}, ignore_label={{ignore}})"
+        return code.call(template, top_k=self.top_k, ignore=self.ignore_label)
+
+
+# Copied into exported PyTorch modules
+
+
+def softmax_loss(scores, labels, divide_by, ignore=-100):
+    """Return the cross entropy of softmax(scores) summed up, divided by a number of labels."""
+    labels = labels.long()
+    total = F.cross_entropy(scores, labels, ignore_index=ignore, reduction="sum")
+    counted = (labels != ignore).sum().clamp(min=1)
+    items = labels.shape[0]
+    counts = {"all": labels.numel(), "counted": counted, "items": items, "none": 1}
+    return total / counts[divide_by]
+
+
+def sigmoid_loss(scores, targets):
+    """Return the cross entropy of sigmoid(scores), summed up for each item; their mean."""
+    total = F.binary_cross_entropy_with_logits(scores, targets, reduction="sum")
+    return total / scores.shape[0]
+
+
+def hinge_loss(scores, labels, norm):
+    """Return the sum of max(0, 1 - s x)**norm / N, s being 1 at the label, else -1."""
+    scores, labels = scores.flatten(1), labels.flatten().long()
+    sign = torch.ones_like(scores).scatter(1, labels[:, None], -1)
+    return F.relu(1 + sign * scores).pow(norm).sum() / scores.shape[0]
+
+
+def contrastive_loss(a, b, similar, margin):
+    """Return the mean over pairs of d**2 / 2, if not similar of max(margin - d, 0)**2 / 2."""
+    squared = (a - b).flatten(1).square().sum(1)
+    apart = F.relu(margin - squared.sqrt()).square()
+    return torch.where(similar.flatten().long() != 0, squared, apart).mean() / 2
+
+
+def legacy_contrastive_loss(a, b, similar, margin):
+    """Return the mean over pairs of d**2 / 2, if not similar of max(margin - d**2, 0) / 2."""
+    squared = (a - b).flatten(1).square().sum(1)
+    apart = F.relu(margin - squared)
+    return torch.where(similar.flatten().long() != 0, squared, apart).mean() / 2
+
+
+def accuracy(scores, labels, top_k, ignore_label):
+    """Return the share of labels among the top_k scores; an equal score counts as higher."""
+    scores = scores.flatten(2) if scores.dim() > 2 else scores[:, :, None]
+    labels = labels.reshape(scores.shape[0], -1).long()
+    counted = torch.ones_like(labels)
+    if ignore_label is not None:
+        counted = (labels != ignore_label).long()
+    own = scores.gather(1, (labels * counted)[:, None])
+    right = ((scores >= own).sum(1) <= top_k) & (counted > 0)
+    return right.sum() / counted.sum().clamp(min=1)

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
 from netspec.exact.sums import Product, RowMagnitudes, RowSquares, RowSums
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 
 
 @register("Eltwise", "eltwise_param")
@@ -31,8 +33,8 @@ class Eltwise(Layer):
     PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
     bottoms = (2, None)
 
+    @override
     def setup(self) -> None:
-        """Read the operation and its coefficients."""
         p = self.param.eltwise_param
         self.operation: int = p.operation
         self.coeff: list[float] = list(p.coeff) or [1.0] * len(self.bottom_shapes)
@@ -44,16 +46,16 @@ class Eltwise(Layer):
         if self.operation == self.MAX:
             self.ignores = frozenset({"eltwise_param.coeff"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottoms' shape."""
         for i, shape in enumerate(bottom_shapes):
             if shape != bottom_shapes[0]:
                 message = f"found bottoms of shapes {bottom_shapes[0]} and {shape}, expected equal ones"
                 raise self.error(message, "bottom", i)
         return bottom_shapes[:1]
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
-        """Return the sum, product or maximum."""
         exact = self.is_exact(bottoms[0])
         if exact and self.operation == self.PROD:
             return Product.apply(self.param.eltwise_param.stable_prod_grad, *bottoms)
@@ -74,6 +76,33 @@ class Eltwise(Layer):
             top = top + x if self.operation == self.SUM else top * x
         return top
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.operation == self.SUM:
+            scaled = zip(bottoms, self.coeff, strict=True)
+            bottoms = tuple(x if c == 1 else graph.node("Mul", x, graph.constant(c)) for x, c in scaled)
+        op = {self.SUM: "Add", self.PROD: "Mul", self.MAX: "Max"}[self.operation]
+        top, *others = bottoms
+        for bottom in others:
+            top = graph.node(op, top, bottom)
+        return top
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.operation == self.MAX:
+            top, *others = bottoms
+            for bottom in others:
+                top = code.call("torch.maximum({x}, {y})", x=top, y=bottom)
+            return top
+        if self.operation == self.PROD:
+            return " * ".join(bottoms)
+        top = ""
+        for bottom, coeff in zip(bottoms, self.coeff, strict=True):
+            sign = " - " if coeff < 0 else " + "
+            term = bottom if abs(coeff) == 1 else code.call("{coeff} * {x}", coeff=abs(coeff), x=bottom)
+            top = f"{top}{sign}{term}" if top else term if coeff > 0 else f"-{term}"
+        return top
+
 
 @register("Reduction", "reduction_param")
 class Reduction(Layer):
@@ -86,16 +115,16 @@ class Reduction(Layer):
 
     SUM, ASUM, SUMSQ, MEAN = 1, 2, 3, 4  # caffe.proto: enum ReductionParameter.ReductionOp
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.reduction_param, bottom_shapes[0]
         self.axis = self.canonical_axis(p.axis, shape, "reduction_param", "axis")
         count = math.prod(shape[self.axis :])
         self.coeff: float = p.coeff / count if p.operation == self.MEAN else p.coeff
         return [shape[: self.axis]]
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the reduced bottom."""
         operation = self.param.reduction_param.operation
         if self.is_exact(x):
             return self._reduce_exactly(x.reshape(math.prod(self.top_shapes[0]), -1), operation) * self.coeff
@@ -112,6 +141,28 @@ class Reduction(Layer):
             sums = RowSquares.apply(rows) if operation == self.SUMSQ else RowSums.apply(rows, 1.0)
         return sums.reshape(self.top_shapes[0])
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        p, (data,) = self.param.reduction_param, bottoms
+        if p.operation == self.ASUM:
+            data = graph.node("Abs", data)
+        elif p.operation == self.SUMSQ:
+            data = graph.node("Mul", data, data)
+        axes = graph.constant(list(range(self.axis, len(self.bottom_shapes[0]))))
+        op = "ReduceMean" if p.operation == self.MEAN else "ReduceSum"
+        top = graph.node(op, data, axes, keepdims=0)
+        return top if p.coeff == 1 else graph.node("Mul", top, graph.constant(p.coeff))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        p = self.param.reduction_param
+        form = {self.ASUM: "{x}.abs()", self.SUMSQ: "{x}.square()"}.get(p.operation, "{x}")
+        axes = list(range(self.axis, len(self.bottom_shapes[0])))
+        over = f"dim={axes[0] if len(axes) == 1 else tuple(axes)}" if self.axis else ""
+        operation = "mean" if p.operation == self.MEAN else "sum"
+        times = "" if p.coeff == 1 else "{coeff} * "
+        return code.call(f"{times}{form}.{operation}({over})", x=bottoms[0], coeff=p.coeff)
+
 
 @register("ArgMax", "argmax_param")
 class ArgMax(Layer):
@@ -125,8 +176,8 @@ class ArgMax(Layer):
     Caffe: src/caffe/layers/argmax_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.argmax_param, bottom_shapes[0]
         self.axis = self.canonical_axis(p.axis, shape, "argmax_param", "axis") if p.HasField("axis") else None
         size = math.prod(shape[1:]) if self.axis is None else shape[self.axis]
@@ -137,8 +188,8 @@ class ArgMax(Layer):
         return [(shape[0], 1 + p.out_max_val, p.top_k, *(1 for _ in shape[3:]))]
 
     @torch.no_grad()
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return indices, values, or both."""
         p = self.param.argmax_param
         axis = 1 if self.axis is None else self.axis
         if self.axis is None:
@@ -152,6 +203,39 @@ class ArgMax(Layer):
         top = torch.stack([indices, values], 1) if p.out_max_val else indices
         return top.reshape(self.top_shapes[0])
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
+        p, (data,) = self.param.argmax_param, bottoms
+        axis = 1 if self.axis is None else self.axis
+        if self.axis is None:
+            data = graph.node("Flatten", data, axis=1)
+        # Of equal values TopK takes the smaller index first; in the reversed axis that is the larger one.
+        backwards = (graph.constant([-1]), graph.constant([-(2**62)]), graph.constant([axis]), graph.constant([-1]))
+        reverse = graph.node("Slice", data, *backwards)
+        values, order = graph.nodes("TopK", reverse, graph.constant([p.top_k]), outputs=2, axis=axis)
+        last = graph.node("Sub", graph.shape_of(data, axis, axis + 1), graph.constant([1]))
+        indices = graph.cast(graph.node("Sub", last, order), "float32")
+        if self.axis is not None:
+            return values if p.out_max_val else indices
+        columns = [indices, values] if p.out_max_val else [indices]
+        one = graph.constant([1])
+        top = graph.node("Concat", *(graph.node("Unsqueeze", column, one) for column in columns), axis=1)
+        ones = len(self.top_shapes[0]) - 3
+        return graph.node("Unsqueeze", top, graph.constant(list(range(3, 3 + ones)))) if ones > 0 else top
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        p, (x,) = self.param.argmax_param, bottoms
+        axis = 1 if self.axis is None else self.axis
+        if self.axis is None and len(self.bottom_shapes[0]) > 2:
+            x = code.call("{x}.flatten(1)", x=x)
+        found = code.call(f"{code.function(arg_max)}({{x}}, dim={axis}, top_k={{top_k}})", x=x, top_k=p.top_k)
+        if self.axis is not None:
+            return f"{found}[{1 if p.out_max_val else 0}]"
+        top = f"torch.stack({found}, 1)" if p.out_max_val else f"{found}[0][:, None]"
+        ones = max(0, len(self.top_shapes[0]) - 3)
+        return f"{top}[{', '.join(['...'] + ['None'] * ones)}]" if ones else top
+
 
 @register("Softmax", "softmax_param")
 class Softmax(Layer):
@@ -164,13 +248,13 @@ class Softmax(Layer):
 
     gradient_reads = frozenset({"top"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape."""
         self.axis = self.canonical_axis(self.param.softmax_param.axis, bottom_shapes[0], "softmax_param", "axis")
         return bottom_shapes
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the probabilities."""
         if self.is_exact(x):
             return Pointwise.apply(x, lambda x: softmax(self._by_class(x)).reshape(x.shape), self.caffes_gradient)
         return F.softmax(x, self.axis)
@@ -179,11 +263,19 @@ class Softmax(Layer):
         """Return x as (outer, classes, inner)."""
         return x.reshape(math.prod(x.shape[: self.axis]), x.shape[self.axis], -1)
 
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layer.caffes_gradient`."""
         if self.is_exact(top):
             return softmax_gradient(self._by_class(top), self._by_class(diff)).reshape(top.shape)
         return (diff - (diff * top).sum(self.axis, keepdim=True)) * top
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Softmax", *bottoms, axis=self.axis)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("F.softmax({x}, dim={axis})", x=bottoms[0], axis=self.axis)
 
 
 @register("Silence")
@@ -198,12 +290,20 @@ class Silence(Layer):
     bottoms = (1, None)
     tops = (0, 0)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return no shape."""
         return []
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return nothing."""
+        return ()
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        return ()
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return ()
 
 
@@ -219,15 +319,30 @@ class Parameter(Layer):
 
     bottoms = (0, 0)
 
+    @override
     def setup(self) -> None:
-        """Add the blob."""
         self.add_blob(tuple(self.param.parameter_param.shape.dim))
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the blob's shape."""
         return self.blob_shapes
 
+    @override
     def forward(self) -> torch.Tensor:
-        """Return the blob."""
         blob = self.blob(0)
         return blob.view_as(blob)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Identity", graph.blob(0))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        return (code.parameter(0),)
+
+
+def arg_max(x, dim, top_k):
+    """Return the indices, as numbers of x's type, and the values of the largest; of equal ones the last comes first."""
+    values, order = torch.sort(x.flip(dim), dim=dim, descending=True, stable=True)
+    indices = (x.shape[dim] - 1 - order).to(x.dtype)
+    return indices.narrow(dim, 0, top_k), values.narrow(dim, 0, top_k)

@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 Shape = tuple[int, ...]
 _CPU = torch.device("cpu")
@@ -62,14 +63,18 @@ class Memory:
     def tensor(self, shape: Shape) -> torch.Tensor:
         """Return the first numbers, on the device; who reads the tensor must not write to it."""
         count = math.prod(shape)
+        return self.holder(count).view(-1)[:count].view(shape)
+
+    def holder(self, count: int) -> torch.Tensor:
+        """Return the tensor that holds the first ``count`` numbers; while it is the same one, so are they."""
         if self._fresh is not None and self._fresh.numel() == count:
-            return self._fresh.view(shape)
-        flat = self._settled(count)[:count]
+            return self._fresh
+        flat = self._settled(count)
         if self.device.type == "cpu":
-            return flat.view(shape)
+            return flat
         if self._uploaded is None or self._uploaded.numel() != count:
-            self._uploaded = flat.to(self.device)
-        return self._uploaded.view(shape)
+            self._uploaded = flat[:count].to(self.device)
+        return self._uploaded
 
     def put(self, tensor: torch.Tensor) -> None:
         """Take what a layer has computed; it belongs to the memory from now on."""
@@ -126,13 +131,14 @@ class BorrowedMemory(Memory):
         self._copy: torch.Tensor | None = None
         self._written = False
 
+    @override
     def reserve(self, count: int) -> None:
         """Refuse more numbers than there are."""
         if count > self.capacity:
             raise ValueError(f"this blob has {self.capacity} numbers, and cannot become one of {count}")
 
+    @override
     def view(self, shape: Shape) -> np.ndarray:
-        """Return a view of the first numbers."""
         tensor = self._find().detach()
         if tensor.device.type != "cpu":
             if self._copy is None:
@@ -142,10 +148,11 @@ class BorrowedMemory(Memory):
             tensor, self._written = self._copy, True
         return tensor.view(-1).numpy()[: math.prod(shape)].reshape(shape)
 
+    @override
     def tensor(self, shape: Shape) -> torch.Tensor:
-        """Return the first numbers."""
         return self._find().detach().view(-1)[: math.prod(shape)].view(shape)
 
+    @override
     def put(self, tensor: torch.Tensor) -> None:
         """Write to the tensor."""
         _write(self._find().detach().view(-1), tensor)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from netspec.errors import SpecError, did_you_mean
 from netspec.layers.base import Layer, Shape
@@ -46,11 +47,12 @@ class Python(Layer):
     Caffe: include/caffe/layers/python_layer.hpp
     """
 
+    not_exported = "it runs Python code of its own"
     bottoms = (0, None)
     tops = (0, None)
 
+    @override
     def setup(self) -> None:
-        """Import the code and run its setup, unless it is only asked for shapes that are given."""
         given = self.context.given_shapes
         self.code: Any = None
         if not self.context.open_data and all(name in given for name in self.param.top):
@@ -69,8 +71,8 @@ class Python(Layer):
             self.add_blob(blob.shape)
             self.blobs[-1].data.copy_(torch.from_numpy(blob.data))
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes, as the code's reshape sets them."""
         if self.code is None:
             return [self.context.given_shapes[name] for name in self.param.top]
         for blob, shape in zip(self.bottom, bottom_shapes, strict=True):
@@ -78,6 +80,7 @@ class Python(Layer):
         self._call("reshape", self.bottom, self.top)
         return [blob.shape for blob in self.top]
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Run the code's reshape and forward, as Caffe does at each pass."""
         tensors = (*bottoms, *(self.blob(i) for i in range(len(self.blobs))))

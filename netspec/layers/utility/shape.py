@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from netspec.exact.sums import Copies, Tiles
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 
 
 def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
@@ -34,8 +36,8 @@ class Flatten(Layer):
 
     shares = frozenset({"data", "diff"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.flatten_param, bottom_shapes[0]
         first = self.canonical_axis(p.axis, shape, "flatten_param", "axis")
         last = self.canonical_axis(p.end_axis, shape, "flatten_param", "end_axis")
@@ -44,9 +46,17 @@ class Flatten(Layer):
             raise self.error(message, "flatten_param")
         return [(*shape[:first], math.prod(shape[first : last + 1]), *shape[last + 1 :])]
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the bottom in its new shape."""
         return x.reshape(self.top_shapes[0])
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.reshape_to_top(bottoms[0])
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.reshape_to_top(bottoms[0])
 
 
 @register("Reshape", "reshape_param")
@@ -60,15 +70,15 @@ class Reshape(Layer):
 
     shares = frozenset({"data", "diff"})
 
+    @override
     def setup(self) -> None:
-        """Read the new axes."""
         self.new_axes = list(self.param.reshape_param.shape.dim)
         if self.new_axes.count(-1) > 1 or min(self.new_axes, default=0) < -1:
             message = f"found shape {self.new_axes}, expected at most one -1 (inferred) and nothing below it"
             raise self.error(message, "reshape_param", "shape")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.reshape_param, bottom_shapes[0]
         start = p.axis if p.axis >= 0 else len(shape) + p.axis + 1
         if not 0 <= start <= len(shape):
@@ -95,9 +105,17 @@ class Reshape(Layer):
             raise self.error(message, "reshape_param", "shape")
         return [tuple(top)]
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the bottom in its new shape."""
         return x.reshape(self.top_shapes[0])
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.reshape_to_top(bottoms[0])
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.reshape_to_top(bottoms[0])
 
 
 @register("Concat", "concat_param")
@@ -111,13 +129,13 @@ class Concat(Layer):
 
     bottoms = (1, None)
 
+    @override
     def setup(self) -> None:
-        """A single bottom is not copied."""
-        if len(self.bottom_shapes) == 1:
+        if len(self.bottom_shapes) == 1:  # it is not copied
             self.shares = frozenset({"data", "diff"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         first = bottom_shapes[0]
         self.axis = axis = _axis(self, first, "concat_param", "concat_dim")
         for i, shape in enumerate(bottom_shapes):
@@ -127,9 +145,19 @@ class Concat(Layer):
                 raise self.error(message, "bottom", i)
         return [(*first[:axis], sum(shape[axis] for shape in bottom_shapes), *first[axis + 1 :])]
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
-        """Return the joined bottoms."""
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Concat", *bottoms, axis=self.axis)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if len(bottoms) == 1:
+            return bottoms[0]
+        return code.call(f"torch.cat([{', '.join(bottoms)}], dim={{axis}})", axis=self.axis)
 
 
 @register("Slice", "slice_param")
@@ -143,13 +171,13 @@ class Slice(Layer):
 
     tops = (1, None)
 
+    @override
     def setup(self) -> None:
-        """A single top is not copied."""
-        if self.num_tops == 1:
+        if self.num_tops == 1:  # it is not copied
             self.shares = frozenset({"data", "diff"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes."""
         shape = bottom_shapes[0]
         self.axis = axis = _axis(self, shape, "slice_param", "slice_dim")
         points, size = list(self.param.slice_param.slice_point), shape[axis]
@@ -169,9 +197,35 @@ class Slice(Layer):
             self.sizes = [size // self.num_tops] * self.num_tops
         return [(*shape[:axis], part, *shape[axis + 1 :]) for part in self.sizes]
 
+    @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the parts."""
         return x.split(self.sizes, self.axis)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        if self.num_tops == 1:
+            return [graph.node("Identity", *bottoms)]
+        points = list(self.param.slice_param.slice_point)
+        if graph.sizes(0)[self.axis] is not None:
+            return graph.nodes("Split", *bottoms, graph.constant(self.sizes), outputs=self.num_tops, axis=self.axis)
+        if not points:
+            return graph.nodes("Split", *bottoms, outputs=self.num_tops, axis=self.axis, num_outputs=self.num_tops)
+        axis = graph.constant([self.axis])
+        return [
+            graph.node("Slice", *bottoms, graph.constant([start]), graph.constant([end]), axis)
+            for start, end in zip([0, *points], [*points, 2**62], strict=True)
+        ]
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+        if self.num_tops == 1:
+            return bottoms
+        if len(set(self.sizes)) == 1 and not self.param.slice_param.slice_point:
+            return code.call("{x}.chunk({count}, dim={axis})", x=bottoms[0], count=self.num_tops, axis=self.axis)
+        if code.sizes(0)[self.axis] is not None:
+            return code.call("{x}.split({sizes}, dim={axis})", x=bottoms[0], sizes=list(self.sizes), axis=self.axis)
+        points = list(self.param.slice_param.slice_point)
+        return code.call("{x}.tensor_split({points}, dim={axis})", x=bottoms[0], points=points, axis=self.axis)
 
 
 @register("Split")
@@ -186,15 +240,30 @@ class Split(Layer):
     tops = (1, None)
     shares = frozenset({"data"})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape for each top."""
         return [bottom_shapes[0]] * self.num_tops
 
+    @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return one tensor a top, so that each has a gradient of its own."""
         if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        return bottoms * self.num_tops
+
+    @property
+    @override
+    def passes_on(self) -> bool:
+        return True
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        return bottoms * self.num_tops
 
 
 @register("Tile", "tile_param")
@@ -206,8 +275,8 @@ class Tile(Layer):
     Caffe: src/caffe/layers/tile_layer.cpp
     """
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         p, shape = self.param.tile_param, bottom_shapes[0]
         self.axis = axis = self.canonical_axis(p.axis, shape, "tile_param", "axis")
         if p.tiles <= 0:
@@ -215,12 +284,20 @@ class Tile(Layer):
         self.repeats = [p.tiles if i == axis else 1 for i in range(len(shape))]
         return [(*shape[:axis], shape[axis] * p.tiles, *shape[axis + 1 :])]
 
+    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the repeated bottom."""
         if self.is_exact(x):
             values = x.reshape(math.prod(x.shape[: self.axis]), -1)
             return Tiles.apply(values, self.repeats[self.axis]).reshape(self.top_shapes[0])
         return x.repeat(self.repeats)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Tile", *bottoms, graph.constant(self.repeats))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("{x}.repeat({repeats})", x=bottoms[0], repeats=tuple(self.repeats))
 
 
 @register("BatchReindex")
@@ -236,20 +313,28 @@ class BatchReindex(Layer):
     bottoms = (2, 2)
     label_bottoms = frozenset({1})
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape."""
         data, indices = bottom_shapes
         if len(indices) != 1:
             raise self.error(f"found indices of shape {indices}, expected one axis", "bottom", 1)
         return [(*indices, *data[1:])]
 
+    @override
     def forward(self, x: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
-        """Return the chosen items."""
         chosen = indices.long()
         wrong = chosen[(chosen < 0) | (chosen >= x.shape[0])]
         if wrong.numel():
             raise self.error(f"found index {int(wrong[0])}, expected 0 to {x.shape[0] - 1}", "bottom", 1)
         return x.index_select(0, chosen)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Gather", bottoms[0], graph.cast(bottoms[1], "int64"), axis=0)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("{x}[{index}.long()]", x=bottoms[0], index=bottoms[1])
 
 
 @register("Filter")
@@ -264,16 +349,17 @@ class Filter(Layer):
 
     bottoms = (2, None)
     tops = (1, None)
+    counted_axis = 0
 
+    @override
     def setup(self) -> None:
-        """Refuse another number of tops than of filtered bottoms."""
         filtered = len(self.bottom_shapes) - 1
         if self.num_tops != filtered:
             message = f"found {self.num_tops} top blob(s), expected {filtered}: one a bottom but for the selector"
             raise self.error(message, "top")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes as if every item were kept."""
         *data, selector = bottom_shapes
         if math.prod(selector[1:]) != 1:
             raise self.error(f"found a selector of shape {selector}, expected one number an item", "bottom", len(data))
@@ -283,8 +369,20 @@ class Filter(Layer):
                 raise self.error(message, "bottom", i)
         return data
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the kept items."""
         *data, selector = bottoms
         kept = selector.reshape(-1).nonzero().squeeze(1)
         return tuple(x.index_select(0, kept) for x in data)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        *data, selector = bottoms
+        dropped = graph.node("Equal", graph.reshape(selector, [-1]), graph.constant(0.0))
+        kept = graph.node("Squeeze", graph.node("NonZero", graph.node("Not", dropped)), graph.constant([0]))
+        return [graph.node("Gather", x, kept, axis=0) for x in data]
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        *data, selector = bottoms
+        return [code.call("{x}[{selector}.flatten() != 0]", x=x, selector=selector) for x in data]

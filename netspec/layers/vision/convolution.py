@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import chain
+from typing import Any, ClassVar
 
 import torch
 from torch.nn import functional as F
+from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
 from netspec.exact.products import ColumnProducts, Columns, Filter, SpreadProducts
-from netspec.layers.base import Layer, Shape
+from netspec.layers.base import Absorbed, Layer, Shape, copy_of
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 
 _CONVOLVE = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
 _DECONVOLVE = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
@@ -104,6 +107,38 @@ class _SlidingFilter(Layer):
         short = [max(0, e - size - 2 * p) for size, p, e in axes]
         return list(chain.from_iterable((0, n) for n in reversed(short)))
 
+    def onnx_geometry(self) -> dict[str, Any]:
+        """Return the attributes of ONNX's Conv and ConvTranspose."""
+        if not self.kernel:
+            return {"kernel_shape": [1]}
+        return {
+            "kernel_shape": list(self.kernel),
+            "strides": list(self.stride),
+            "dilations": list(self.dilation),
+            "pads": [*self.pad, *self.pad],
+        }
+
+    onnx_op: ClassVar[str] = "Conv"
+
+    def onnx_convolved(
+        self, graph: OnnxGraph, maps: str, weights: Sequence[str], group: int, geometry: dict[str, Any]
+    ) -> str:
+        """Return the product with the filters. A filter of one pixel is padded before: OpenCV 5.0 does it wrong."""
+        pads = geometry.get("pads", [])
+        if self.onnx_op == "Conv" and set(self.kernel) == {1} and any(pads):
+            before, after = pads[: len(self.pad)], pads[len(self.pad) :]
+            maps = graph.node("Pad", maps, graph.constant([0, 0, *before, 0, 0, *after]))
+            geometry = {**geometry, "pads": [0] * len(pads)}
+        return graph.node(self.onnx_op, maps, *weights, group=group, **geometry)
+
+    def torch_geometry(self) -> dict[str, Any]:
+        """Return kernel, stride, padding and dilation as torch takes them: one number where all axes have the same."""
+        given = {"kernel_size": self.kernel, "stride": self.stride, "padding": self.pad, "dilation": self.dilation}
+        return {name: values[0] if len(set(values)) == 1 else values for name, values in given.items()}
+
+
+TORCH_USUAL = {"stride": 1, "padding": 0, "dilation": 1, "groups": 1}
+
 
 @register("Convolution", "convolution_param")
 class Convolution(_SlidingFilter):
@@ -120,8 +155,8 @@ class Convolution(_SlidingFilter):
     tops = (1, None)
     same_tops = True
 
+    @override
     def setup(self) -> None:
-        """Read the geometry, add the filters and the bias."""
         self.read_geometry()
         if self.spatial_axes > 3:
             raise self.error(
@@ -149,6 +184,7 @@ class Convolution(_SlidingFilter):
         """Return the spatial shape of a top for a bottom of ``shape``."""
         return self.slide(shape)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return one shape for all tops; the bottoms must suit the filters."""
         self.check_axes(bottom_shapes, self.channels)
@@ -156,6 +192,7 @@ class Convolution(_SlidingFilter):
         top = (*shape[: self.channel_axis], self.num_output, *self.output_shape(shape))
         return [top] * len(bottom_shapes)
 
+    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the responses to each bottom."""
         weight = self.blob(0)
@@ -185,10 +222,74 @@ class Convolution(_SlidingFilter):
             return ColumnProducts.apply(maps, weight, bias, sliding, self.group, in_place)
         return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
 
+    @override
     def multiply_adds(self) -> int:
-        """Return output pixels times the filters' weights."""
         pixels = math.prod(self.top_shapes[0]) // self.num_output
         return len(self.top_shapes) * pixels * math.prod(self.blob_shapes[0])
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        weights = [graph.blob(0, (*self.blob_shapes[0], *(() if self.kernel else (1,))))]
+        if len(self.blobs) > 1:
+            weights.append(graph.blob(1))
+        geometry = self.onnx_geometry()
+        overhang = self.onnx_overhang(graph)
+        if any(overhang):
+            geometry["pads"] = [*self.pad, *(p + n for p, n in zip(self.pad, overhang, strict=True))]
+        tops = []
+        for i, bottom in enumerate(bottoms):
+            usual = self.channel_axis == 1 and self.spatial_axes
+            maps = bottom if usual else self._onnx_maps(graph, bottom)
+            top = self.onnx_convolved(graph, maps, weights, self.group, geometry)
+            tops.append(top if usual else graph.reshape_to_top(top, i))
+        return tops
+
+    def onnx_overhang(self, graph: OnnxGraph) -> Shape:
+        """Return the zeros to append along each spatial axis, where the filter is longer than the padded map."""
+        overhang = tuple(reversed(self.overhang(self.bottom_shapes[0])[1::2]))
+        for axis, zeros in enumerate(overhang, self.channel_axis + 1):
+            if zeros:
+                graph.size(0, axis, "its filter is longer than the map")
+        return overhang
+
+    def _onnx_maps(self, graph: OnnxGraph, bottom: str) -> str:
+        """Return a bottom as images, channels and at least one spatial axis."""
+        first = self.channel_axis + 1
+        why = "its channels are not axis 1"
+        spatial = [graph.size(0, axis, why) for axis in range(first, first + self.spatial_axes)] or [1]
+        return graph.reshape(bottom, [-1, self.channels, *spatial])
+
+    @property
+    @override
+    def absorbs(self) -> bool:
+        return self.channel_axis == 1
+
+    @override
+    def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+        param = copy_of(self.param)
+        param.convolution_param.bias_term = True
+        bias = self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros(self.num_output, dtype=torch.double)
+        return Absorbed(param, (self.scaled_filters(scale.expand(self.num_output)), scale * bias + shift))
+
+    def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
+        """Return blobs[0], in double, with the filters of each output channel multiplied by a number of their own."""
+        filters = self.blob_in_double(0)
+        return filters * scale.reshape(-1, *(1,) * (filters.dim() - 1))
+
+    torch_module: ClassVar[str] = "Conv"
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+        if self.channel_axis != 1 or not self.spatial_axes or any(self.overhang(self.bottom_shapes[0])):
+            raise self.refusal("PyTorch", "it is exported for (N, C, spatial axes) and filters that fit")
+        numbers = {"in_channels": self.channels, "out_channels": self.num_output}
+        numbers |= {**self.torch_geometry(), "groups": self.group}
+        options = ", ".join(f"{name}={{{name}}}" for name in list(numbers)[2:])
+        bias = "" if len(self.blobs) > 1 else ", bias=False"
+        template = f"nn.{self.torch_module}{self.spatial_axes}d({{in_channels}}, {{out_channels}}, {options}{bias})"
+        state = {"weight": self.blob(0), **({"bias": self.blob(1)} if len(self.blobs) > 1 else {})}
+        conv = code.module(template, state, TORCH_USUAL, **numbers)
+        return [code.call("{conv}({x})", conv=conv, x=bottom) for bottom in bottoms]
 
 
 @register("Deconvolution", "convolution_param")
@@ -202,17 +303,19 @@ class Deconvolution(Convolution):
     Caffe: src/caffe/layers/base_conv_layer.cpp, deconv_layer.cpp
     """
 
+    @override
     def filter_shape(self) -> Shape:
         """Return the shape of blobs[0]: a convolution's with its ends exchanged."""
         return (self.channels, self.num_output // self.group, *self.kernel)
 
+    @override
     def output_shape(self, shape: Shape) -> Shape:
-        """Return the spatial shape of a top for a bottom of ``shape``."""
         axes = zip(shape[self.channel_axis + 1 :], self.stride, self.extent, self.pad, strict=True)
         spatial = tuple(s * (size - 1) + e - 2 * p for size, s, e, p in axes)
         self.check_output(spatial, shape)
         return spatial
 
+    @override
     def apply_filters(
         self, axes: int, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, *geometry: Shape
     ) -> torch.Tensor:
@@ -224,10 +327,26 @@ class Deconvolution(Convolution):
             return SpreadProducts.apply(maps, weight, bias, sliding, self.group, in_place, size)
         return _DECONVOLVE[axes](maps, weight, bias, stride, pad, 0, self.group, dilation)
 
+    @override
     def multiply_adds(self) -> int:
-        """Return input pixels times the filters' weights."""
         pixels = math.prod(self.bottom_shapes[0]) // self.channels
         return len(self.bottom_shapes) * pixels * math.prod(self.blob_shapes[0])
+
+    onnx_op = "ConvTranspose"
+
+    @override
+    def overhang(self, shape: Shape) -> list[int]:
+        """Return zeros: any filter fits."""
+        return [0] * (2 * self.spatial_axes)
+
+    @override
+    def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
+        filters = self.blob_in_double(0)
+        grouped = filters.reshape(self.group, -1, *filters.shape[1:])
+        factors = scale.reshape(self.group, 1, -1, *(1,) * self.spatial_axes)
+        return (grouped * factors).reshape(filters.shape)
+
+    torch_module = "ConvTranspose"
 
 
 @register("Im2col", "convolution_param")
@@ -243,21 +362,22 @@ class Im2col(_SlidingFilter):
         f"convolution_param.{name}" for name in ("num_output", "bias_term", "group", "weight_filler", "bias_filler")
     )
 
+    @override
     def setup(self) -> None:
-        """Read the geometry."""
         self.read_geometry()
         if self.spatial_axes < 1:
             raise self.error("the bottom has no spatial axis after its channels", "bottom")
         self.channels = self.bottom_shapes[0][self.channel_axis]
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape with a channel for each pixel of the filter, and the filter's positions."""
         self.check_axes(bottom_shapes, self.channels)
         shape = bottom_shapes[0]
         return [(*shape[: self.channel_axis], self.channels * math.prod(self.kernel), *self.slide(shape))]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the pixels under the filter."""
         overhang = self.overhang(self.bottom_shapes[0])
         if self.is_exact(data):
             maps = F.pad(data, overhang).flatten(0, self.channel_axis - 1) if self.channel_axis else data[None]
@@ -273,6 +393,32 @@ class Im2col(_SlidingFilter):
         order = (*range(first), *range(last, windows.dim()), *range(first, last))
         return windows.permute(order).reshape(self.top_shapes[0])
 
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.channel_axis != 1 or self.spatial_axes > 3 or any(self.overhang(self.bottom_shapes[0])):
+            raise self.refusal("ONNX", "it is exported for (N, C, spatial axes) and filters that fit")
+        pixels = math.prod(self.kernel)
+        picks = (
+            torch.eye(pixels).reshape(pixels, 1, *self.kernel).repeat(self.channels, *(1,) * (1 + self.spatial_axes))
+        )
+        return self.onnx_convolved(graph, bottoms[0], [graph.constant(picks)], self.channels, self.onnx_geometry())
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.channel_axis != 1 or self.spatial_axes != 2 or any(self.overhang(self.bottom_shapes[0])):
+            raise self.refusal("PyTorch", "it is exported for (N, C, H, W) and filters that fit")
+        numbers = self.torch_geometry()
+        options = ", ".join(f"{name}={{{name}}}" for name, value in numbers.items() if value != TORCH_USUAL.get(name))
+        rows = self.top_shapes[0][2]
+        code.size(0, 2, "the rows of windows are counted beforehand")
+        template = f"{code.function(lay_out_windows)}({{x}}, {{rows}}, {options})"
+        return code.call(template, x=bottoms[0], rows=rows, **numbers)
+
+
+def lay_out_windows(x, rows, **geometry):
+    """Return the pixels under each position of a filter as channels (N, C K, H, W)."""
+    return F.unfold(x, **geometry).unflatten(2, (rows, -1))
+
 
 @register("Crop", "crop_param")
 class Crop(Layer):
@@ -286,6 +432,7 @@ class Crop(Layer):
 
     bottoms = (2, 2)
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the wanted shape; place the window."""
         data, wanted = bottom_shapes
@@ -307,6 +454,27 @@ class Crop(Layer):
             self.window.append(slice(offset, offset + wanted[i]))
         return [(*data[:axis], *wanted[axis : len(data)])]
 
+    @override
     def forward(self, data: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-        """Return the window."""
         return data[tuple(self.window)]
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        axis = next((i for i, part in enumerate(self.window) if part != slice(None)), 0)
+        starts = [part.start or 0 for part in self.window[axis:]]
+        wanted = graph.shape_of(bottoms[1], axis, len(self.window))
+        start = graph.constant(starts)
+        axes = graph.constant(list(range(axis, len(self.window))))
+        return graph.node("Slice", bottoms[0], start, graph.node("Add", wanted, start), axes)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        parts = []
+        for axis, part in enumerate(self.window):
+            if part == slice(None):
+                parts.append(":")
+            elif part.start == 0:
+                parts.append(f": {{y}}.shape[{axis}]")
+            else:
+                parts.append(f"{part.start} : {part.start} + {{y}}.shape[{axis}]")
+        return code.call(f"{{x}}[{', '.join(parts)}]", x=bottoms[0], y=bottoms[1])

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch.nn import functional as F
+from typing_extensions import override
 
 from netspec.exact.sums import Copies
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TRAIN
 
 MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
@@ -70,6 +74,19 @@ class Windows:
 
     def _axes(self) -> zip[tuple[int, int, int, int]]:
         return zip(self.size, self.kernel, self.stride, self.pad, strict=True)
+
+    @property
+    def reach(self) -> Pair:
+        """Return the padding after the map, vertical and horizontal, that brings Caffe's windows when rounding down.
+
+        With it, (size + pad + reach - kernel) // stride + 1 is ``count`` at every size: rounding up adds windows as
+        long as there is a pixel left, and where either axis is padded those that begin past the padded map are dropped.
+        """
+        reaches = []
+        for _, kernel, stride, pad in self._axes():
+            reach = pad if self.round_mode == FLOOR else pad + stride - 1
+            reaches.append(min(reach, kernel - 1) if any(self.pad) else reach)
+        return reaches[0], reaches[1]
 
 
 def max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
@@ -151,6 +168,77 @@ class _PoolingBase(Layer):
             return sampled_pool(maps, windows, self.context.random.on(maps.device)), None
         return weighted_pool(maps, windows), None
 
+    def onnx_pool(
+        self, graph: OnnxGraph, data: str, windows: Windows, method: int, mask: bool = False
+    ) -> Sequence[str]:
+        """Return the pooled maps and, where it is asked for, the mask."""
+        if any(r >= k for r, k in zip(windows.reach, windows.kernel, strict=True)):
+            raise self.refusal(
+                "ONNX", "unpadded windows at a stride above the kernel can miss the map; use round_mode: FLOOR"
+            )
+        pads = [*windows.pad, *windows.reach]
+        geometry = {"kernel_shape": list(windows.kernel), "strides": list(windows.stride), "pads": pads}
+        if method == MAX:
+            return self._onnx_max(graph, data, geometry, mask)
+        if method == AVE:
+            return [self._onnx_average(graph, data, windows, geometry)]
+        if self.phase == TRAIN:
+            raise self.refusal("ONNX", "STOCHASTIC pooling draws random numbers in the training phase")
+        squares = graph.node("AveragePool", graph.node("Mul", data, data), count_include_pad=1, **geometry)
+        mean = graph.node("AveragePool", data, count_include_pad=1, **geometry)
+        least = graph.constant(SMALLEST / math.prod(windows.kernel))
+        return [graph.node("Div", squares, graph.node("Add", mean, least))]
+
+    def _onnx_max(self, graph: OnnxGraph, data: str, geometry: dict[str, Any], mask: bool) -> Sequence[str]:
+        if not mask:
+            return [graph.node("MaxPool", data, **geometry)]
+        top, indices = graph.nodes("MaxPool", data, outputs=2, **geometry)
+        pixels = graph.node("ReduceProd", graph.shape_of(data, 2, 4), keepdims=1)
+        return [top, graph.cast(graph.node("Mod", indices, pixels), "float32")]  # ONNX counts through all maps
+
+    def _onnx_average(self, graph: OnnxGraph, data: str, windows: Windows, geometry: dict[str, Any]) -> str:
+        means = graph.node("AveragePool", data, count_include_pad=1, **geometry)
+        beyond = [reach - pad for reach, pad in zip(windows.reach, windows.pad, strict=True)]
+        fixed = None not in graph.sizes(0)[2:]
+        areas = windows.areas(torch.zeros(())) / math.prod(windows.kernel)
+        if not any(beyond) or (fixed and bool((areas == 1).all())):
+            return means
+        # The last windows reach past the padded map; what lies there does not count.
+        if fixed:
+            return graph.node("Div", means, graph.constant(areas[None, None]))
+        ones = graph.node("Expand", graph.constant(1.0), graph.shape_of(data))
+        frame = graph.constant([0, 0, *windows.pad, 0, 0, *windows.pad])
+        framed = graph.node("Pad", ones, frame, graph.constant(1.0), mode="constant")
+        counts = dict(geometry, pads=[0, 0, *beyond])
+        return graph.node("Div", means, graph.node("AveragePool", framed, count_include_pad=1, **counts))
+
+    def torch_pool(self, code: TorchCode, x: str, windows: Windows, method: int, mask: bool = False) -> str:
+        """Return the expression of the pooled maps; with ``mask`` of them and of the mask."""
+        if self.phase == TRAIN and method == STOCHASTIC:
+            raise self.refusal("PyTorch", "STOCHASTIC pooling draws random numbers in the training phase")
+        geometry = list(zip(windows.kernel, windows.stride, windows.pad, windows.reach, strict=True))
+        if any(r >= k for k, _, _, r in geometry) or (method != MAX and any(2 * p > k for k, _, p, _ in geometry)):
+            raise self.refusal("PyTorch", "windows that can miss the map; use round_mode: FLOOR, or less padding")
+        numbers: dict[str, Any] = {"kernel_size": windows.kernel, "stride": windows.stride, "padding": windows.pad}
+        options = ["{kernel_size}"]
+        if windows.stride != windows.kernel:
+            options.append("stride={stride}")
+        if any(2 * p > k for k, _, p, _ in geometry):
+            frame = (windows.pad[1], windows.reach[1], windows.pad[0], windows.reach[0])
+            x = code.call("F.pad({x}, {frame}, value=-torch.inf)", x=x, frame=frame)
+        else:
+            options += ["padding={padding}"] if any(windows.pad) else []
+            options += ["ceil_mode=True"] if windows.round_mode == CEIL and windows.stride != (1, 1) else []
+        options += ["return_indices=True"] if mask else []
+        numbers = {name: pair[0] if pair[0] == pair[1] else pair for name, pair in numbers.items()}
+        arguments = ", ".join(options)
+        if method == STOCHASTIC:
+            template = (
+                f"F.avg_pool2d({{x}}.square(), {arguments}) / F.avg_pool2d({{x}}, {arguments}).clamp(min={{least}})"
+            )
+            return code.call(template, x=x, least=SMALLEST, **numbers)
+        return code.call(f"F.{'max' if method == MAX else 'avg'}_pool2d({{x}}, {arguments})", x=x, **numbers)
+
 
 @register("Pooling", "pooling_param")
 class Pooling(_PoolingBase):
@@ -165,8 +253,8 @@ class Pooling(_PoolingBase):
 
     tops = (1, 2)
 
+    @override
     def setup(self) -> None:
-        """Read the method and the windows' geometry."""
         param = self.param.pooling_param
         self.method: int = param.pool
         if self.num_tops > 1 and self.method != MAX:
@@ -198,8 +286,8 @@ class Pooling(_PoolingBase):
             )
         return pair
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of the pooled maps, and of the mask."""
         shape, param = bottom_shapes[0], self.param.pooling_param
         if len(shape) != 4:
             raise self.error(f"pooling needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
@@ -212,10 +300,26 @@ class Pooling(_PoolingBase):
             raise self.error(message, "pooling_param")
         return [(*shape[:2], *self.windows.count)] * self.num_tops
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
-        """Return the pooled maps, and the mask if it is asked for."""
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
+        if self.param.pooling_param.global_pooling and self.method != STOCHASTIC and self.num_tops == 1:
+            return [graph.node("GlobalMaxPool" if self.method == MAX else "GlobalAveragePool", *bottoms)]
+        if self.param.pooling_param.global_pooling:
+            for axis in (2, 3):
+                graph.size(0, axis, "its one window is the whole map")
+        return self.onnx_pool(graph, bottoms[0], self.windows, self.method, mask=self.num_tops > 1)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+        mask = self.num_tops > 1
+        if not self.param.pooling_param.global_pooling or self.method == STOCHASTIC or mask:
+            return self.torch_pool(code, bottoms[0], self.windows, self.method, mask)
+        return code.call(f"F.adaptive_{'max' if self.method == MAX else 'avg'}_pool2d({{x}}, 1)", x=bottoms[0])
 
 
 @register("SPP", "spp_param")
@@ -227,11 +331,12 @@ class SPP(_PoolingBase):
     Caffe: src/caffe/layers/spp_layer.cpp
     """
 
+    @override
     def setup(self) -> None:
-        """Refuse a pyramid without a level."""
         if self.param.spp_param.pyramid_height < 1:
             raise self.error("pyramid_height must be at least 1", "spp_param", "pyramid_height")
 
+    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the number of features; place each level's windows."""
         shape, param = bottom_shapes[0], self.param.spp_param
@@ -244,13 +349,33 @@ class SPP(_PoolingBase):
             return [(*shape[:2], *self.levels[0].count)]
         return [(shape[0], shape[1] * sum(w.count[0] * w.count[1] for w in self.levels))]
 
+    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the features, the coarsest level's first."""
         several = len(self.levels) > 2 and self.is_exact(data)  # Caffe's SPP is a net of its own, with a Split
         copies = Copies.apply(data, len(self.levels)) if several else [data] * len(self.levels)
         method = self.param.spp_param.pool
         pooled = [self.pool(copy, windows, method)[0] for copy, windows in zip(copies, self.levels, strict=True)]
         return pooled[0] if len(pooled) == 1 else torch.cat([level.flatten(1) for level in pooled], dim=1)
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        for axis in (2, 3):
+            graph.size(0, axis, "the windows of its pyramid follow from the map's size")
+        method = self.param.spp_param.pool
+        levels = [self.onnx_pool(graph, bottoms[0], windows, method)[0] for windows in self.levels]
+        if len(levels) == 1:
+            return levels[0]
+        return graph.node("Concat", *(graph.node("Flatten", level, axis=1) for level in levels), axis=1)
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        for axis in (2, 3):
+            code.size(0, axis, "the windows of its pyramid follow from the map's size")
+        method = self.param.spp_param.pool
+        levels = [self.torch_pool(code, bottoms[0], windows, method) for windows in self.levels]
+        if len(levels) == 1:
+            return levels[0]
+        return f"torch.cat([{', '.join(f'{level}.flatten(1)' for level in levels)}], dim=1)"
 
 
 def _pyramid_level(bins: int, size: Pair) -> Windows:

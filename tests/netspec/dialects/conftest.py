@@ -1,10 +1,11 @@
-"""How tests of dialects build one layer, and check its gradients."""
+"""Dialects for one test: registry and schema are afterwards as they were before."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
 
+from fresh_dialects import fresh_dialects
 from netspec.dialects import use_dialect
 from netspec.layers import Layer
 from netspec.net.one_layer import make_layer
@@ -13,8 +14,9 @@ from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 
 @pytest.fixture(autouse=True)
-def _leave_no_dialect(leave_no_dialect: None) -> None:
+def _leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     torch.manual_seed(0)
+    yield from fresh_dialects(monkeypatch)
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """What BVLC Caffe computed, computed again through caffe.Net and the solvers: their passes are not netspec's own."""
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -7,13 +8,14 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-from golden_cases import LayerCase, promised
-from netspec.proto.schema import PHASES
+from golden_cases import EVERY, SAMPLED, LayerCase, assert_same_layers, lay_out_examples, promised, set_parameters
 from netspec.pycaffe import mode
 from paths import GOLDEN
+from pycaffe_cases import compute
 
 LAYERS = sorted((GOLDEN / "layers").iterdir())
 TRAININGS = sorted(folder.name for folder in (GOLDEN / "train").iterdir())
+EXAMPLES = sorted(folder.name for folder in (GOLDEN / "examples" / "runs").iterdir())
 TOLERANCE = 1e-5  # of the largest element
 
 
@@ -22,36 +24,6 @@ def exact() -> Iterator[Callable[[str], None]]:
     before = mode.exact()
     yield mode.set_exact
     mode.set_exact(before)
-
-
-def compute(case: LayerCase) -> dict[str, np.ndarray]:
-    """Return what a script would find in the blobs, under Caffe's keys."""
-    golden, meta = case.golden, case.meta
-    net = caffe.Net(str(case.folder / "net.prototxt"), PHASES[meta["phase"]])
-    for key, array in golden.items():
-        kind, _, name = key.partition("/")
-        if kind == "param_init":
-            layer, _, index = name.rpartition("/")
-            net.params[layer][int(index)].data[...] = array
-        elif kind == "in":
-            net.blobs[name].data[...] = array
-    for _ in range(meta["warmup"] + 1):
-        outputs = net.forward()
-    if meta["grad"]:
-        for key, array in golden.items():
-            if key.startswith("topdiff/"):
-                net.blobs[key.partition("/")[2]].diff[...] = array
-        net.backward()
-    found = {f"out/{name}": array for name, array in outputs.items()}
-    for key in golden:
-        kind, _, name = key.partition("/")
-        if kind == "indiff":
-            found[key] = net.blobs[name].diff
-        elif kind in ("paramdiff", "param_after"):
-            layer, _, index = name.rpartition("/")
-            blob = net.params[layer][int(index)]
-            found[key] = blob.diff if kind == "paramdiff" else blob.data
-    return found
 
 
 @pytest.mark.parametrize("folder", LAYERS, ids=lambda path: path.name)
@@ -106,3 +78,49 @@ def test_solvers_follow_caffe(
             if key.startswith("final/"):
                 _, layer, index = key.split("/")
                 np.testing.assert_array_equal(solver.net.params[layer][int(index)].data, golden[key], key)
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return lay_out_examples(tmp_path_factory.mktemp("examples"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", EXAMPLES)
+def test_caffes_examples(
+    run: str,
+    folder: Path,
+    exact: Callable[[str], None],
+    same_blas: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """LeNet, the autoencoder and the Siamese net: outputs, and what was subtracted from the weights first."""
+    monkeypatch.chdir(folder)
+    exact("all")
+    meta = json.loads(Path(f"examples/runs/{run}/meta.json").read_text())
+    golden = np.load(f"examples/runs/{run}/trajectory.npz")
+    solver = caffe.get_solver(f"examples/runs/{run}/solver.prototxt")
+    solver.param.test_initialization = False
+    for name in meta["init"]:
+        set_parameters(solver.net.passes.net, np.load(f"examples/init/{name}.npz"))
+    solver.step(1)
+    updates = {key: sampled(solver, key, "diff") for key in golden.files if key.startswith("update/")}
+    assert_same_layers(updates, golden, 1e-4)
+    if not same_blas:
+        return
+    outputs = [{name: float(solver.net.blobs[name].data) for name in solver.net.outputs}]
+    for _ in range(meta["iterations"] - 1):
+        solver.step(1)
+        outputs.append({name: float(solver.net.blobs[name].data) for name in solver.net.outputs})
+    for key in golden.files:
+        if key.startswith("out/"):
+            np.testing.assert_array_equal(np.float32([out[key[4:]] for out in outputs]), golden[key], key)
+        if key.startswith("final/"):
+            np.testing.assert_array_equal(sampled(solver, key, "data"), golden[key], key)
+
+
+def sampled(solver: caffe.SGDSolver, key: str, what: str) -> np.ndarray:
+    """Return ``data`` or ``diff`` of the parameter KIND/LAYER/INDEX, sampled as the examples' files are."""
+    _, layer, index = key.split("/")
+    values = getattr(solver.net.params[layer][int(index)], what)
+    return values if values.size < SAMPLED else values.reshape(-1)[::EVERY]

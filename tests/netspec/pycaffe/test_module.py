@@ -83,6 +83,7 @@ def script(code: str, folder: Path, **environment: str) -> subprocess.CompletedP
     )
 
 
+@pytest.mark.slow
 def test_the_log_is_glogs(write: Callable[..., str], tmp_path: Path) -> None:
     write(SMALL)
     code = "import netspec.pycaffe as caffe; caffe.log('hello'); caffe.Net('net.prototxt', caffe.TEST)"
@@ -118,6 +119,7 @@ print(repr(solver.net.params["fc"][0].data.tolist()))
 """
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_net(write: Callable[..., str], tmp_path: Path) -> None:
     write("""
     layer { name: "data" type: "DummyData" top: "data" top: "wanted" dummy_data_param {

@@ -89,3 +89,92 @@ def test_weights_are_saved_and_read(net: caffe.Net, caplog: pytest.LogCaptureFix
         for name, blobs in net.params.items():
             for mine, theirs in zip(blobs, again.params[name], strict=True):
                 assert (mine.data == theirs.data).all()
+
+
+def ruled(name: str, rule: str) -> str:
+    return f"""
+    layer {{ name: "{name}" type: "InnerProduct" bottom: "data" top: "{name}" {rule}
+      inner_product_param {{ num_output: 1 }} }}"""
+
+
+def made(net: caffe.Net) -> list[str]:
+    """Return the blobs besides the input and its copies."""
+    return [name for name in net.blobs if "data" not in name]
+
+
+@pytest.mark.parametrize(
+    ("level", "expected"),
+    [
+        (None, ["always", "up to 0", "from 0"]),
+        (1, ["always", "from 0", "from 1"]),
+        (2, ["always", "from 0", "from 1"]),
+        (-1, ["always", "up to 0"]),
+    ],
+)
+def test_levels(write: Callable[..., str], level: int | None, expected: list[str]) -> None:
+    path = write(
+        'input: "data" input_shape { dim: 1 dim: 1 dim: 10 dim: 10 }'
+        + ruled("always", "")
+        + ruled("up to 0", "include { max_level: 0 }")
+        + ruled("from 0", "include { min_level: 0 }")
+        + ruled("from 1", "include { min_level: 1 }")
+    )
+    net = caffe.Net(path, caffe.TEST) if level is None else caffe.Net(path, caffe.TEST, level=level)
+    assert made(net) == expected
+    if level is not None:
+        assert made(caffe.Net(path, caffe.TEST, level)) == expected
+
+
+@pytest.mark.parametrize(
+    ("stages", "expected"),
+    [
+        (None, ["always"]),
+        (["B"], ["always", "B"]),
+        (["A", "B"], ["always", "A", "B", "A and B"]),
+        (["C"], ["always"]),
+    ],
+)
+def test_stages(write: Callable[..., str], stages: list[str] | None, expected: list[str]) -> None:
+    path = write(
+        'input: "data" input_shape { dim: 1 dim: 1 dim: 10 dim: 10 }'
+        + ruled("always", "")
+        + ruled("A", 'include { stage: "A" }')
+        + ruled("B", 'include { stage: "B" }')
+        + ruled("A and B", 'include { stage: "A" stage: "B" }')
+    )
+    assert made(caffe.Net(path, caffe.TEST, stages=stages)) == expected
+
+
+def test_train_test_and_deploy_in_one_file(write: Callable[..., str]) -> None:
+    shape = "shape { dim: 1 dim: 1 dim: 10 dim: 10 }"
+    data = f'type: "DummyData" top: "data" top: "label" dummy_data_param {{ {shape} shape {{ dim: 1 dim: 1 }} }}'
+    path = write(
+        f'layer {{ name: "train" {data} include {{ phase: TRAIN }} }}\n'
+        f'layer {{ name: "val" {data} include {{ phase: TEST stage: "val" }} }}\n'
+        f'layer {{ name: "given" type: "Input" top: "data" input_param {{ {shape} }} include {{ stage: "deploy" }} }}\n'
+        'layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" inner_product_param { num_output: 2 } }\n'
+        'layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss"\n'
+        '  include { phase: TRAIN } include { phase: TEST stage: "val" } }\n'
+        'layer { name: "pred" type: "Softmax" bottom: "ip" top: "pred" include { stage: "deploy" } }\n'
+    )
+    for phase, stages, outputs in (
+        (caffe.TRAIN, None, ["loss"]),
+        (caffe.TEST, ["val"], ["loss"]),
+        (caffe.TEST, ["deploy"], ["pred"]),
+    ):
+        net = caffe.Net(path, phase, stages=stages)
+        assert list(net.blobs["data"].shape) == [1, 1, 10, 10]
+        assert net.outputs == outputs
+        assert list(net.forward()) == outputs
+    assert net.inputs == ["data"]
+    assert made(net) == ["ip", "pred"]
+
+
+def test_a_loss_without_a_top_has_an_automatic_one(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(SMALL.replace('top: "cost"', ""), caffe.TRAIN)
+    assert net._blob_names[-1] == "(automatic)"
+    assert net.top_names["cost"] == ["(automatic)"]
+    net.blobs["label"].data[...] = 1
+    assert net._forward(0, len(net.layers) - 1) == pytest.approx(float(net.blobs["(automatic)"].data))
+    net.backward()
+    assert net.params["scores"][0].diff.any()

@@ -1,43 +1,23 @@
 """Caffe's own examples, trained with ``exact: all``: LeNet, the MNIST autoencoder and the Siamese MNIST net."""
 
 import json
-import shutil
 from pathlib import Path
 
-import lmdb
 import numpy as np
 import pytest
 
-from golden_cases import assert_same_layers, parameters, set_parameters, train
+from golden_cases import assert_same_layers, lay_out_examples, parameters, set_parameters, train
 from netspec.net.net import Net
-from netspec.proto.schema import Datum
 from netspec.solver.solver import Solver, load_solver
 from paths import GOLDEN
 
-EXAMPLES = GOLDEN / "examples"
-RUNS = sorted(folder.name for folder in (EXAMPLES / "runs").iterdir())
-DATABASES = {"mnist": "mnist", "siamese": "mnist_siamese"}
+RUNS = sorted(folder.name for folder in (GOLDEN / "examples" / "runs").iterdir())
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with ``examples/``, as the paths in its prototxt files want it: the records are in LMDBs there."""
-    folder = tmp_path_factory.mktemp("examples")
-    shutil.copytree(EXAMPLES, folder / "examples")
-    for name, prefix in DATABASES.items():
-        records = np.load(EXAMPLES / name / "records.npz")
-        for kind in ("train", "test"):
-            write(folder / "examples" / name / f"{prefix}_{kind}_lmdb", records[kind], records[f"{kind}_label"])
-    return folder
-
-
-def write(path: Path, images: np.ndarray, labels: np.ndarray) -> None:
-    """Write images (N, C, H, W) and labels (N,) as Datums."""
-    channels, height, width = images.shape[1:]
-    with lmdb.open(str(path), map_size=2**26) as environment, environment.begin(write=True) as transaction:
-        for i, (image, label) in enumerate(zip(images, labels, strict=True)):
-            datum = Datum(channels=channels, height=height, width=width, data=image.tobytes(), label=int(label))
-            transaction.put(b"%08d" % i, datum.SerializeToString())
+    """A folder with ``examples/``, as the paths in its prototxt files want it."""
+    return lay_out_examples(tmp_path_factory.mktemp("examples"))
 
 
 def start(run: str, meta: dict) -> Solver:

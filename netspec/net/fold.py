@@ -1,0 +1,58 @@
+"""Folding: what only scales and shifts the channels becomes part of the weights before it, as is done before shipping.
+
+A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
+weights s W and the bias s b + t. A BatchNorm that normalizes by its past is such a map, s = 1 / sqrt(var + eps) and t =
+-mean s, and so is a Scale; maps in a row are one map. The arithmetic is in double precision. The layers know their own
+part: :meth:`Layer.as_affine`, :meth:`Layer.absorb` and :meth:`Layer.absorb_before`; here they are only put together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from netspec.graph.fold import Chain, Roles, find_chains
+from netspec.layers.base import Absorbed, Affine
+from netspec.net.net import Net
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A chain of a net's layers, and the parameters and learned blobs (double) with which its keeper does it all."""
+
+    chain: Chain
+    absorbed: Absorbed
+
+
+def roles_of(net: Net) -> Roles:
+    """Return what each layer of a net is for folding."""
+    one_to_one = [len(node.bottoms) == 1 and len(node.tops) == 1 for node in net.plan.nodes]
+    affine = [one and layer.as_affine() is not None for one, layer in zip(one_to_one, net.layers, strict=True)]
+    return Roles(
+        absorbs=[len(node.tops) == 1 and layer.absorbs for node, layer in zip(net.plan.nodes, net.layers, strict=True)],
+        affine=affine,
+        absorbs_before=[one and layer.absorbs_before for one, layer in zip(affine, net.layers, strict=True)],
+        passes_on=[layer.passes_on for layer in net.layers],
+    )
+
+
+def find_folds(net: Net) -> list[Fold]:
+    """Return all that can be folded in a net, with its weights as they are; the net is not changed."""
+    folds = []
+    for chain in find_chains(net.plan, roles_of(net)):
+        keeper = net.layers[chain.keeper]
+        scale, shift = composed([net.layers[i].as_affine() for i in chain.folded])
+        absorb = keeper.absorb if chain.keeper < chain.folded[0] else keeper.absorb_before
+        folds.append(Fold(chain, absorb(scale, shift)))
+    return folds
+
+
+def composed(maps: Sequence[Affine | None]) -> Affine:
+    """Return the one map that does what these do one after the other."""
+    scale, shift = torch.ones((), dtype=torch.double), torch.zeros((), dtype=torch.double)
+    for each in maps:
+        assert each is not None, "the chain consists of affine layers"
+        scale, shift = each[0] * scale, each[0] * shift + each[1]
+    return scale, shift

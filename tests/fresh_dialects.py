@@ -1,0 +1,22 @@
+"""Dialects for one test: registry and schema are afterwards as they were before."""
+
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from netspec.layers import registry
+from netspec.proto.dialect import files
+from netspec.proto.dialect import registry as dialect
+
+
+def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let a test use dialects; switch them off when it is done."""
+    assert dialect.active() == []
+    monkeypatch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
+    yield
+    for name in dialect.active():
+        dialect.deactivate(name)
+    own = [file.module for file in files.known_files().values()]
+    for name in [name for name in sys.modules if name in own or name.startswith("netspec_dialect_")]:
+        del sys.modules[name]

@@ -1,0 +1,83 @@
+"""What every layer owes those who export: the same numbers elsewhere, or a reason why not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, run_module
+from laws.test_registry import EXAMPLES, TYPES, folder  # noqa: F401
+from netspec.errors import SpecError
+from netspec.export.deploy import with_inputs
+from netspec.export.onnx import onnx_model
+from netspec.export.torch import torch_module
+from netspec.graph.filter import with_state
+from netspec.layers import Layer, layer_class
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.proto.text import parse_net_text
+
+NOT_IN_ONNX = {"DummyData": "random", "HDF5Output": "writes a file", "Python": "code"}
+NOT_IN_TORCH = NOT_IN_ONNX | {"InfogainLoss": "matrix of weights", "Accuracy": "each class"}
+DATA = [name for name in TYPES if getattr(layer_class(name), "reads_data", False)]
+
+
+def net_of_example(name: str, folder: Path) -> Net:  # noqa: F811
+    example = EXAMPLES[name]
+    text = "force_backward: false\n"
+    for i, shape in enumerate(example.shapes):
+        dims = " ".join(f"dim: {size}" for size in shape)
+        text += f'layer {{ name: "bottom{i}" type: "Input" top: "bottom{i}" input_param {{ shape {{ {dims} }} }} }}\n'
+    bottoms = " ".join(f'bottom: "bottom{i}"' for i in range(len(example.shapes)))
+    tops = " ".join(f'top: "top{i}"' for i in range(example.tops))
+    text += f'layer {{ name: "it" type: "{name}" {bottoms} {tops} {example.text.replace("{tmp}", str(folder))} }}\n'
+    message, source = parse_net_text(text, "net.prototxt")
+    message = with_state(message, example.phase)
+    if name in DATA:
+        message, source = with_inputs(message, source, {"top0": (3, 2, 9, 9)})
+    return build_net(message, source, BuildOptions(seed=0, allow_python=True))
+
+
+def test_every_layer_says_how_it_is_exported_or_why_not() -> None:
+    for name in TYPES:
+        cls = layer_class(name)
+        assert cls is not None
+        own = [method for method in ("to_onnx", "to_torch") if getattr(cls, method) is not getattr(Layer, method)]
+        refused = "not_exported" in vars(cls) or name in DATA or name in NOT_IN_TORCH
+        assert len(own) == 2 or refused, name
+
+
+@pytest.mark.parametrize("name", TYPES)
+@pytest.mark.parametrize("target", ["ONNX", "PyTorch"])
+def test_layer_computes_the_same_elsewhere_or_says_why_it_cannot(
+    name: str,
+    target: str,
+    folder: Path,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if target == "ONNX":
+        pytest.importorskip("onnx", reason=ONNX_EXTRA)
+    monkeypatch.chdir(folder)
+    net = net_of_example(name, folder)
+    write = onnx_model if target == "ONNX" else torch_module
+    refused = (NOT_IN_ONNX if target == "ONNX" else NOT_IN_TORCH).get(name)
+    if refused:
+        with pytest.raises(SpecError, match=rf'layer "it" \({name}\): cannot be exported to {target}: .*{refused}'):
+            write(net)
+        net.close()
+        return
+    given = EXAMPLES[name].bottoms()
+    inputs = {blob: given[i].float().numpy() for i, blob in enumerate(net.inputs) if i < len(given)}
+    for blob in net.inputs:
+        inputs.setdefault(blob, np.zeros(net.shapes[blob], np.float32))
+    if name == "Silence":
+        assert not net.outputs
+    elif target == "ONNX":
+        assert_same(in_onnxruntime(write(net)[0], inputs), here(net, inputs))  # type: ignore[index]
+    else:
+        module = write(net)
+        assert isinstance(module, torch.nn.Module)
+        assert_same(run_module(module, net, inputs), here(net, inputs))
+    net.close()

@@ -1,0 +1,200 @@
+"""``netspec export`` and ``netspec fold``: what they write, what they say, what they refuse."""
+
+import errno
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+
+import netspec
+from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, random_inputs, run_module
+from netspec.net.net import Net
+
+MODEL, WEIGHTS = "deploy.prototxt", "deploy.caffemodel"
+TEXT = """name: "Cli"
+layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 8 } } }
+layer { name: "conv" type: "Convolution" bottom: "data" top: "conv"
+  convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "xavier" } } }
+layer { name: "bn" type: "BatchNorm" bottom: "conv" top: "bn" }
+layer { name: "relu" type: "ReLU" bottom: "bn" top: "bn" }
+"""
+
+
+@pytest.fixture
+def onnx() -> Any:
+    """The onnx library."""
+    return pytest.importorskip("onnx", reason=ONNX_EXTRA)
+
+
+@pytest.fixture
+def net(run: Callable[..., object]) -> Net:
+    """A net, whose files are in the working directory."""
+    Path(MODEL).write_text(TEXT)
+    net = netspec.load_net(MODEL, seed=1)
+    for blob in net.params["bn"]:
+        blob.data.fill_(2)
+    netspec.save_weights(net, WEIGHTS)
+    return net
+
+
+def test_onnx(onnx: Any, net: Net, run: Callable[..., object]) -> None:
+    result = run("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "net.onnx")
+    assert (result.status, result.out, result.err) == (0, "", "")
+    inputs = random_inputs(net)
+    model = onnx.load("net.onnx")
+    assert_same(in_onnxruntime(model, inputs), here(net, inputs))
+    props = {each.key: each.value for each in model.metadata_props}
+    assert props["netspec.prototxt"] == MODEL
+    assert props["netspec.weights"] == WEIGHTS
+    assert len(props["netspec.weights.sha256"]) == 64
+    assert props["netspec.phase"] == "TEST"
+
+
+def test_torch(net: Net, run: Callable[..., object], monkeypatch: pytest.MonkeyPatch) -> None:
+    result = run("export", MODEL, "--weights", WEIGHTS, "--to", "torch", "--out", "exported_cli.py")
+    assert result.status == 0
+    assert result.err == "note: the weights are in exported_cli.safetensors, beside the module\n"
+    monkeypatch.syspath_prepend(".")
+    import exported_cli  # type: ignore
+
+    inputs = random_inputs(net)
+    assert_same(run_module(exported_cli.load(), net, inputs), here(net, inputs))
+    del sys.modules["exported_cli"]
+
+
+def test_pt2(net: Net, run: Callable[..., object]) -> None:
+    assert run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "net.pt2").status == 0
+    inputs = random_inputs(net)
+    assert_same(run_module(torch.export.load("net.pt2").module(), net, inputs), here(net, inputs))
+
+
+def test_safetensors(net: Net, run: Callable[..., object]) -> None:
+    assert run("export", MODEL, "--weights", WEIGHTS, "--to", "safetensors", "--out", "net.safetensors").status == 0
+    found = load_file("net.safetensors")
+    assert sorted(found) == ["bn.0", "bn.1", "bn.2", "conv.0", "conv.1"]
+    np.testing.assert_array_equal(found["conv.0"], net.params["conv"][0].detach().numpy())
+
+
+def test_fold(net: Net, run: Callable[..., object]) -> None:
+    result = run("fold", MODEL, "--weights", WEIGHTS, "--out", "small")
+    assert result.status == 0
+    assert result.err == "small.prototxt and small.caffemodel: 3 layers of 4\n"
+    small = netspec.load_net("small.prototxt", weights="small.caffemodel")
+    assert [layer.type for layer in small.layers] == ["Input", "Convolution", "ReLU"]
+    inputs = random_inputs(net)
+    assert_same(here(small, inputs), here(net, inputs))
+
+
+def test_a_training_net_folds_to_a_deploy_net(run: Callable[..., object]) -> None:
+    result = run(
+        "fold",
+        "sgd_step/train_val.prototxt",
+        "--weights",
+        "sgd_step/init.caffemodel",
+        "--out",
+        "small",
+        "--shape",
+        "pair_data=2,2,28,28",
+    )
+    assert result.status == 0
+    small = netspec.load_net("small.prototxt", weights="small.caffemodel")
+    assert small.inputs == ["pair_data"]
+    assert not any(layer.is_loss for layer in small.layers)
+
+
+def test_a_training_net_is_exported_with_its_loss(onnx: Any, run: Callable[..., object]) -> None:
+    words = (
+        "export",
+        "sgd_step/train_val.prototxt",
+        "--weights",
+        "sgd_step/init.caffemodel",
+        "--to",
+        "onnx",
+        "--out",
+        "net.onnx",
+    )
+    assert "known by its data only; say --shape pair_data=" in run(*words).fault
+    assert run(*words, "--shape", "pair_data=2,2,28,28").status == 0
+    model = onnx.load("net.onnx")
+    assert [each.name for each in model.graph.input] == ["pair_data", "sim"]
+    assert [each.name for each in model.graph.output] == ["loss"]
+
+
+def test_part_of_a_net(onnx: Any, net: Net, run: Callable[..., object]) -> None:
+    words = ("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "net.onnx", "--blob")
+    assert run(*words, "conv").status == 0
+    assert [node.op_type for node in onnx.load("net.onnx").graph.node] == ["Conv"]
+    assert 'no blob "conf" in this net; did you mean "conv"?' in run(*words, "conf").fault
+
+
+def test_images_steps(onnx: Any, net: Net, run: Callable[..., object]) -> None:
+    words = ("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "net.onnx", "--mean", "1,2,3", "--swap")
+    assert run(*words, "--scale", "0.5").status == 0
+    inputs = random_inputs(net)
+    done = (inputs["data"][:, ::-1] - np.array([1, 2, 3], np.float32).reshape(-1, 1, 1)) * np.float32(0.5)
+    expected = here(net, {"data": np.ascontiguousarray(done)})
+    assert_same(in_onnxruntime(onnx.load("net.onnx"), inputs), expected)
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (("--to", "onnx", "--out", "no/net.onnx"), "no/net.onnx: there is no folder no; make it first"),
+        (("--to", "torch", "--out", "net.txt"), "--out net.txt: expected a name that ends in .py"),
+        (("--to", "onnx", "--out", "n.onnx", "--shape", "dat=1,3,8,8"), '--shape names "dat"; did you mean "data"?'),
+        (("--to", "onnx", "--out", "n.onnx", "--mean", "no.npy"), "no.npy: cannot be read as an array"),
+        (("--to", "onnx", "--out", "n.onnx", "--swap", "--input", "x"), 'no input "x" in this net; it has: data'),
+    ],
+)
+def test_faults_are_one_line(
+    words: tuple[str, ...], fault: str, onnx: Any, net: Net, run: Callable[..., object]
+) -> None:
+    assert fault in run("export", MODEL, "--weights", WEIGHTS, *words).fault
+    assert not list(Path().glob("n.onnx"))
+
+
+def test_weights_that_are_not_there(onnx: Any, net: Net, run: Callable[..., object]) -> None:
+    words = ("export", MODEL, "--to", "onnx", "--out", "n.onnx")
+    assert "no.caffemodel: cannot be read: No such file or directory" in run(*words, "--weights", "no.caffemodel").fault
+    assert run(*words).err == "warning: no --weights: the net has random ones\n"
+
+
+def test_the_onnx_library_is_an_extra(net: Net, run: Callable[..., object], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    words = ("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "n.onnx")
+    assert run(*words).fault == "--to onnx needs the onnx library: pip install 'netspec-caffe[onnx]'"
+
+
+@pytest.mark.parametrize(
+    ("target", "out"), [("torch", "n.py"), ("pt2", "n.pt2"), ("safetensors", "n.safetensors"), ("fold", "n")]
+)
+def test_a_fault_leaves_old_files_as_they_were(
+    target: str, out: str, net: Net, run: Callable[..., object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("fold", MODEL) if target == "fold" else ("export", MODEL, "--to", target)
+    words = (*words, "--weights", WEIGHTS, "--out", out)
+    assert run(*words).status == 0
+    before = {path: path.read_bytes() for path in Path().glob("n*")}
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert run(*words).fault.endswith("cannot be written: No space left on device")
+    assert {path: path.read_bytes() for path in Path().iterdir() if path.name.lstrip(".")[:1] == "n"} == before
+
+
+def test_folding_needs_weights(net: Net, run: Callable[..., object]) -> None:
+    assert run("fold", MODEL, "--out", "n").status == 2
+
+
+def test_steps_for_images_are_for_onnx(net: Net, run: Callable[..., object]) -> None:
+    result = run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "n.pt2", "--swap")
+    assert result.status == 2
+    assert "go with --to onnx" in result.err

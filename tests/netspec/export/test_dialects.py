@@ -1,0 +1,214 @@
+"""The layers of forks, exported: the same numbers in onnxruntime, OpenCV 5 and PyTorch, at other sizes too."""
+
+from collections.abc import Callable, Mapping
+
+import cv2
+import numpy as np
+import pytest
+
+from exported import (
+    ONNX_EXTRA,
+    assert_same,
+    here,
+    in_onnxruntime,
+    in_opencv,
+    other_inputs,
+    random_inputs,
+    run_module,
+    trained,
+)
+from netspec.dialects import use_dialect
+from netspec.errors import SpecError
+from netspec.export.onnx import onnx_model
+from netspec.export.shapes import find_shapes
+from netspec.export.torch import torch_module
+from netspec.net.net import Net
+
+pytest.importorskip("onnx", reason=ONNX_EXTRA)
+OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
+Shape = tuple[int, ...]
+MAP = (2, 4, 6, 5)
+
+
+def net_text(layer: str, shapes: Mapping[str, Shape], tops: int = 1) -> str:
+    inputs = "".join(
+        f'layer {{ name: "{blob}" type: "Input" top: "{blob}" input_param {{ shape {{ '
+        f"{' '.join(f'dim: {size}' for size in shape)} }} }} }}\n"
+        for blob, shape in shapes.items()
+    )
+    bottoms = " ".join(f'bottom: "{blob}"' for blob in shapes)
+    made = " ".join(f'top: "top{i}"' for i in range(tops))
+    return f'{inputs}layer {{ name: "it" {layer} {bottoms} {made} }}'
+
+
+CASES: dict[str, tuple[str, str, dict[str, Shape]]] = {
+    "Permute": ("ssd", "type: 'Permute' permute_param { order: 0 order: 2 order: 3 order: 1 }", {"x": MAP}),
+    "Normalize": ("ssd", "type: 'Normalize' norm_param { across_spatial: false channel_shared: false }", {"x": MAP}),
+    "Normalize across": ("ssd", "type: 'Normalize' norm_param { eps: 0.01 }", {"x": MAP}),
+    "PriorBox": (
+        "ssd",
+        "type: 'PriorBox' prior_box_param { min_size: 3 max_size: 7 aspect_ratio: 2 variance: 0.1 variance: 0.1 "
+        "variance: 0.2 variance: 0.2 }",
+        {"x": MAP, "image": (2, 3, 24, 20)},
+    ),
+    "PriorBox with step": (
+        "ssd",
+        "type: 'PriorBox' prior_box_param { min_size: 3 min_size: 5 flip: false clip: true img_size: 40 step: 8 }",
+        {"x": MAP},
+    ),
+    "Axpy": ("blocks", "type: 'Axpy'", {"a": (2, 4), "x": MAP, "y": MAP}),
+    "ReLU6": ("blocks", "type: 'ReLU6'", {"x": MAP}),
+    "ReLU6 with slope": ("blocks", "type: 'ReLU6' relu6_param { negative_slope: 0.25 }", {"x": MAP}),
+    "DepthwiseConvolution": (
+        "blocks",
+        "type: 'DepthwiseConvolution' convolution_param { num_output: 8 group: 4 kernel_size: 3 pad: 1 stride: 2 }",
+        {"x": MAP},
+    ),
+    "ConvolutionDepthwise": (
+        "blocks",
+        "type: 'ConvolutionDepthwise' convolution_param { kernel_size: 3 bias_term: false }",
+        {"x": MAP},
+    ),
+    "ShuffleChannel": ("blocks", "type: 'ShuffleChannel' shuffle_channel_param { group: 2 }", {"x": MAP}),
+    "Interp by zoom": (
+        "blocks",
+        "type: 'Interp' interp_param { zoom_factor: 3 shrink_factor: 2 pad_beg: 0 pad_end: -1 }",
+        {"x": MAP},
+    ),
+    "Interp to a size": ("blocks", "type: 'Interp' interp_param { height: 11 width: 4 }", {"x": MAP}),
+    "Interp like another": ("blocks", "type: 'Interp'", {"x": MAP, "y": (2, 1, 9, 13)}),
+    "Upsample": ("blocks", "type: 'Upsample' upsample_param { scale: 3 }", {"x": MAP}),
+    "BN of PSPNet": ("blocks", "type: 'BN' bn_param { frozen: true }", {"x": MAP}),
+    "BN of SegNet": ("blocks", "type: 'BN' bn_param { bn_mode: INFERENCE }", {"x": MAP}),
+    "BN by the batch": ("blocks", "type: 'BN' bn_param { bn_mode: LEARN }", {"x": MAP}),
+    "Dropout": ("rcnn", "type: 'Dropout' dropout_param { dropout_ratio: 0.25 scale_train: false }", {"x": MAP}),
+    "SmoothL1Loss": (
+        "rcnn",
+        "type: 'SmoothL1Loss' smooth_l1_loss_param { sigma: 2 }",
+        {"x": (5, 8), "y": (5, 8), "inside": (5, 8), "outside": (5, 8)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_layer_computes_the_same(name: str, net_of: Callable[..., Net]) -> None:
+    dialect, layer, shapes = CASES[name]
+    use_dialect(dialect)
+    net = trained(net_of(net_text(layer, shapes)))
+    inputs = random_inputs(net)
+    model, _ = onnx_model(net)
+    module = torch_module(net)
+    for given in (inputs, other_inputs(net, find_shapes(net), inputs)):
+        expected = here(net, given)
+        assert_same(in_onnxruntime(model, given), expected)
+        assert_same(run_module(module, net, given), expected)
+        if OPENCV_5:
+            assert_same(in_opencv(model, given), expected, scalars_have_an_axis=True)
+
+
+def test_unpooling_brings_values_to_where_they_came_from(net_of: Callable[..., Net]) -> None:
+    use_dialect("blocks")
+    text = """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 6 } } }
+    layer { name: "pool" type: "Pooling" bottom: "x" top: "pool" top: "mask"
+      pooling_param { kernel_size: 2 stride: 2 } }
+    layer { name: "up" type: "Upsample" bottom: "pool" bottom: "mask" top: "up" upsample_param { scale: 2 } }"""
+    net = net_of(text)
+    inputs = random_inputs(net)
+    model, notes = onnx_model(net)
+    assert [line.split(" is fixed")[0] for line in notes] == ["the height", "the width"]
+    expected = here(net, inputs)
+    assert_same(in_onnxruntime(model, inputs), expected)
+    assert_same(run_module(torch_module(net), net, inputs), expected)
+    if OPENCV_5:
+        assert_same(in_opencv(model, inputs), expected)
+
+
+def test_regions_are_pooled(net_of: Callable[..., Net]) -> None:
+    use_dialect("rcnn")
+    layer = "type: 'ROIPooling' roi_pooling_param { pooled_h: 3 pooled_w: 2 spatial_scale: 0.5 }"
+    net = net_of(net_text(layer, {"x": (2, 4, 9, 8), "rois": (4, 5)}))
+    corners = np.array([[0, 1, 1, 9, 13], [1, 2, 2, 12, 8], [1, 0, 0, 15, 17], [0, 3, 3, 4, 4]], np.float32)
+    inputs = {"x": random_inputs(net)["x"], "rois": corners}
+    assert_same(in_onnxruntime(onnx_model(net)[0], inputs), here(net, inputs))
+    with pytest.raises(SpecError, match=r"\(ROIPooling\): cannot be exported to PyTorch: .*pooling of regions"):
+        torch_module(net)
+
+
+@pytest.mark.parametrize(
+    ("dialect", "layer", "shapes"),
+    [
+        (
+            "rcnn",
+            "type: 'PSROIPooling' psroi_pooling_param { spatial_scale: 0.5 output_dim: 2 group_size: 2 }",
+            {"x": (1, 8, 6, 6), "rois": (3, 5)},
+        ),
+        (
+            "ssd",
+            "type: 'MultiBoxLoss' multibox_loss_param { num_classes: 3 }",
+            {"loc": (1, 8), "conf": (1, 6), "prior": (1, 2, 8), "truth": (1, 1, 1, 8)},
+        ),
+    ],
+)
+def test_what_has_no_counterpart_is_refused_with_its_place_and_reason(
+    dialect: str, layer: str, shapes: dict[str, Shape], net_of: Callable[..., Net]
+) -> None:
+    use_dialect(dialect)
+    net = net_of(net_text(layer, shapes))
+    for target, write in (("ONNX", onnx_model), ("PyTorch", torch_module)):
+        with pytest.raises(
+            SpecError, match=rf'^net.prototxt:\d+:1: layer "it" \(\w+\): cannot be exported to {target}: '
+        ):
+            write(net)
+
+
+def detections(
+    net_of: Callable[..., Net], settings: str, images: int, priors: int, kinds: int
+) -> tuple[Net, dict[str, np.ndarray]]:
+    """Return a net of one DetectionOutput over 3 classes, and predictions that overlap, some scores being equal."""
+    use_dialect("ssd")
+    shapes = {"loc": (images, 4 * priors * kinds), "conf": (images, 3 * priors), "prior": (1, 2, 4 * priors)}
+    net = net_of(net_text(f"type: 'DetectionOutput' detection_output_param {{ num_classes: 3 {settings} }}", shapes))
+    rng = np.random.default_rng(3)
+    low = rng.uniform(0, 0.7, (priors, 2))
+    boxes = np.concatenate([low, low + rng.uniform(0.1, 0.3, (priors, 2))], axis=1)
+    prior = np.stack([boxes, np.full((priors, 4), 0.1)]).reshape(shapes["prior"])
+    scores = rng.integers(0, 40, shapes["conf"]) / 40
+    given = {"loc": rng.standard_normal(shapes["loc"]) / 3, "conf": scores, "prior": prior}
+    return net, {name: values.astype(np.float32) for name, values in given.items()}
+
+
+DETECTIONS = {
+    "as SSD": "nms_param { nms_threshold: 0.45 top_k: 30 } keep_top_k: 20 confidence_threshold: 0.1 "
+    "code_type: CENTER_SIZE",
+    "everything": "nms_param { nms_threshold: 0.5 } code_type: CENTER_SIZE",
+    "most": "nms_param { nms_threshold: 0.5 } code_type: CENTER_SIZE confidence_threshold: 0.01",
+    "few": "nms_param { nms_threshold: 0.3 top_k: 5 } keep_top_k: 3 code_type: CENTER_SIZE background_label_id: 2",
+    "all classes": "nms_param { nms_threshold: 0.3 } keep_top_k: 9 code_type: CENTER_SIZE background_label_id: -1",
+    "nothing": "nms_param { nms_threshold: 0.3 } confidence_threshold: 2 keep_top_k: 5 code_type: CENTER_SIZE",
+    "encoded": "nms_param { nms_threshold: 0.3 } variance_encoded_in_target: true code_type: CENTER_SIZE",
+    "corners": "nms_param { nms_threshold: 0.4 } code_type: CORNER confidence_threshold: 0.2",
+    "corners and size": "nms_param { nms_threshold: 0.4 } code_type: CORNER_SIZE keep_top_k: 12",
+    "own boxes": "share_location: false nms_param { nms_threshold: 0.4 top_k: 20 } keep_top_k: 12 "
+    "code_type: CENTER_SIZE confidence_threshold: 0.05",
+}
+
+
+@pytest.mark.parametrize("images", [1, 2])
+@pytest.mark.parametrize("name", DETECTIONS)
+def test_detections_are_the_same(name: str, images: int, net_of: Callable[..., Net]) -> None:
+    settings = DETECTIONS[name]
+    net, inputs = detections(net_of, settings, images, 60, 3 if "false" in settings else 1)
+    expected = here(net, inputs)
+    assert (expected["top0"].shape[2] > images) == (name != "nothing")
+    model, _ = onnx_model(net)
+    assert_same(in_onnxruntime(model, inputs), expected)
+    if OPENCV_5 and "confidence_threshold" in settings:  # its suppression takes no threshold below 0
+        assert_same(in_opencv(model, inputs), expected)
+    if "CENTER_SIZE" in settings and "false" not in settings:
+        assert_same(run_module(torch_module(net), net, inputs), expected)
+
+
+def test_an_adaptive_threshold_is_refused(net_of: Callable[..., Net]) -> None:
+    net, _ = detections(net_of, "nms_param { nms_threshold: 0.6 eta: 0.9 }", 1, 4, 1)
+    with pytest.raises(SpecError, match=r"cannot be exported to ONNX: .*eta must be 1"):
+        onnx_model(net)

@@ -1,0 +1,168 @@
+"""PyTorch source: the same numbers without this project, formatted, and taken by torch.export and torch.compile."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import netspec
+from exported import assert_same, golden_net, here, other_inputs, random_inputs, run_module, trained
+from netspec.export.shapes import settled
+from netspec.export.torch import export_pt2, export_torch, torch_module, torch_source
+from netspec.export.torch_code import write_program
+from netspec.net.net import Net
+from paths import GOLDEN, ROOT
+
+CASES = sorted((GOLDEN / "layers").iterdir())
+REFUSED = {
+    "accuracy_topk_perclass": "without the accuracy of each class",
+    "infogain": "matrix of weights",
+}
+
+
+def formatted(text: str) -> bool:
+    ruff = shutil.which("ruff") or str(Path(sys.executable).with_name("ruff"))
+    command = [ruff, "format", "--isolated", "--check", "--stdin-filename", "net.py", "-"]
+    return subprocess.run(command, input=text, text=True, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
+def test_golden_layer_computes_the_same(case: Path) -> None:
+    net, inputs = golden_net(case)
+    if case.name in REFUSED:
+        with pytest.raises(netspec.SpecError, match=REFUSED[case.name]):
+            torch_source(net)
+        return
+    module = torch_module(net)
+    assert_same(run_module(module, net, inputs), here(net, inputs))
+    assert formatted(torch_source(net)[0])
+    inputs = other_inputs(net, settled(net, lambda shapes: write_program(net, shapes))[1], inputs)
+    again, _ = golden_net(case)  # a recurrent net remembers what it saw
+    assert_same(run_module(module, net, inputs), here(again, inputs))
+
+
+def test_the_module_runs_without_this_project(tmp_path: Path) -> None:
+    net = trained(netspec.load_net(ROOT / "prototxt" / "small" / "siamese_resnet27_256" / "deploy.prototxt", seed=0))
+    inputs = random_inputs(net)
+    export_torch(net, tmp_path / "net.py", "deploy.prototxt")
+    np.save(tmp_path / "data.npy", inputs["data"])
+    program = (
+        "import sys, numpy, torch, net\n"
+        "assert not any(name.startswith('netspec') for name in sys.modules)\n"
+        "with torch.no_grad():\n"
+        "    found = net.load()(torch.from_numpy(numpy.load('data.npy')))\n"
+        "numpy.save('found.npy', found.numpy())\n"
+    )
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
+    subprocess.run([sys.executable, "net.py"], cwd=tmp_path, check=True, capture_output=True)
+    assert_same({net.outputs[0]: np.load(tmp_path / "found.npy")}, here(net, inputs))
+
+
+SMALL = """name: "Small"
+layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 dim: 12 dim: 12 } } }
+layer { name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
+  convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "xavier" } } }
+layer { name: "bn1" type: "BatchNorm" bottom: "conv1" top: "conv1" }
+layer { name: "scale1" type: "Scale" bottom: "conv1" top: "conv1" scale_param { bias_term: true } }
+layer { name: "relu1" type: "ReLU" bottom: "conv1" top: "conv1" }
+layer { name: "pool1" type: "Pooling" bottom: "conv1" top: "pool1" pooling_param { kernel_size: 3 stride: 2 } }
+layer { name: "drop1" type: "Dropout" bottom: "pool1" top: "pool1" }
+layer { name: "pool2" type: "Pooling" bottom: "pool1" top: "pool2"
+  pooling_param { pool: AVE global_pooling: true } }
+layer { name: "fc/3" type: "InnerProduct" bottom: "pool2" top: "fc"
+  inner_product_param { num_output: 5 weight_filler { type: "xavier" } } }
+layer { name: "prob" type: "Softmax" bottom: "fc" top: "prob" }
+"""
+
+
+def test_reads_as_a_person_would_have_written_it(net_of: Callable[..., Net]) -> None:
+    text, state, _ = torch_source(trained(net_of(SMALL)), "small.prototxt")
+    assert text == (Path(__file__).parent / "small.txt").read_text()
+    assert list(state)[:3] == ["conv1.weight", "conv1.bias", "bn1.running_mean"]
+
+
+REPEATED = SMALL + "".join(
+    f"""
+layer {{ name: "b{k}/a" type: "Convolution" bottom: "{"pool1" if k == 0 else f"sum{k - 1}"}" top: "b{k}/a"
+  convolution_param {{ num_output: {6 + k // 3} kernel_size: 1 weight_filler {{ type: "xavier" }} }} }}
+layer {{ name: "b{k}/relu" type: "ReLU" bottom: "b{k}/a" top: "b{k}/a" }}
+layer {{ name: "b{k}/b" type: "Convolution" bottom: "b{k}/a" top: "b{k}/b"
+  convolution_param {{ num_output: 4 kernel_size: 1 weight_filler {{ type: "xavier" }} }} }}
+layer {{ name: "b{k}/sum" type: "Eltwise" bottom: "{"pool1" if k == 0 else f"sum{k - 1}"}" bottom: "b{k}/b"
+  top: "sum{k}" }}
+"""
+    for k in range(5)
+)
+
+
+def test_what_repeats_is_a_class(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(REPEATED))
+    text, state, _ = torch_source(net)
+    assert "self.sum0_to_sum2 = nn.Sequential(*(SumBlock(6) for _ in range(3)))" in text
+    assert "self.sum3 = SumBlock(7)" in text
+    assert "sum0_to_sum2.1.a.weight" in state
+    assert text.count("nn.Conv2d(") == 3
+    assert formatted(text)
+    assert_same(run_module(torch_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+
+
+TOWERS = """name: "Towers"
+layer { name: "data" type: "Input" top: "data" top: "other" input_param { shape { dim: 2 dim: 6 } } }
+""" + "".join(
+    f"""layer {{ name: "{layer}{end}" type: "InnerProduct" bottom: "{bottom}" top: "{layer}{end}"
+  param {{ name: "{layer}_w" }} param {{ name: "{layer}_b" }}
+  inner_product_param {{ num_output: 6 weight_filler {{ type: "xavier" }} }} }}
+layer {{ name: "relu_{layer}{end}" type: "ReLU" bottom: "{layer}{end}" top: "{layer}{end}" }}
+"""
+    for end, first in (("", "data"), ("_p", "other"))
+    for layer, bottom in (("ip1", first), ("ip2", f"ip1{end}"), ("ip3", f"ip2{end}"), ("ip4", f"ip3{end}"))
+)
+
+
+def test_towers_that_share_weights_are_one_module(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(TOWERS))
+    text, state, _ = torch_source(net)
+    assert len(state) == 8
+    assert text.count("self.ip2(") == 2  # for one tower and for the other
+    assert_same(run_module(torch_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+
+
+def test_a_deconvolution_longer_than_the_map(net_of: Callable[..., Net]) -> None:
+    text = """layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 2 dim: 3 dim: 4 } } }
+    layer { name: "up" type: "Deconvolution" bottom: "data" top: "up"
+      convolution_param { num_output: 2 kernel_size: 5 stride: 2 } }"""
+    net = trained(net_of(text))
+    assert_same(run_module(torch_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+
+
+def test_names_that_python_does_not_take(net_of: Callable[..., Net]) -> None:
+    text = """name: "1x1 net" layer { name: "in" type: "Input" top: "in" input_param { shape { dim: 2 dim: 3 } } }
+    layer { name: "class" type: "InnerProduct" bottom: "in" top: "self" inner_product_param { num_output: 2 } }
+    layer { name: "forward" type: "InnerProduct" bottom: "self" top: "print" inner_product_param { num_output: 2 } }
+    layer { name: "1/x" type: "InnerProduct" bottom: "in" top: "2/x" inner_product_param { num_output: 2 } }"""
+    net = trained(net_of(text))
+    assert_same(run_module(torch_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+
+
+def test_torch_export_takes_it_with_a_free_batch_and_size(net_of: Callable[..., Net], tmp_path: Path) -> None:
+    net = trained(net_of(SMALL))
+    assert export_pt2(net, tmp_path / "small.pt2") == []
+    program = torch.export.load(tmp_path / "small.pt2").module()
+    inputs = {"data": np.random.default_rng(0).standard_normal((3, 3, 20, 17)).astype(np.float32)}
+    assert_same(run_module(program, net, inputs), here(net, inputs))
+
+
+@pytest.mark.parametrize("backend", ["eager", "aot_eager", "inductor"])
+def test_torch_compile_takes_it(backend: str, net_of: Callable[..., Net]) -> None:
+    if backend == "inductor" and not (shutil.which("g++") or os.environ.get("CXX")):
+        pytest.skip("no C++ compiler")
+    net = trained(net_of(SMALL))
+    compiled: Any = torch.compile(torch_module(net), backend=backend, fullgraph=True)
+    assert_same(run_module(compiled, net, random_inputs(net)), here(net, random_inputs(net)))
