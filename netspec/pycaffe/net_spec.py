@@ -59,14 +59,13 @@ class Function:
         layer.top.extend(layer.bottom if self.in_place else [name_of(top) for top in self.tops])
         layer.name = name_of(self.tops[0] if self.tops else self)
         own = _own_message(layer, self.type_name)
+        own_fields = layer.DESCRIPTOR.fields_by_name[own].message_type.fields_by_name if own else ()
         for name, value in self.params.items():
-            if (
-                not name.endswith("param")
-                and own
-                and name in layer.DESCRIPTOR.fields_by_name[own].message_type.fields_by_name
-            ):
+            # As in Caffe, a field of both goes to the layer's own message, unless it is a message itself.
+            in_layer = name in layer.DESCRIPTOR.fields_by_name
+            if name in own_fields and not (in_layer and name.endswith("param")):
                 assign_proto(getattr(layer, own), name, value)
-            elif name in layer.DESCRIPTOR.fields_by_name:
+            elif in_layer:
                 assign_proto(layer, name, value)
             else:
                 raise AttributeError(self._unknown(layer, own, name))

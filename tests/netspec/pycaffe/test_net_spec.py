@@ -177,3 +177,5 @@ def test_a_dialects_layers_and_constants(leave_no_dialect: None) -> None:
     assert top.to_proto().layer[1].permute_param.order == [0, 2, 3, 1]
     assert P.PriorBox.CENTER_SIZE == 2
     assert L.Normalize(top, norm_param={"eps": 1}).to_proto().layer[2].norm_param.eps == 1
+    found = L.DetectionOutput(top, top, top, nms_param={"top_k": 4}).to_proto().layer[-1]
+    assert found.detection_output_param.nms_param.top_k == 4
