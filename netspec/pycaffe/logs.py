@@ -8,9 +8,7 @@ import sys
 from typing import Any
 
 from netspec import log
-
-VARIABLE = "GLOG_minloglevel"
-_LEVELS = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
+from netspec.command_line import SEVERITIES, VARIABLE
 
 
 class _Stderr(logging.StreamHandler[Any]):
@@ -36,6 +34,13 @@ def start() -> None:
     _set_level(os.environ.get(VARIABLE, "0"))
 
 
+def stop() -> None:
+    """Leave the log to the program's own handlers of the logger "netspec"."""
+    log.logger.removeHandler(_handler)
+    log.logger.propagate = True
+    log.logger.setLevel(logging.NOTSET)
+
+
 def init_log(level: int | None = None, stderr: bool = True) -> None:
     """Show the log from ``level`` on: 0 (INFO) to 3 (FATAL)."""
     if level is not None:
@@ -52,6 +57,6 @@ def _set_level(level: int | str) -> None:
         number = int(level)
     except ValueError:
         number = 0
-    chosen = _LEVELS[min(max(number, 0), 3)]
+    chosen = SEVERITIES[min(max(number, 0), 3)]
     _handler.setLevel(chosen)
     log.logger.setLevel(chosen)

@@ -1,21 +1,14 @@
 """How tests of pycaffe make nets: from text, in a folder of their own, which is the working directory."""
 
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import netspec.pycaffe as caffe
+from netspec.pycaffe import logs
 
-
-@pytest.fixture(autouse=True)
-def quiet() -> Iterator[None]:
-    """Leave Caffe's log to pytest."""
-    logger = logging.getLogger("netspec")
-    handlers, logger.handlers, logger.propagate = logger.handlers, [], True
-    yield
-    logger.handlers, logger.propagate = handlers, False
+logs.stop()  # pytest keeps it
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ def test_blobs_hold_what_caffes_held(folder: Path) -> None:
     assert set(found) == {key for key in case.golden if key.split("/")[0] not in ("in", "param_init", "topdiff")}
     for key, value in found.items():
         expected = case.golden[key]
-        assert value.shape == expected.shape, key
+        assert (value.shape, value.dtype) == (expected.shape, np.float32), key
         scale = max(float(np.abs(expected).max(initial=0)), 1e-30)
         worst = float(np.abs(value.astype(np.float64) - expected).max(initial=0)) / scale
         assert worst <= TOLERANCE, f"{key}: off by {worst:.2e} of the largest element"

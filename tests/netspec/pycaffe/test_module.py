@@ -141,3 +141,10 @@ def test_two_processes_train_one_net(write: Callable[..., str], tmp_path: Path) 
     outputs = [process.communicate(timeout=120) for process in running]
     assert [process.returncode for process in running] == [0, 0], outputs
     assert outputs[0][0] == outputs[1][0] != ""
+
+
+@pytest.mark.slow
+def test_a_program_may_take_the_log_over(tmp_path: Path) -> None:
+    code = "import logging, netspec.pycaffe as caffe\ncaffe.logs.stop()\n"
+    code += "logging.basicConfig(level='INFO', format='own %(message)s')\ncaffe.log('hello')"
+    assert script(code, tmp_path).stderr == "own hello\n"
