@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from netspec.net.build import build_net
 from netspec.net.options import BuildOptions
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
+from netspec.solver.solver import load_solver
 
 Build = Callable[..., Layer]
 Gradcheck = Callable[..., None]
@@ -364,3 +366,13 @@ def test_a_small_detector_learns_where_two_squares_are() -> None:
         best = max(out[out[:, 0] == i], key=lambda found: float(found[2]))
         assert best[1] == row[1]
         assert overlap(tuple(best[3:].tolist()), tuple(row[3:7].tolist())) > 0.7
+
+
+def test_what_the_solver_of_ssd_has_more_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    use_dialect("ssd")
+    (tmp_path / "solver.prototxt").write_text(
+        'net_param { layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } } }\n'
+        'base_lr: 1 lr_policy: "fixed" eval_type: "detection"'
+    )
+    load_solver(tmp_path / "solver.prototxt")
+    assert "solver.prototxt:2:31: eval_type has no effect: it is a fork's" in caplog.text
