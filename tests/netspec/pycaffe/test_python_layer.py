@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -202,7 +203,7 @@ def test_param_str(python_net: Callable[..., caffe.Net]) -> None:
     assert (net.blobs["data"].diff == 140).all()
 
 
-def test_the_script_reaches_the_layers_own_object(python_net: Callable[..., caffe.Net]) -> None:
+def test_the_script_reaches_the_layers_own_object(python_net: Callable[..., Any]) -> None:
     text = 'layer { type: "Python" name: "rows" top: "row" top: "label" python_param { module: "mine" layer: "Rows" } }'
     net = python_net(text)
     assert net.blobs["label"].data == [7]  # written in setup
@@ -239,7 +240,7 @@ def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net], 
     nets = [python_net(text, caffe.TRAIN) for text in (own, caffes)]
     nets[1].share_with(nets[0])
     random = np.random.default_rng(0)
-    arrays = {"data": random.random((6, 5)), "wanted": random.random((6, 3))}
+    arrays: dict[str, Any] = {"data": random.random((6, 5)), "wanted": random.random((6, 3))}
     losses = [net.forward(**arrays)["loss"].reshape(()) for net in nets]
     assert losses[0] == pytest.approx(losses[1], rel=1e-6)
     for net in nets:
