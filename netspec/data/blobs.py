@@ -18,6 +18,11 @@ Shape = tuple[int, ...]
 LEGACY_AXES = ("num", "channels", "height", "width")
 _DATA, _DIFF = ("data", "double_data"), ("diff", "double_diff")
 
+# NVIDIA Caffe's BlobProto, which DIGITS 6 and OpenCV's half-precision tools write too: `raw_data_type`, an enum, and
+# `raw_data`, little-endian bytes beside the shape and instead of `data`.
+_RAW_TYPE, _RAW_DATA = ("raw_data_type", 10), ("raw_data", 12)
+_RAW_DTYPES = ("<f8", "<f4", "<f2", "<i4", "<u4")  # DOUBLE, FLOAT, FLOAT16, INT, UINT
+
 
 def shape_of(proto: Any) -> Shape:
     """Return the shape: ``shape``, or the four old fields num, channels, height, width where any of them is given."""
@@ -44,7 +49,8 @@ def fits(proto: Any, shape: Sequence[int]) -> bool:
 def to_array(proto: Any) -> np.ndarray:
     """Return the values in the blob's shape: float32, or float64 where the blob holds doubles. The array is read-only.
 
-    Raises ValueError where there are not as many values as the shape says.
+    Where the blob has neither data nor double_data, the numbers in its raw_data are returned: half precision and
+    integers as float32. Raises ValueError where there are not as many values as the shape says.
     """
     return _values(proto, _DATA)
 
@@ -69,11 +75,30 @@ def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
 def _values(proto: Any, names: tuple[str, str]) -> np.ndarray:
     single, double = names
     name, dtype = (double, "<f8") if len(getattr(proto, double)) else (single, "<f4")
-    values = np.frombuffer(getattr(_Runs.FromString(proto.SerializeToString()), name), dtype)
+    runs = _Runs.FromString(proto.SerializeToString())
+    values = np.frombuffer(getattr(runs, name), dtype)
     shape = shape_of(proto)
-    if len(values) != math.prod(shape):
-        raise ValueError(f"found {len(values)} numbers in {name}, expected {math.prod(shape)} for shape {shape}")
+    count = math.prod(shape)
+    if len(values) != count and not len(values) and names == _DATA and runs.raw_data:
+        return _raw_values(runs, count).reshape(shape)
+    if len(values) != count:
+        raise ValueError(f"found {len(values)} numbers in {name}, expected {count} for shape {shape}")
     return values.reshape(shape)
+
+
+def _raw_values(runs: Any, count: int) -> np.ndarray:
+    """Return the ``count`` numbers of raw_data; raises ValueError where its bytes are not as many."""
+    kind, size = runs.raw_data_type, len(runs.raw_data)
+    if not 0 <= kind < len(_RAW_DTYPES):
+        raise ValueError(f"found no data, and raw_data_type {kind}, expected 0 to {len(_RAW_DTYPES) - 1}")
+    dtype = np.dtype(_RAW_DTYPES[kind])
+    if size != count * dtype.itemsize:
+        expected = f"expected {count * dtype.itemsize}, {count} numbers of {dtype.name}"
+        raise ValueError(f"found no data, and {size} bytes of raw_data; {expected}")
+    values = np.frombuffer(runs.raw_data, dtype)
+    values = values if dtype.itemsize == 8 else values.astype("<f4")
+    values.flags.writeable = False
+    return values
 
 
 def _runs_message() -> Any:
@@ -84,10 +109,13 @@ def _runs_message() -> Any:
     """
     file = descriptor_pb2.FileDescriptorProto(name="netspec/blob_runs.proto", package="netspec")
     message = file.message_type.add(name="BlobRuns")
+    field = descriptor_pb2.FieldDescriptorProto
     for name in _DATA + _DIFF:
         number = BlobProto.DESCRIPTOR.fields_by_name[name].number
-        field = descriptor_pb2.FieldDescriptorProto
         message.field.add(name=name, number=number, type=field.TYPE_BYTES, label=field.LABEL_OPTIONAL)
+    kinds = ((*_RAW_TYPE, field.TYPE_INT32), (*_RAW_DATA, field.TYPE_BYTES))
+    for name, number, kind in kinds:
+        message.field.add(name=name, number=number, type=kind, label=field.LABEL_OPTIONAL)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("netspec.BlobRuns"))

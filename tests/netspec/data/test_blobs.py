@@ -72,3 +72,51 @@ def test_too_few_numbers_for_the_shape_are_refused():
     proto = BlobProto(shape=BlobShape(dim=[2, 2]), data=[1, 2, 3])
     with pytest.raises(ValueError, match=r"found 3 numbers in data, expected 4 for shape \(2, 2\)"):
         blobs.to_array(proto)
+
+
+def with_raw(proto: BlobProto, kind: int | None, raw: bytes) -> BlobProto:
+    """Append raw_data_type (field 10, a varint) and raw_data (field 12, bytes of fewer than 128) on the wire."""
+    number = b"" if kind is None else bytes([10 << 3, kind])
+    return BlobProto.FromString(proto.SerializeToString() + number + bytes([12 << 3 | 2, len(raw)]) + raw)
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype", "found"),
+    [
+        (0, "<f8", np.float64),
+        (None, "<f8", np.float64),
+        (1, "<f4", np.float32),
+        (2, "<f2", np.float32),
+        (3, "<i4", np.float32),
+        (4, "<u4", np.float32),
+    ],
+)
+def test_numbers_of_raw_data_are_read(kind: int | None, dtype: str, found: type):
+    values = np.array([[1, 2, 3], [4, 500, 6]], dtype)
+    proto = with_raw(BlobProto(shape=BlobShape(dim=[2, 3])), kind, values.tobytes())
+    np.testing.assert_array_equal(blobs.to_array(proto), values)
+    assert blobs.to_array(proto).dtype == found
+    assert blobs.diff_to_array(proto) is None
+
+
+def test_half_precision_keeps_its_fractions_and_signs():
+    values = np.array([-0.1, 65504, 6e-8, -0.0], "<f2")
+    proto = with_raw(BlobProto(num=1, channels=1, height=1, width=4), 2, values.tobytes())
+    np.testing.assert_array_equal(blobs.to_array(proto)[0, 0, 0], values.astype(np.float32))
+
+
+def test_data_wins_over_what_another_fork_keeps_under_the_numbers_of_raw_data():
+    data = BlobProto(shape=BlobShape(dim=[2]), data=[1, 2])
+    np.testing.assert_array_equal(blobs.to_array(with_raw(data, 1, np.array([7, 8], "<f4").tobytes())), [1, 2])
+    number_12_is_a_varint = data.SerializeToString() + bytes([10 << 3 | 2, 1, 65, 12 << 3, 9])
+    np.testing.assert_array_equal(blobs.to_array(BlobProto.FromString(number_12_is_a_varint)), [1, 2])
+
+
+def test_raw_data_that_does_not_fit_is_refused():
+    empty = BlobProto(shape=BlobShape(dim=[3]))
+    with pytest.raises(ValueError, match="found no data, and 4 bytes of raw_data; expected 6, 3 numbers of float16"):
+        blobs.to_array(with_raw(empty, 2, b"abcd"))
+    with pytest.raises(ValueError, match="raw_data_type 9, expected 0 to 4"):
+        blobs.to_array(with_raw(empty, 9, b"abcd"))
+    with pytest.raises(ValueError, match="found 0 numbers in data, expected 3"):
+        blobs.to_array(empty)
