@@ -47,6 +47,7 @@ class _Manner:
     shapes: Mapping[str, Shape]
     open_data: bool
     allow_python: bool
+    strict: bool
 
 
 def check_file(
@@ -58,14 +59,15 @@ def check_file(
     open_data: bool = False,
     weights: str | None = None,
     allow_python: bool = False,
+    strict: bool = False,
 ) -> list[Checked]:
     """Check a net for a phase, level and stages, or a solver, whose training net gets these, and all its nets.
 
     ``shapes`` are those of data layers' tops; the data of the others is opened with ``open_data``. ``weights``, paths
-    separated by commas, are what a training would begin with, in the place of a solver's own. Raises SpecError where
-    the file itself cannot be read.
+    separated by commas, are what a training would begin with, in the place of a solver's own; with ``strict`` they
+    must have every layer. Raises SpecError where the file itself cannot be read.
     """
-    manner = _Manner(shapes or {}, open_data, allow_python)
+    manner = _Manner(shapes or {}, open_data, allow_python, strict)
     given = [weights] if weights else []
     try:
         net, source = parse_net(path)
@@ -100,8 +102,8 @@ def _check_net(
         allow_python=manner.allow_python,
     )
     built = build_net(net, source, options)
-    for path in (path.strip() for paths in weights for path in paths.split(",")):
-        load_weights(built, path, report=faults.append)
+    if files := [path.strip() for paths in weights for path in paths.split(",")]:
+        load_weights(built, files, manner.strict, report=faults.append)
     advice = [*missing_data(net, built.param, source), *(() if faults else net_advice(built))]
     return Checked(label, built, faults, advice)
 

@@ -20,6 +20,11 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_strict(parser: argparse.ArgumentParser) -> None:
+    """Add ``--strict``."""
+    parser.add_argument("--strict", action="store_true", help="refuse weights that lack a layer of the net")
+
+
 def add_exact(parser: argparse.ArgumentParser) -> None:
     """Add ``--exact``."""
     parser.add_argument(
@@ -121,9 +126,14 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
     )
 
 
-def load_weights(net: Any, paths: str | None) -> None:
-    """Load weights from one file after the other; their paths are separated by commas."""
+def load_weights(net: Any, paths: str | None, strict: bool) -> None:
+    """Load weights from one file after the other; their paths are separated by commas. Something must fit."""
     from netspec.net import weights
 
-    for path in paths.split(",") if paths else ():
-        weights.load_weights(net, path.strip())
+    if paths:
+        weights.load_weights(net, split_paths(paths), strict, some=True)
+
+
+def split_paths(paths: str) -> list[str]:
+    """Return the paths of ``--weights``, which commas separate."""
+    return [path.strip() for path in paths.split(",")]

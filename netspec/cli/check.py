@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from netspec.cli.arguments import add_python, add_state, shape, stages
+from netspec.cli.arguments import add_python, add_state, add_strict, shape, stages
 from netspec.cli.run import Commands
 from netspec.proto.schema import PHASES
 
@@ -29,6 +29,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
     p.add_argument("--weights", help="weights that must fit, several separated by commas")
     p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")
+    add_strict(p)
     add_python(p)
 
 
@@ -44,6 +45,7 @@ def _check(arguments: argparse.Namespace) -> int:
         shapes=dict(arguments.shape),
         open_data=arguments.data,
         weights=arguments.weights,
+        strict=arguments.strict,
         allow_python=arguments.allow_python_layers,
     )
     for line in dict.fromkeys(line for part in checked for line in part.advice):

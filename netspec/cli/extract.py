@@ -13,11 +13,13 @@ from netspec.cli.arguments import (
     add_exact,
     add_python,
     add_state,
+    add_strict,
     bar,
     device,
     load_weights,
     positive,
     shape,
+    split_paths,
     stages,
 )
 from netspec.cli.run import Commands
@@ -53,6 +55,7 @@ def add_to(commands: Commands) -> None:
     add_state(p, phase="TEST")
     add_python(p)
     add_exact(p)
+    add_strict(p)
 
 
 def _extract(arguments: argparse.Namespace) -> None:
@@ -78,11 +81,13 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.shape and arguments.shape[0] != arguments.input:
         raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
     images = list_images(arguments.images)
-    weights = [path.strip() for path in arguments.weights.split(",")] if arguments.weights else []
+    weights = split_paths(arguments.weights) if arguments.weights else []
     given = arguments.shape[1] if arguments.shape else None
     (blob,) = arguments.blob
     zooms, chosen = arguments.zooms or (1.0,), device(arguments.gpu)
-    net = ImageNet(arguments.model, weights, blob, arguments.input, chosen, given, zooms, arguments.exact)
+    net = ImageNet(
+        arguments.model, weights, blob, arguments.input, chosen, given, zooms, arguments.exact, arguments.strict
+    )
     size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "BGR"
     print(f"{arguments.model}: {blob} of {len(images.paths)} images from {arguments.images}")
     print(f"{arguments.input} ({size}): {kind}, {net.scaling}")
@@ -104,7 +109,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     python, exact = arguments.allow_python_layers, arguments.exact
     options = BuildOptions(device(arguments.gpu), allow_python=python, exact=exact)
     net = build_net(stated, source, options)
-    load_weights(net, arguments.weights)
+    load_weights(net, arguments.weights, arguments.strict)
     arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))
     net.close()
     print(f"{arguments.model}: {', '.join(arguments.blob)} of {len(arrays['keys'])} records")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from netspec.cli.arguments import add_device, add_exact, add_python, add_state, load, load_weights, positive
+from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, load, load_weights, positive
 from netspec.cli.run import Commands
 from netspec.scores import Score, Scores
 
@@ -20,6 +20,7 @@ def add_to(commands: Commands) -> None:
     add_state(p, phase=None)
     add_python(p)
     add_exact(p)
+    add_strict(p)
 
     p = commands.add("time", _time, "measure a model's forward and backward milliseconds a layer (caffe time)")
     p.add_argument("--model", required=True, help="the net's prototxt")
@@ -34,7 +35,7 @@ def _test(arguments: argparse.Namespace) -> None:
     from netspec.check.measure import test_net
 
     net = load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
-    load_weights(net, arguments.weights)
+    load_weights(net, arguments.weights, arguments.strict)
     means = test_net(net, arguments.iterations)
     net.close()
     if arguments.scores:

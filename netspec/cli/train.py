@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec import log
-from netspec.cli.arguments import add_device, add_exact, add_python, add_state, devices
+from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, devices
 from netspec.cli.run import Commands, signals
 from netspec.command_line import WrongUsage
 from netspec.scores import Score, Scores, Snapshot, read_scores
@@ -36,6 +36,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="default: snapshot")
     add_python(p)
     add_exact(p)
+    add_strict(p)
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -60,6 +61,7 @@ def _train(arguments: argparse.Namespace) -> None:
             allow_python=arguments.allow_python_layers,
             action=action,
             exact=arguments.exact,
+            strict=arguments.strict,
         )
         if arguments.scores:
             _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))

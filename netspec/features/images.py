@@ -58,8 +58,9 @@ class ImageNet:
     """The part of a net that computes ``blob`` from images in ``input_blob``, and what its data layer does to pixels.
 
     The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
-    None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning.
-    Raises SpecError for faults of the files; warns where the weights were trained on other pixels.
+    None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning;
+    something in them must fit, and with ``strict`` every layer must be there. Raises SpecError for faults of the files;
+    warns where the weights were trained on other pixels.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class ImageNet:
         shape: Shape | None = None,
         zooms: Sequence[float] = (1.0,),
         exact: str = SMALL,
+        strict: bool = False,
     ) -> None:
         net, source = parse_net(model)
         net, source = filter_net(with_state(net, TEST), source)
@@ -89,8 +91,9 @@ class ImageNet:
         options = BuildOptions(device or torch.device("cpu"), seed=0, exact=exact)
         self.net = build_filtered(after, after_source, options)
         self.net.keep = [blob]
+        if weights:
+            load_weights(self.net, weights, strict, some=True)
         for path in weights:
-            load_weights(self.net, path)
             if not transforming:
                 readers = [layer.name for layer in after.layer if input_blob in layer.bottom]
                 _warn_of_other_pixels(path, model, readers)

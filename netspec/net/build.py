@@ -34,9 +34,11 @@ def load_net(
     seed: int | None = None,
     allow_python: bool = False,
     exact: str = SMALL,
+    strict: bool = False,
 ) -> Net:
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
 
+    A warning names the layers that the weights lack; with ``strict`` that is an error.
     ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
     Raises SpecError for every fault of the files.
     """
@@ -45,7 +47,7 @@ def load_net(
     options = BuildOptions(torch.device(device), seed, allow_python=allow_python, exact=exact)
     built = build_net(with_state(net, number, level, stages), source, options)
     if weights is not None:
-        load_weights(built, weights)
+        load_weights(built, weights, strict)
     return built
 
 

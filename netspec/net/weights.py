@@ -5,7 +5,7 @@ Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,46 +18,96 @@ from netspec import log
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
 from netspec.graph import Report, raise_fault
-from netspec.layers.base import shape_string
+from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import NetParameter
 from netspec.whole_file import whole_file
 
-Copies = list[tuple[torch.Tensor, np.ndarray]]
+MOST_NAMES = 20  # layers that a warning names
+Copies = list[tuple[Layer, int, np.ndarray]]  # the layer, the blob's number in it, the values
 
 
-def load_weights(net: Net, path: str | Path, *, report: Report = raise_fault) -> None:
+def load_weights(
+    net: Net,
+    path: str | Path | Iterable[str | Path],
+    strict: bool = False,
+    *,
+    some: bool = False,
+    report: Report = raise_fault,
+) -> None:
     """Copy the weights of a .caffemodel or .caffemodel.h5 into the layers of the same names, all or none.
 
-    Layers that only the file has are ignored, and named in the log; layers that only the net has stay as they are.
-    ``report`` gets a SpecError for a file that cannot be read, and for blobs of other number or shape than the net's.
+    Of several files each is loaded in turn, the last one winning. Layers that only a file has are ignored, and named
+    in the log. One warning names the layers that no file has, which stay as they were filled; with ``strict`` that is a
+    SpecError, and with ``some`` it is one where nothing fits. ``report`` gets the SpecErrors: those, and those for a
+    file that cannot be read, and for blobs of other number or shape than the net's.
     """
-    path = Path(path)
-    try:
-        if h5py.is_hdf5(path):
-            _copy(partial(_from_hdf5, net, path), report)
-        else:
-            copy_weights(net, read_net_binary(path), path, report)
-    except SpecError as fault:
-        report(fault)
+    paths = [Path(path)] if isinstance(path, (str, Path)) else [Path(each) for each in path]
+    loaded: set[int] = set()
+    whole = True
+    for each in paths:
+        faults: list[SpecError] = []
+        try:
+            if h5py.is_hdf5(each):
+                loaded |= _copy(partial(_from_hdf5, net, each), faults.append)
+            else:
+                loaded |= _copy(partial(_from_message, net, read_net_binary(each), each), faults.append)
+        except SpecError as fault:
+            faults.append(fault)
+        for fault in faults:
+            report(fault)
+        whole = whole and not faults
+    if whole:
+        _tell_missing(net, loaded, paths, strict, some, report)
 
 
 def copy_weights(net: Net, message: NetParameter, path: str | Path, report: Report = raise_fault) -> None:
-    """Copy the weights in a message, read from ``path``, as :func:`load_weights` copies a file's."""
+    """Copy the weights in a message, read from ``path``, into the layers of the same names, all or none.
+
+    Layers that only one side has are left alone. ``report`` gets a SpecError as in :func:`load_weights`.
+    """
     _copy(partial(_from_message, net, message, Path(path)), report)
 
 
-def _copy(find: Callable[[Report], Copies], report: Report) -> None:
-    """Copy what is found where nothing is wrong with any of it; on meta there is nothing to copy to."""
+def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
+    """Copy what is found where nothing is wrong with any of it; on meta there is nothing to copy to.
+
+    Return the ids of the net's blobs that were found.
+    """
     faults: list[SpecError] = []
     copies = find(faults.append)
     for fault in faults:
         report(fault)
     with torch.no_grad():
-        for blob, values in copies if not faults else ():
+        for layer, j, values in copies if not faults else ():
+            blob = layer.blob(j)
             if not blob.is_meta:
                 blob.copy_(torch.tensor(values).view(blob.shape))
+    return {id(layer.blobs[j]) for layer, j, _ in copies}
+
+
+def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, some: bool, report: Report) -> None:
+    """Warn of the layers of which a blob was not loaded, or report them; weights in the prototxt itself count."""
+    learning = [layer for layer in net.layers if len(layer.blobs)]
+    missing = [
+        layer for layer in learning if not layer.param.blobs and any(id(blob) not in loaded for blob in layer.blobs)
+    ]
+    if not missing:
+        return
+    nothing = not any(id(blob) in loaded for layer in learning for blob in layer.blobs)
+    files = ", ".join(map(str, paths))
+    names = ", ".join(layer.param.name for layer in missing[:MOST_NAMES])
+    names += f" and {len(missing) - MOST_NAMES} more" if len(missing) > MOST_NAMES else ""
+    if nothing:
+        fault = f"holds weights for none of the net's {len(learning)} layers that have any: {names}"
+    else:
+        fault = f"lacks weights for {len(missing)} of the net's {len(learning)} layers that have any: {names}"
+    if strict or (some and nothing):
+        advice = "is it the file of another net?" if nothing else "leave strict out to keep their fillers' values"
+        report(SpecError(f"{fault}; {advice}", Where(files)))
+    else:
+        log.warning("net.cpp:746", f"{files}: {fault}; they stay as they were filled")
 
 
 def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
@@ -114,7 +164,7 @@ def _from_message(net: Net, message: Any, path: Path, report: Report) -> Copies:
                 report(_wrong_shape(path, source.name, j, blobs.shape_of(blob), target.blob_shapes[j]))
                 continue
             try:
-                copies.append((target.blob(j), blobs.to_array(blob)))
+                copies.append((target, j, blobs.to_array(blob)))
             except ValueError as fault:
                 report(SpecError(f'layer "{source.name}", blob {j}: {fault}', Where(str(path))))
     return copies
@@ -149,7 +199,7 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
                 if array.shape != target.blob_shapes[j]:
                     report(_wrong_shape(path, name, j, array.shape, target.blob_shapes[j]))
                     continue
-                copies.append((target.blob(j), array[()]))
+                copies.append((target, j, array[()]))
     return copies
 
 

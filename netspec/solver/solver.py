@@ -53,13 +53,14 @@ def load_solver(
     allow_python: bool = False,
     action: Callable[[], str | None] | None = None,
     exact: str = SMALL,
+    strict: bool = False,
 ) -> Solver:
     """Make the solver of a prototxt, its nets built and ready to step.
 
-    ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field;
-    ``snapshot`` is a .solverstate to go on from; ``level`` and ``stages`` go to the training net. Several devices train
-    side by side, the first being the root. For ``device`` and ``action`` see :class:`Solver`. Raises SpecError for
-    every fault of the files.
+    ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
+    ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
+    ``stages`` go to the training net. Several devices train side by side, the first being the root. For ``device`` and
+    ``action`` see :class:`Solver`. Raises SpecError for every fault of the files.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
@@ -78,7 +79,14 @@ def load_solver(
     else:
         log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in chosen))
     solver = Solver(
-        param, node, device=chosen[0], others=chosen[1:], allow_python=allow_python, exact=exact, action=action
+        param,
+        node,
+        device=chosen[0],
+        others=chosen[1:],
+        allow_python=allow_python,
+        exact=exact,
+        strict=strict,
+        action=action,
     )
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
@@ -122,6 +130,7 @@ class Solver:
         allow_python: bool = False,
         exact: str = SMALL,
         seed: int | None = None,
+        strict: bool = False,
         action: Callable[[], str | None] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
@@ -160,6 +169,7 @@ class Solver:
         self._device = device or choose_device(param, node)
         self._allow_python = allow_python
         self._exact = exact
+        self._strict = strict
         drawn = int.from_bytes(os.urandom(4), "little") if seed is None else seed
         self._seed = param.random_seed if param.random_seed >= 0 else drawn
 
@@ -198,10 +208,11 @@ class Solver:
             accumulate_in_place=True,
         )
         net = build_net(described.net, described.source, options)
-        for paths in self.param.weights:
-            for path in paths.split(","):
-                log.info("solver.cpp:72", f"Finetuning from {path.strip()}")
-                load_weights(net, path.strip())
+        files = [path.strip() for paths in self.param.weights for path in paths.split(",")]
+        for path in files:
+            log.info("solver.cpp:72", f"Finetuning from {path}")
+        if files:
+            load_weights(net, files, self._strict)
         return net
 
     @property

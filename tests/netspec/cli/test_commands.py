@@ -19,6 +19,7 @@ import netspec
 from netspec.layers import layer_types
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
+from netspec.proto.schema import NetParameter
 from netspec.proto.text import read_net, read_solver
 from paths import GOLDEN, ROOT
 
@@ -333,3 +334,36 @@ def test_help_is_no_fault(run: Run) -> None:
     result = run("train", "--help")
     assert result.status == 0
     assert "--sighup_effect" in result.out
+
+
+def test_weights_of_which_no_layer_fits_are_refused(run: Run) -> None:
+    other = NetParameter.FromString(Path(INIT).read_bytes())
+    for layer in other.layer:
+        layer.name += "_b"
+    Path("other.caffemodel").write_bytes(other.SerializeToString())
+    Path("images").mkdir()
+    cv2.imwrite("images/1.png", np.zeros((28, 28), np.uint8))
+    words = ("--model", NET, "--weights", "other.caffemodel")
+    extract = ("extract", *words, "--blob", "feat", "--out", "f.npz")
+    for command in (("test", *words), extract, (*extract, "--images", "images")):
+        fault = run(*command).fault
+        assert fault.startswith("other.caffemodel: holds weights for none of the net's ")
+        assert fault.endswith("is it the file of another net?")
+
+
+def test_weights_that_lack_a_layer_get_one_warning_and_with_strict_a_fault(run: Run, edited: Edit) -> None:
+    solver = edited(SOLVER, "max_iter: 60", "max_iter: 1")
+    part = NetParameter.FromString(Path(INIT).read_bytes())
+    for layer in part.layer:
+        layer.name = layer.name.replace("conv1", "gone")
+    Path("part.caffemodel").write_bytes(part.SerializeToString())
+    lacks = "part.caffemodel: lacks weights for 2 of the net's 8 layers that have any: conv1, conv1_p"
+    for command in (
+        ["test", "--model", NET, "--weights", "part.caffemodel", "--iterations", 1],
+        ["train", solver, "--weights", "part.caffemodel"],
+        ["check", solver, "--data", "--weights", "part.caffemodel"],
+    ):
+        result = run(*command)
+        assert result.status == 0, result.err
+        assert result.err.count(f"{lacks}; they stay as they were filled") == 1
+        assert run(*command, "--strict").fault == f"{lacks}; leave strict out to keep their fillers' values"

@@ -284,3 +284,73 @@ def test_a_folder_that_is_not_there(tmp_path: Path):
         save_weights(net_of(TOWERS), tmp_path / "gone" / "w.caffemodel")
     with pytest.raises(SpecError, match=r"gone/w\.h5: cannot be written: No such file or directory$"):
         save_weights(net_of(TOWERS), tmp_path / "gone" / "w.h5")
+
+
+TWO = """
+layer { name: "in" type: "Input" top: "a" input_param { shape { dim: 2 dim: 3 } } }
+layer { name: "one" type: "InnerProduct" bottom: "a" top: "x" inner_product_param { num_output: 4 } }
+layer { name: "two" type: "InnerProduct" bottom: "x" top: "y" inner_product_param { num_output: 4 } }
+"""
+
+
+def holding(tmp_path: Path, *layers: str, name: str = "w.caffemodel") -> Path:
+    """Write weights of the net TWO that have these layers only."""
+    proto = net_to_proto(net_of(TWO))
+    kept = [layer for layer in proto.layer if layer.name in layers]
+    del proto.layer[:]
+    proto.layer.extend(kept)
+    path = tmp_path / name
+    path.write_bytes(NetParameter(name="some", layer=proto.layer).SerializeToString())
+    return path
+
+
+@pytest.mark.parametrize("ending", ["", ".h5"])
+def test_one_warning_names_the_layers_that_the_weights_lack(tmp_path: Path, warnings, ending: str):
+    path = holding(tmp_path, "one")
+    if ending:
+        save_weights(net_of(TWO), path)
+        path = path.with_suffix(ending)
+        save_weights(net_of(TWO), path)
+        with h5py.File(path, "r+") as file:
+            del file["data/two"]
+    net = net_of(TWO)
+    before = blobs_of(net)["two"][0]
+    load_weights(net, path)
+    assert warnings() == [
+        f"{path}: lacks weights for 1 of the net's 2 layers that have any: two; they stay as they were filled"
+    ]
+    np.testing.assert_array_equal(blobs_of(net)["two"][0], before)
+    with pytest.raises(SpecError, match=r"lacks weights for 1 of the net's 2 layers that have any: two; leave strict"):
+        load_weights(net, path, strict=True)
+
+
+def test_a_warning_where_nothing_fits_and_an_error_where_something_must(tmp_path: Path, warnings):
+    path = holding(tmp_path, "in")
+    load_weights(net_of(TWO), path)
+    (line,) = warnings()
+    assert "holds weights for none of the net's 2 layers that have any: one, two; they stay" in line
+    with pytest.raises(SpecError, match="none of the net's 2 layers that have any: one, two; is it the file of an"):
+        load_weights(net_of(TWO), path, some=True)
+    load_weights(net_of(TWO), holding(tmp_path, "two"), some=True)
+
+
+def test_several_files_together_may_have_every_layer(tmp_path: Path, warnings):
+    paths = [holding(tmp_path, "one", name="1.caffemodel"), holding(tmp_path, "two", name="2.caffemodel")]
+    load_weights(net_of(TWO), paths, strict=True)
+    assert warnings() == []
+
+
+def test_a_layer_that_shares_the_blobs_of_a_loaded_one_is_not_missed(tmp_path: Path, warnings):
+    proto = net_to_proto(net_of(TOWERS))
+    del proto.layer[3:]  # "ip/p" and what follows
+    load_weights(net_of(TOWERS), written(tmp_path, proto), strict=True)
+    assert warnings() == []
+
+
+def test_layers_without_blobs_and_weights_in_the_prototxt_are_not_missed(tmp_path: Path, warnings):
+    text = TWO.replace('name: "two"', 'name: "two" blobs { shape { dim: 4 dim: 4 } %s } blobs { shape { dim: 4 } %s }')
+    text %= ("data: [" + ", ".join("1" * 16) + "]", "data: [1, 2, 3, 4]")
+    net = net_of(text + 'layer { name: "relu" type: "ReLU" bottom: "y" top: "y" }')
+    load_weights(net, holding(tmp_path, "one"), strict=True)
+    assert warnings() == []
+    assert blobs_of(net)["two"][1].tolist() == [1, 2, 3, 4]
