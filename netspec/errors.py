@@ -38,6 +38,19 @@ class SpecError(ValueError):
         super().__init__(f"{where}: {message}" if where else message)
 
 
+class ForkFault(SpecError):
+    """A field or a layer type that Caffe does not have.
+
+    ``what`` says which of the two it is, ``name`` is its name, and ``dialects`` are the known dialects that have it.
+    """
+
+    def __init__(self, message: str, where: Where | None, what: str, name: str, dialects: tuple[str, ...]) -> None:
+        super().__init__(message, where)
+        self.what = what
+        self.name = name
+        self.dialects = dialects
+
+
 def did_you_mean(word: str, known: list[str] | tuple[str, ...]) -> str:
     """Return ``; did you mean "x"?`` for the closest known word, or an empty string."""
     import difflib

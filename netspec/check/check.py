@@ -1,7 +1,8 @@
 """What a file builds: shapes, parameters, memory, multiply-adds; and all that is wrong with it, at once.
 
 Whatever a training would refuse before its first iteration is found here, without writing anything and, unless asked,
-without opening data. Of one text file that cannot be read the first fault is reported, of one layer's own settings too.
+without opening data. Unknown fields of a text file are reported all at once, and the file then is not built; of other
+faults of its text the first is reported, of one layer's own settings too.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from pathlib import Path
 import torch
 
 from netspec import log
+from netspec.check.forks import gathered, unknown_types
 from netspec.check.lint import missing_data, net_advice, solver_advice
-from netspec.errors import SpecError
+from netspec.errors import ForkFault, SpecError
 from netspec.graph.filter import with_state, with_train_state
 from netspec.layers.base import Shape
 from netspec.net.build import build_net
@@ -65,27 +67,35 @@ def check_file(
 
     ``shapes`` are those of data layers' tops; the data of the others is opened with ``open_data``. ``weights``, paths
     separated by commas, are what a training would begin with, in the place of a solver's own; with ``strict`` they
-    must have every layer. Raises SpecError where the file itself cannot be read.
+    must have every layer. A file that cannot be read comes alone, without a net.
     """
     manner = _Manner(shapes or {}, open_data, allow_python, strict)
     given = [weights] if weights else []
+    unknown: list[SpecError] = []
     try:
-        net, source = parse_net(path)
+        net, source = parse_net(path, report=unknown.append)
     except SpecError as as_net:
+        of_solver: list[SpecError] = []
         try:
-            solver, node = parse_solver(path)
+            solver, node = parse_solver(path, report=of_solver.append)
         except SpecError as as_solver:
-            raise max(as_net, as_solver, key=_reach) from None
+            last = max([*unknown, as_net], [*of_solver, as_solver], key=_reach)
+            return [Checked(str(path), None, gathered(last))]
+        if of_solver:
+            return [Checked(str(path), None, gathered(of_solver))]
         solver = with_train_state(solver, level, stages)
         return _check_solver(solver, node, path, given or solver.weights, manner)
+    if unknown:
+        return [Checked(str(path), None, gathered([*unknown, *unknown_types(net, source)]))]
     checked = _check_net(with_state(net, phase, level, stages), source, str(path), given, manner)
     checked.faults += not_to_be_given(manner.shapes, [net], path)
     return [checked]
 
 
-def _reach(fault: SpecError) -> tuple[int, int]:
+def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
     """Return how far into a file a reader came: further as a net or as a solver tells which of them it is."""
-    return (fault.where.line, fault.where.column) if fault.where else (0, 0)
+    where = faults[-1].where
+    return (where.line, where.column) if where else (0, 0)
 
 
 def _check_net(
@@ -121,6 +131,9 @@ def _check_solver(
     except SpecError as fault:
         faults.append(fault)
     described = solver_nets(solver, node, faults.append)
+    if any(isinstance(fault, ForkFault) for fault in faults):
+        types = [fault for part in described for fault in unknown_types(part.net, part.source)]
+        return [Checked(str(path), None, gathered([*faults, *types]))]
     faults += not_to_be_given(manner.shapes, [part.net for part in described], path)
     parts = [
         _check_net(part.net, part.source, part.label, weights, manner, seed_of(max(solver.random_seed, 0), part.label))

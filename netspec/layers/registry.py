@@ -8,7 +8,7 @@ from typing import TypeVar
 from netspec.errors import did_you_mean
 from netspec.layers.base import Layer
 from netspec.proto.dialect.files import announce_known
-from netspec.proto.dialect.registry import advice_for_type
+from netspec.proto.dialect.registry import advice_for, dialects_with_type
 
 _LAYERS: dict[str, type[Layer]] = {}
 L = TypeVar("L", bound=type[Layer])
@@ -45,6 +45,6 @@ def layer_types() -> list[str]:
 def unknown_type(type_name: str) -> str:
     """Return the sentence that says that a type is unknown, and what may be meant or which dialect has it."""
     announce_known()
-    advice = advice_for_type(type_name)
+    advice = advice_for(type_name, dialects_with_type(type_name))
     hint = f"; {advice}" if advice else did_you_mean(type_name, layer_types())
     return f'unknown layer type "{type_name}"{hint or "; `netspec layers` lists the known ones"}'

@@ -7,13 +7,14 @@ that it refuses is refused, in one line that says where and why. One word more b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 from google.protobuf.message import Message
 
-from netspec.errors import SpecError, Where, did_you_mean
+from netspec.errors import ForkFault, SpecError, Where, did_you_mean
 from netspec.proto.dialect import registry as dialect
 from netspec.proto.dialect.files import announce_known
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
@@ -38,22 +39,27 @@ _OTHER_FILE: dict[str, tuple[Any, str]] = {
     "caffe.SolverParameter": (NetParameter, "net"),
 }
 
+_CLOSING = {"{": "}", "<": ">", "[": "]"}
+
 Children = dict[str, list[Place]]
 
 
-def read_text(text: str, file: str, message: Message) -> Place:
+def read_text(text: str, file: str, message: Message, report: Callable[[SpecError], None] | None = None) -> Place:
     """Read a text into an empty ``message``; return the places of its parts.
+
+    ``report``, if given, gets a ForkFault for each unknown field, which then is left out with all that it holds.
 
     Raises SpecError for unknown fields, values of the wrong type or out of range, singular fields given twice, missing
     required fields, and text that is not protobuf's text format.
     """
-    return _Reader(text, file).read(message)
+    return _Reader(text, file, report).read(message)
 
 
 class _Reader:
     """A recursive descent over the tokens; ``self.token`` is the next one."""
 
-    def __init__(self, text: str, file: str) -> None:
+    def __init__(self, text: str, file: str, report: Callable[[SpecError], None] | None) -> None:
+        self._report = report
         self.lexer = Lexer(text, file)
         self._tokens = iter(self.lexer)
         self._open: list[tuple[Message, Token]] = []  # the messages being read, each with the token that named it
@@ -78,7 +84,12 @@ class _Reader:
         alias, meaning = _ALIASES.get(key, (name.text, None))
         field = fields_of(message.DESCRIPTOR).get(alias)
         if field is None:
-            raise self._error(self._unknown_field(message, name.text), name)
+            fault = self._unknown_field(message, name)
+            if self._report is None or not isinstance(fault, ForkFault):
+                raise fault
+            self._report(fault)
+            self._skip(name)
+            return
         if not field.repeated and field.present(message):
             first = children[alias][0].where.line
             raise self._error(f'"{alias}" was given already, in line {first}; it can be given once', name)
@@ -94,6 +105,36 @@ class _Reader:
             self._list(field, message, nodes)
         else:
             nodes.append(self._value(field, message, name))
+        if self._at(",") or self._at(";"):
+            self._next()
+
+    def _skip(self, name: Token) -> None:
+        """Pass over the value of an unknown field: a scalar, a list or a message, whatever is in it."""
+        has_colon = self._at(":")
+        if has_colon:
+            self._next()
+        if self.token.kind == SYMBOL and self.token.text in _CLOSING:
+            awaited = [_CLOSING[self._next().text]]
+            while awaited:
+                if self.token.kind == END:
+                    raise self._unclosed(name.text, name, awaited[0])
+                token = self._next()
+                if token.kind != SYMBOL:
+                    continue
+                if token.text in _CLOSING:
+                    awaited.append(_CLOSING[token.text])
+                elif token.text == awaited[-1]:
+                    awaited.pop()
+        elif not has_colon:
+            raise self._expected('":" or "{"', f'after "{name.text}"')
+        elif self.token.kind == STRING:
+            while self.token.kind == STRING:
+                self._next()
+        else:
+            self._minus()
+            if self.token.kind not in (NAME, INTEGER, FLOAT):
+                raise self._expected("a value", f'for "{name.text}"')
+            self._next()
         if self._at(",") or self._at(";"):
             self._next()
 
@@ -133,8 +174,7 @@ class _Reader:
         self._open.append((message, place))
         while not self._at(closing):
             if self.token.kind == END:
-                line = self.lexer.where(place.start).line
-                raise self._error(f'the file ends inside "{name}" of line {line}; is a "{closing}" missing?')
+                raise self._unclosed(name, place, closing)
             self._field(message, children)
         self._check_required(message)
         self._open.pop()
@@ -263,6 +303,10 @@ class _Reader:
                 place = self._open[-1][1]
                 raise self._error(f'{message.DESCRIPTOR.name} lacks "{field.name}", which it requires', place)
 
+    def _unclosed(self, name: str, place: Token, closing: str) -> SpecError:
+        line = self.lexer.where(place.start).line
+        return self._error(f'the file ends inside "{name}" of line {line}; is a "{closing}" missing?')
+
     def _expected(self, what: str, where: str = "", token: Token | None = None, advice: str = "") -> SpecError:
         token = token or self.token
         if token.kind == END:
@@ -286,29 +330,42 @@ class _Reader:
                 break
         return SpecError(message, place)
 
-    def _unknown_field(self, message: Message, name: str) -> str:
-        """Say that a field is unknown, and as well as can be guessed what was meant."""
-        descriptor = message.DESCRIPTOR
-        fault = f'{descriptor.name} has no field "{name}"'
+    def _unknown_field(self, message: Message, token: Token) -> SpecError:
+        """Say that a field is unknown, and as well as can be guessed what was meant.
+
+        That is a ForkFault unless the fault seems to lie elsewhere: in a bracket, a quotation mark, the kind of file.
+        """
         announce_known()
-        fork = dialect.advice_for_field(descriptor.full_name, name)
-        if fork:
-            return f"{fault}; {fork}"
+        descriptor, name = message.DESCRIPTOR, token.text
+        dialects = dialect.dialects_with_field(descriptor.full_name, name)
+        fault = f'{descriptor.name} has no field "{name}"'
+        elsewhere = "" if dialects else self._elsewhere(message, name)
+        hint = f"; {dialect.advice_for(name, dialects)}" if dialects else self._meant(message, name)
+        error = self._error(fault + (elsewhere or hint), token)
+        if elsewhere or self.lexer.suspicion(token.start):
+            return error
+        return ForkFault(error.message, error.where, "field", name, dialects)
+
+    def _elsewhere(self, message: Message, name: str) -> str:
+        """Return the sentence that a field belongs into another message or file; or an empty string."""
         inner = self._open[-1][1]
         for outer, _ in reversed(self._open[:-1]):
             if name in fields_of(outer.DESCRIPTOR):
                 line = self.lexer.where(inner.start).line
-                return f'{fault}, but {outer.DESCRIPTOR.name} has; is a "}}" missing for "{inner.text}" of line {line}?'
-        known = fields_of(descriptor)
+                return f', but {outer.DESCRIPTOR.name} has; is a "}}" missing for "{inner.text}" of line {line}?'
+        other, kind = _OTHER_FILE.get(message.DESCRIPTOR.full_name, (message, ""))
+        if kind and name in fields_of(other.DESCRIPTOR):
+            return f", but {other.DESCRIPTOR.name} has; is this file a {kind}?"
+        return ""
+
+    def _meant(self, message: Message, name: str) -> str:
+        """Return the field that may be meant, or where this one belongs; or an empty string."""
+        known = fields_of(message.DESCRIPTOR)
+        if close := did_you_mean(name, list(known)):
+            return close
         messages = {n: f.descriptor.message_type for n, f in known.items() if f.type == Declared.TYPE_MESSAGE}
         inside = [n for n, message_type in messages.items() if name in fields_of(message_type)]
-        close = did_you_mean(name, list(known))
-        other, kind = _OTHER_FILE.get(descriptor.full_name, (message, ""))
-        if kind and name in fields_of(other.DESCRIPTOR):
-            return f"{fault}, but {other.DESCRIPTOR.name} has; is this file a {kind}?"
-        if inside and not close:
-            return f"{fault}; it belongs in {' or '.join(inside)}"
-        return fault + close
+        return f"; it belongs in {' or '.join(inside)}" if inside else ""
 
 
 def _frozen(children: Children) -> dict[str, tuple[Place, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
@@ -22,6 +23,9 @@ __all__ = [
 ]
 
 
+Report = Callable[[SpecError], None] | None
+
+
 def read_net(path: str | Path) -> NetParameter:
     """Return the net of a .prototxt, upgraded to the current format. Raises SpecError."""
     return parse_net(path)[0]
@@ -32,30 +36,36 @@ def read_solver(path: str | Path) -> SolverParameter:
     return parse_solver(path)[0]
 
 
-def parse_net(path: str | Path, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
-    """Return the net of a .prototxt and where its parts stand. Raises SpecError."""
-    return parse_net_text(_text_of(path), str(path), upgrade)
+def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
+    """Return the net of a .prototxt and where its parts stand. Raises SpecError.
+
+    ``report``, if given, gets a ForkFault for each unknown field, which then is left out.
+    """
+    return parse_net_text(_text_of(path), str(path), upgrade, report)
 
 
-def parse_net_text(text: str, file: str, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
+def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
     """Return the net that a text describes and where its parts stand; ``file`` is what errors call it."""
     net = NetParameter()
-    source = SourceMap.of(read_text(text, file, net))
+    source = SourceMap.of(read_text(text, file, net, report))
     return upgrades.upgrade_net(net, source) if upgrade else (net, source)
 
 
-def parse_solver(path: str | Path, upgrade: bool = True) -> tuple[SolverParameter, Place]:
+def parse_solver(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[SolverParameter, Place]:
     """Return the solver of a .prototxt and where its parts stand. Raises SpecError.
 
-    The nets in it are upgraded too; ``SourceMap.of(node.fields["net_param"][0])`` is the map of one.
+    The nets in it are upgraded too; ``SourceMap.of(node.fields["net_param"][0])`` is the map of one. For ``report``
+    see :func:`parse_net`.
     """
-    return parse_solver_text(_text_of(path), str(path), upgrade)
+    return parse_solver_text(_text_of(path), str(path), upgrade, report)
 
 
-def parse_solver_text(text: str, file: str, upgrade: bool = True) -> tuple[SolverParameter, Place]:
+def parse_solver_text(
+    text: str, file: str, upgrade: bool = True, report: Report = None
+) -> tuple[SolverParameter, Place]:
     """Return the solver that a text describes and where its parts stand; ``file`` is what errors call it."""
     solver = SolverParameter()
-    node = read_text(text, file, solver)
+    node = read_text(text, file, solver, report)
     if upgrade:
         solver, node = upgrades.upgrade_solver(solver, node)
         solver = upgrades.upgrade_snapshot_prefix(solver, file)

@@ -42,7 +42,7 @@ def solver_nets(param: SolverParameter, node: Place, report: Report = raise_faul
 
     The test nets are in Caffe's order: each test_net_param, each test_net, then the general net for every further
     test_iter. ``report`` gets a SpecError for all that the solver does not say clearly and for each file that cannot be
-    read; the nets concerned are left out.
+    read; the nets concerned are left out. It also gets a ForkFault for each unknown field, which is left out itself.
     """
     read = _Reader(param, node, report)
     described = []
@@ -114,4 +114,4 @@ class _Reader:
         if not Path(path).is_file():
             message = f'{name} "{path}" is not a file; paths are relative to the working directory'
             raise SpecError(message, self._node.find(name, index))
-        return parse_net(path)
+        return parse_net(path, report=self._report)

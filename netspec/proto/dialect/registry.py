@@ -136,21 +136,27 @@ def active_dialects() -> tuple[Dialect, ...]:
     return tuple(_active[name] for name in active())
 
 
-def advice_for_field(message: str, field: str) -> str:
-    """Return which known dialect has a field of a message (full name), and what to do; or an empty string."""
-    return _advice(field, [d for d in _known.values() if (message, field) in d.fields()])
+def dialects_with_field(message: str, field: str) -> tuple[str, ...]:
+    """Return the known dialects that have a field of a message (full name)."""
+    return tuple(d.name for d in _known.values() if (message, field) in d.fields())
 
 
-def advice_for_type(layer_type: str) -> str:
-    """Return which known dialect has a layer type, and what to do; or an empty string."""
-    return _advice(layer_type, [d for d in _known.values() if layer_type in d.layer_types])
+def dialects_with_type(layer_type: str) -> tuple[str, ...]:
+    """Return the known dialects that have a layer type."""
+    return tuple(d.name for d in _known.values() if layer_type in d.layer_types)
 
 
-def _advice(name: str, dialects: list[Dialect]) -> str:
+def advice_of(dialect: str) -> str:
+    """Return how a user switches a known dialect on."""
+    return _known[dialect].advice
+
+
+def advice_for(name: str, dialects: tuple[str, ...]) -> str:
+    """Return the sentence that known dialects have a field or layer type, and what to do; or an empty string."""
     if not dialects:
         return ""
-    names = " and ".join(f'"{d.name}"' for d in dialects)
-    advice = f"; {dialects[0].advice}" if dialects[0].advice else ""
+    names = " and ".join(f'"{d}"' for d in dialects)
+    advice = f"; {advice_of(dialects[0])}" if advice_of(dialects[0]) else ""
     return (
         f'dialect{"s" if len(dialects) > 1 else ""} {names} {"have" if len(dialects) > 1 else "has"} "{name}"{advice}'
     )

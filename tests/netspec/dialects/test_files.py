@@ -253,7 +253,7 @@ def test_a_packages_entry_point_is_hinted_at_and_used(tmp_path: Path, capsys: py
     net.write_text(NET.replace("Times", "Thrice").replace("times_param", "thrice_param"))
     assert main(["check", str(net)]) == 1
     error = capsys.readouterr().err
-    assert 'dialect "doubling_too" has "thrice_param"; add --plugin doubling_too' in error
+    assert 'of dialect "doubling_too"; add --plugin doubling_too' in error
     assert 'dialect "absent": there is no module forky.absent; it is left out' in error
     assert 'dialect "nothing" is left out: ' in error
     assert "forky.doubling" not in sys.modules

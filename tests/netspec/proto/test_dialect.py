@@ -126,10 +126,13 @@ def test_an_unknown_type_or_field_tells_which_known_dialects_have_it() -> None:
         Dialect("one", "extend LayerParameter { optional int32 lens = 700; }", ("Lens",), "add --plugin one")
     )
     dialect.announce(Dialect("two", "extend LayerParameter { optional int32 lens = 800; }", ("Lens",)))
-    assert dialect.advice_for_type("Lens") == 'dialects "one" and "two" have "Lens"; add --plugin one'
-    assert dialect.advice_for_field("caffe.LayerParameter", "lens").startswith('dialects "one" and "two" have "lens"')
-    assert dialect.advice_for_field("caffe.PoolingParameter", "lens") == ""
-    assert dialect.advice_for_type("ReLU") == ""
+    both = ("one", "two")
+    assert dialect.dialects_with_type("Lens") == both
+    assert dialect.dialects_with_field("caffe.LayerParameter", "lens") == both
+    assert dialect.advice_for("Lens", both) == 'dialects "one" and "two" have "Lens"; add --plugin one'
+    assert dialect.dialects_with_field("caffe.PoolingParameter", "lens") == ()
+    assert dialect.dialects_with_type("ReLU") == ()
+    assert dialect.advice_for("ReLU", ()) == ""
 
 
 REFUSED = {

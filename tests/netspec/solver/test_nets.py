@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 from google.protobuf.message import Message
@@ -125,9 +126,9 @@ def test_what_caffe_refuses(text: str, message: str):
 def test_a_file_is_read_once_however_many_nets_it_holds(monkeypatch: pytest.MonkeyPatch):
     read: list[str] = []
 
-    def noted(text: str, file: str, message: Message) -> Place:
+    def noted(text: str, file: str, message: Message, *report: Any) -> Place:
         read.append(file)
-        return read_text(text, file, message)
+        return read_text(text, file, message, *report)
 
     monkeypatch.setattr("netspec.proto.text.read_text", noted)
     nets('net: "a.prototxt" test_net: "b.prototxt" test_net: "b.prototxt"' + "test_iter: 1 " * 4 + "test_interval: 1")

@@ -1,0 +1,78 @@
+"""All unknown fields of a file are reported at once: one line for each dialect, one for each field of no dialect."""
+
+from pathlib import Path
+
+import pytest
+
+from netspec.check.check import check_file
+
+INPUT = 'layer { name: "in" type: "Input" top: "a" input_param { shape { dim: 1 dim: 4 dim: 4 dim: 4 } } }\n'
+PERMUTE = """layer { name: "p%d" type: "Permute" bottom: "a" top: "p%d"
+  permute_param { order: 0 order: 2 order: [3, 1] deeper { x: "}" 'y' } } }
+"""
+NORM = """layer { name: "n" type: "Normalize" bottom: "a" top: "n"
+  norm_param < across_spatial: false scale_filler { type: "constant" value: -20 } > }
+"""
+SHUFFLE = 'layer { name: "s" type: "ShuffleChannel" bottom: "a" top: "s" shuffle_channel_param { group: 2 } }\n'
+POOL = (
+    'layer { name: "k" type: "Pooling" bottom: "a" top: "k" pooling_param { kernal: -3, pool: MAX kernel_size: 2 } }\n'
+)
+
+
+def lines(path: str) -> list[str]:
+    return [str(fault) for part in check_file(path) for fault in part.faults]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_unknown_fields_and_layers_are_counted_by_dialect():
+    Path("net.prototxt").write_text(INPUT + PERMUTE % (1, 1) + PERMUTE % (2, 2) + NORM + SHUFFLE)
+    assert lines("net.prototxt") == [
+        "net.prototxt:3:3: 3 fields (permute_param 2 times, norm_param) and 3 layers (Permute 2 times, Normalize) of "
+        'dialect "ssd"; add --plugin ssd, in Python netspec.use_dialect("ssd")',
+        "net.prototxt:8:63: 1 field (shuffle_channel_param) and 1 layer (ShuffleChannel) of "
+        'dialect "blocks"; add --plugin blocks, in Python netspec.use_dialect("blocks")',
+    ]
+
+
+def test_a_field_of_no_dialect_is_named_once_with_its_lines():
+    layer = 'layer { name: "c" type: "ReLU" bottom: "a" top: "a" quantize: true }\n'
+    Path("net.prototxt").write_text(INPUT + POOL + layer * 12)
+    assert lines("net.prototxt") == [
+        'net.prototxt:2:72: layer "k" (Pooling): PoolingParameter has no field "kernal"; did you mean "kernel_w"?',
+        'net.prototxt:3:53: layer "c" (ReLU): LayerParameter has no field "quantize" '
+        "(also in lines 4, 5, 6, 7, 8, 9, 10, 11 and more)",
+    ]
+
+
+def test_what_cannot_be_passed_over_comes_after_what_was_found():
+    Path("net.prototxt").write_text(POOL + SHUFFLE + 'layer { odd { a: [1, 2] b { c: 1 }\n  top: "x" \n')
+    found = lines("net.prototxt")
+    assert [line.partition(" ")[0] for line in found] == [
+        f"net.prototxt:{place}:" for place in ("1:72", "2:63", "3:9", "5:1")
+    ]
+    assert found[3] == 'net.prototxt:5:1: the file ends inside "odd" of line 3; is a "}" missing?'
+    Path("net.prototxt").write_text("odd: }\nlayer { even 3 }")
+    assert lines("net.prototxt")[-1] == 'net.prototxt:1:6: expected a value for "odd", found "}"'
+    Path("net.prototxt").write_text("layer { even 3 }")
+    assert lines("net.prototxt")[-1] == 'net.prototxt:1:14: expected ":" or "{" after "even", found "3"'
+
+
+def test_a_solver_and_its_nets_are_read_to_the_end():
+    Path("net.prototxt").write_text(INPUT + NORM)
+    Path("solver.prototxt").write_text('net: "net.prototxt"\nbase_lr: 1\n')
+    assert lines("solver.prototxt")[-1].startswith("net.prototxt:3:3: 1 field (norm_param) and 1 layer (Normalize) of")
+    Path("solver.prototxt").write_text('fast: true\nnet: "net.prototxt"\nbase_lr: 1\nquick_mode { x: 1 }\n')
+    assert [line.partition(": ")[2] for line in lines("solver.prototxt")] == [
+        'SolverParameter has no field "fast"',
+        'SolverParameter has no field "quick_mode"',
+    ]
+
+
+def test_a_solver_read_as_a_net_and_a_file_that_is_not_there():
+    Path("solver.prototxt").write_text("lr_policies: 1\nbase_lr: 0.1\nbase_lr: 0.2\n")
+    assert lines("solver.prototxt")[-1].startswith('solver.prototxt:3:1: "base_lr" was given already')
+    assert lines("nowhere.prototxt") == ["nowhere.prototxt: cannot be read: No such file or directory"]
