@@ -20,6 +20,7 @@ import lmdb
 
 from netspec import log
 from netspec.errors import SpecError, Where
+from netspec.lfs import pointer_fault_at
 
 BACKENDS = ("lmdb", "leveldb")
 _SCAN = 4096  # keys listed ahead of the one that is asked for
@@ -100,6 +101,8 @@ class _LmdbReader(Reader):
         size = os.path.getsize(os.path.join(source, "data.mdb"))
         if not size:
             raise ValueError("has an empty data.mdb, so it was never written")
+        if fault := pointer_fault_at(os.path.join(source, "data.mdb")):
+            raise ValueError(f"has a data.mdb that {fault}")
         self._env = _open_lmdb(source)
         stat = self._env.stat()
         pages = 2 + stat["branch_pages"] + stat["leaf_pages"] + stat["overflow_pages"]

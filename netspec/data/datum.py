@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from netspec.lfs import pointer_fault
 from netspec.proto.schema import Datum
 
 
@@ -88,7 +89,7 @@ def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise ValueError("cannot be decoded as an image")
+        raise ValueError(pointer_fault(image) or "cannot be decoded as an image")
     if pixels.dtype != np.uint8:
         raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits a channel can be read")
     return pixels

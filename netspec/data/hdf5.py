@@ -17,6 +17,7 @@ from netspec.data.images import list_lines
 from netspec.data.random_words import permutation
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
+from netspec.lfs import pointer_fault_at
 
 _FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may straddle two
 
@@ -127,7 +128,7 @@ def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list
                 raise SpecError(f'datasets of "{name}" have {counts} rows; expected one number of rows, above 0', place)
             return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
     except OSError as fault:
-        raise SpecError(f'HDF5 file "{name}" cannot be read: {fault}', place) from None
+        raise SpecError(f'HDF5 file "{name}" {pointer_fault_at(name) or f"cannot be read: {fault}"}', place) from None
 
 
 class Hdf5Sink:

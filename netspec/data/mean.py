@@ -15,6 +15,7 @@ from netspec.data import blobs
 from netspec.data.database import Reader
 from netspec.data.datum import datum_to_array, parse_datum, times
 from netspec.errors import SpecError, Where
+from netspec.lfs import pointer_fault
 from netspec.proto.schema import BlobProto
 from netspec.whole_file import whole_file
 
@@ -26,9 +27,13 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     """
     log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
     try:
-        mean = blobs.to_array(BlobProto.FromString(Path(path).read_bytes()))
+        data = Path(path).read_bytes()
     except OSError as fault:
         raise SpecError(f'mean file "{path}" cannot be read: {fault.strerror}', where) from None
+    if fault := pointer_fault(data):
+        raise SpecError(f'mean file "{path}" {fault}', where)
+    try:
+        mean = blobs.to_array(BlobProto.FromString(data))
     except (DecodeError, ValueError) as fault:
         raise SpecError(f'mean file "{path}" is no BlobProto of a mean image ({fault})', where) from None
     if mean.ndim != 3 and not (mean.ndim == 4 and mean.shape[0] == 1):

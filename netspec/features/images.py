@@ -24,6 +24,7 @@ from netspec.features.records import Progress
 from netspec.features.views import middle
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
+from netspec.lfs import pointer_fault_at
 from netspec.net.build import build_filtered
 from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights
@@ -182,7 +183,7 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
 def _read(path: Path, channels: int) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR if channels == 3 else cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise SpecError("cannot read this image", Where(str(path)))
+        raise SpecError(pointer_fault_at(path) or "cannot read this image", Where(str(path)))
     return image
 
 

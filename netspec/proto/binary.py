@@ -8,6 +8,7 @@ from typing import TypeVar
 from google.protobuf.message import DecodeError, Message
 
 from netspec.errors import SpecError, Where
+from netspec.lfs import pointer_fault
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.current import upgrade_net
@@ -29,6 +30,8 @@ def read_binary(path: str | Path, message_class: type[M]) -> M:
     name = message_class.DESCRIPTOR.name
     if not data:
         raise SpecError(f"the file is empty, expected a binary {name}", where)
+    if fault := pointer_fault(data):
+        raise SpecError(fault, where)
     message = message_class()
     try:
         message.ParseFromString(data)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
+from netspec.lfs import pointer_fault
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
@@ -78,4 +79,6 @@ def _text_of(path: str | Path) -> str:
         data = Path(path).read_bytes()
     except OSError as fault:
         raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+    if fault := pointer_fault(data):
+        raise SpecError(fault, Where(str(path)))
     return data.removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")
