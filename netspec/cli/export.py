@@ -94,7 +94,8 @@ def _source(arguments: argparse.Namespace, labels: bool) -> Any:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from netspec.export.convert import export_net, read_mean_option
+    from netspec.data.mean import read_mean_option
+    from netspec.export.convert import export_net
     from netspec.export.preprocess import Preprocess
 
     steps = Preprocess(

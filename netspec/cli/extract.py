@@ -51,6 +51,20 @@ def add_to(commands: Commands) -> None:
     p.add_argument(
         "--shape", type=shape, metavar="BLOB=N,C,H,W", help="that blob's shape, where the data is not at hand"
     )
+    p.add_argument("--swap", action="store_true", help="with --images: reverse the channels, to RGB")
+    p.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="then multiply pixels, 0 to 255, by this")
+    p.add_argument(
+        "--mean",
+        metavar="A,B,C|FILE",
+        help="then subtract this: numbers in the net's order, or a .binaryproto or .npy",
+    )
+    p.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="then multiply by this; these four replace the data layer's transform_param",
+    )
     add_device(p)
     add_state(p, phase="TEST")
     add_python(p)
@@ -75,20 +89,22 @@ def _extract(arguments: argparse.Namespace) -> None:
 def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.features.image_list import list_images
     from netspec.features.images import ImageNet, extract_images
+    from netspec.features.scaling import Steps
 
     if len(arguments.blob) != 1:
         raise WrongUsage(f"--images takes one --blob, found {len(arguments.blob)}")
     if arguments.shape and arguments.shape[0] != arguments.input:
         raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
+    steps = Steps.of(arguments.mean, arguments.scale, arguments.raw_scale, arguments.swap)
     images = list_images(arguments.images)
     weights = split_paths(arguments.weights) if arguments.weights else []
     given = arguments.shape[1] if arguments.shape else None
     (blob,) = arguments.blob
     zooms, chosen = arguments.zooms or (1.0,), device(arguments.gpu)
     net = ImageNet(
-        arguments.model, weights, blob, arguments.input, chosen, given, zooms, arguments.exact, arguments.strict
+        arguments.model, weights, blob, arguments.input, chosen, given, zooms, arguments.exact, arguments.strict, steps
     )
-    size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "BGR"
+    size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "RGB" if net.scaling.swap else "BGR"
     print(f"{arguments.model}: {blob} of {len(images.paths)} images from {arguments.images}")
     print(f"{arguments.input} ({size}): {kind}, {net.scaling}")
     return extract_images(net, images, bar("extract", "batch"))
@@ -101,6 +117,8 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.net.options import BuildOptions
     from netspec.proto.text import parse_net
 
+    if arguments.swap or arguments.mean is not None or (arguments.scale, arguments.raw_scale) != (1, 1):
+        raise WrongUsage("--swap, --raw-scale, --mean and --scale are of --images; records have a transform_param")
     if arguments.zooms:
         raise WrongUsage("--zooms are of --images; a data layer's records have their own transform_param")
     message, source = parse_net(arguments.model)

@@ -41,6 +41,21 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     return mean.reshape(mean.shape[-3:]).astype(np.float32)
 
 
+def read_mean_option(text: str) -> np.ndarray:
+    """Return the mean of ``--mean``: numbers with commas between, or a .binaryproto or .npy file (C, H, W)."""
+    try:
+        return np.array([float(part) for part in text.split(",")], np.float32)
+    except ValueError:
+        pass
+    if not text.endswith(".npy"):
+        return read_mean(text, Where("--mean"))
+    try:
+        mean = np.load(text, allow_pickle=False)
+    except (OSError, ValueError) as fault:
+        raise SpecError(f"cannot be read as an array: {fault}", Where(text)) from None
+    return mean.astype(np.float32)
+
+
 def compute_mean(reader: Reader, where: Where) -> np.ndarray:
     """Return the mean of all records of a database, encoded or not: float32 (C, H, W).
 

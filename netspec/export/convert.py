@@ -8,11 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from netspec.data.blobs import Shape
-from netspec.data.mean import read_mean
 from netspec.errors import SpecError, Where
 from netspec.export.deploy import fold, with_inputs, write_caffe
 from netspec.export.onnx import export_onnx
@@ -55,8 +53,8 @@ class Source:
             message, source = prune(message, source, self.blobs, {})
         options = BuildOptions(seed=0, given_shapes=self.shapes, allow_python=self.allow_python)
         net = build_net(message, source, options)
-        for path in self.weights:
-            load_weights(net, path)
+        if self.weights:
+            load_weights(net, self.weights)
         return net
 
     def metadata(self) -> dict[str, str]:
@@ -120,21 +118,6 @@ def fold_files(source: Source, prefix: Path) -> tuple[int, int]:
     write_caffe(message, prefix)
     splits = sum(layer.passes_on for layer in net.layers)
     return len(net.layers) - splits, len(message.layer)
-
-
-def read_mean_option(text: str) -> np.ndarray:
-    """Return the mean of ``--mean``: numbers with commas between, or a .binaryproto or .npy file (C, H, W)."""
-    try:
-        return np.array([float(part) for part in text.split(",")], np.float32)
-    except ValueError:
-        pass
-    if not text.endswith(".npy"):
-        return read_mean(text, Where("--mean"))
-    try:
-        mean = np.load(text, allow_pickle=False)
-    except (OSError, ValueError) as fault:
-        raise SpecError(f"cannot be read as an array: {fault}", Where(text)) from None
-    return mean.astype(np.float32)
 
 
 def _sha256(path: Path) -> str:

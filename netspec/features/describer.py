@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from netspec.features.images import ImageNet
+from netspec.features.scaling import Steps
 from netspec.features.views import read_zooms
 
 
@@ -15,8 +17,10 @@ class Describer:
     """A callable that gives blob ``blob`` of a net for an image that goes into its blob ``input``.
 
     The net is the prototxt ``model`` in phase TEST, cut down to what computes the blob; the pixels are scaled as its
-    data layer's transform_param says. ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how
-    many. Raises SpecError for faults of the files.
+    data layer's transform_param says or, where any of these is given, by ``swap``, ``raw_scale``, ``mean`` and
+    ``scale``, in this order (:class:`netspec.features.scaling.Steps`); each may be text, as on the command line.
+    ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how many. Raises SpecError for faults of
+    the files.
     """
 
     def __init__(
@@ -27,8 +31,14 @@ class Describer:
         input: str = "data",
         device: str = "cpu",
         zooms: str | float = "1",
+        mean: str | float | Sequence[float] | np.ndarray | None = None,
+        scale: str | float = 1.0,
+        raw_scale: str | float = 1.0,
+        swap: str | bool = False,
     ) -> None:
-        self.image_net = ImageNet(model, [weights], blob, input, torch.device(device), zooms=read_zooms(zooms))
+        steps = Steps.of(mean, scale, raw_scale, swap)
+        chosen = torch.device(device)
+        self.image_net = ImageNet(model, [weights], blob, input, chosen, zooms=read_zooms(zooms), steps=steps)
         self.views = len(self.image_net.zooms)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import h5py
@@ -16,11 +14,11 @@ import torch
 from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import planar
-from netspec.data.mean import read_mean
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.features.image_list import ImageList
 from netspec.features.records import Progress
+from netspec.features.scaling import Steps, scaling_of
 from netspec.features.views import middle
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
@@ -29,38 +27,20 @@ from netspec.net.build import build_filtered
 from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights
 from netspec.proto.binary import read_net_binary
-from netspec.proto.schema import TEST, LayerParameter, NetParameter
+from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 
 BATCH = 16  # images at once
 
 
-@dataclass(frozen=True)
-class Scaling:
-    """(x - mean) * scale; ``mean`` broadcasts against (C, H, W). ``layer`` is whose transform_param says so, if any."""
-
-    mean: np.ndarray
-    scale: float
-    layer: str = ""
-
-    def __str__(self) -> str:
-        if not self.layer:
-            return "0 to 255, since no transform_param says otherwise"
-        values = self.mean.reshape(-1)
-        channels = values[:1] if np.all(values == values[0]) else values
-        told = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
-        mean = f", minus {told}" if np.any(values) else ""
-        scale = f", times {self.scale:g}" if self.scale != 1 else ""
-        return f'0 to 255{mean}{scale}, as the transform_param of layer "{self.layer}" says'
-
-
 class ImageNet:
-    """The part of a net that computes ``blob`` from images in ``input_blob``, and what its data layer does to pixels.
+    """The part of a net that computes ``blob`` from images in ``input_blob``, and what is done to their pixels before.
 
     The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
     None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning;
-    something in them must fit, and with ``strict`` every layer must be there. Raises SpecError for faults of the files;
+    something in them must fit, and with ``strict`` every layer must be there. ``steps``, if any are given, are done to
+    the pixels in the place of what the data layer's transform_param says. Raises SpecError for faults of the files;
     warns where the weights were trained on other pixels.
     """
 
@@ -75,6 +55,7 @@ class ImageNet:
         zooms: Sequence[float] = (1.0,),
         exact: str = SMALL,
         strict: bool = False,
+        steps: Steps | None = None,
     ) -> None:
         net, source = parse_net(model)
         net, source = filter_net(with_state(net, TEST), source)
@@ -87,7 +68,8 @@ class ImageNet:
         self.shape: Shape = tuple(shape[1:])
         self.zooms = tuple(zooms)
         transforming = [layer for layer in before.layer if layer.HasField("transform_param")]
-        self.scaling = _scaling(transforming[0], self.shape, source.file) if transforming else Scaling(np.zeros(1), 1.0)
+        steps = steps or Steps()
+        self.scaling = scaling_of(steps, transforming[0] if transforming else None, self.shape, source.file)
         after, after_source = prune(net, source, [blob], {input_blob: shape})
         options = BuildOptions(device or torch.device("cpu"), seed=0, exact=exact)
         self.net = build_filtered(after, after_source, options)
@@ -95,16 +77,15 @@ class ImageNet:
         if weights:
             load_weights(self.net, weights, strict, some=True)
         for path in weights:
-            if not transforming:
+            if not transforming and not steps:
                 readers = [layer.name for layer in after.layer if input_blob in layer.bottom]
                 _warn_of_other_pixels(path, model, readers)
 
     def __call__(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return the blob (N, V D) float32, view after view, of images (H, W, 3) or (H, W), uint8, BGR, any sizes."""
         views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
-        pixels = (np.stack(views) - self.scaling.mean) * self.scaling.scale
         with torch.no_grad():
-            self.net(**{self.input: pixels})
+            self.net(**{self.input: self.scaling(np.stack(views))})
         return self.net.blobs[self.blob].reshape(len(images), -1).cpu().numpy()
 
 
@@ -135,27 +116,6 @@ def _shape_of(blob: str, net: NetParameter, source: SourceMap) -> Shape:
     built = build_filtered(net, source, BuildOptions(torch.device("meta"), seed=0))
     built.close()
     return built.shapes[blob]
-
-
-def _scaling(layer: LayerParameter, shape: Shape, file: str) -> Scaling:
-    """Return a transform_param's mean and scale for one image of ``shape`` (C, H, W).
-
-    A pair's mean has the channels of both images: the first image's count. A mean image larger than the blob is cut at
-    its center, as Caffe cuts it with the image in phase TEST.
-    """
-    param: Any = layer.transform_param
-    channels, height, width = shape
-    if param.mean_file:
-        mean = read_mean(param.mean_file, Where(file))[:channels]
-        top, left = (mean.shape[1] - height) // 2, (mean.shape[2] - width) // 2
-        if mean.shape[0] != channels or min(top, left) < 0:
-            message = f"the mean of {param.mean_file} is {mean.shape}, expected at least {shape}"
-            raise SpecError(message, Where(file))
-        return Scaling(mean[:, top : top + height, left : left + width], param.scale, layer.name)
-    values = np.array(param.mean_value or [0], np.float32)
-    if len(values) not in (1, channels, 2 * channels):
-        raise SpecError(f"found {len(values)} mean_value for images of {channels} channels", Where(file))
-    return Scaling(values[:channels, None, None], param.scale, layer.name)
 
 
 def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Sequence[str]) -> None:

@@ -318,6 +318,22 @@ class Net(torch.nn.Module):
             for j, blob in enumerate(theirs.blobs):
                 layer.blobs[j] = blob
 
+    def set_input_arrays(self, data: np.ndarray, labels: np.ndarray | None = None) -> None:
+        """Give the MemoryData layer, the first if there are several, its images (n, C, H, W) and labels (n,).
+
+        Without labels they are 0. n must be a multiple of the layer's batch size; each pass then takes the next batch.
+        Raises SpecError for other shapes, and for a net without such a layer.
+        Caffe: Net_SetInputArrays (python/caffe/_caffe.cpp)
+        """
+        takers = [layer for layer in self.layers if hasattr(layer, "set_input_arrays")]
+        if not takers:
+            message = (
+                "set_input_arrays is for nets with a MemoryData layer, and this one has none; call net(blob=array)"
+            )
+            raise SpecError(message, Where(self.plan.source.file))
+        taker: Any = takers[0]
+        taker.set_input_arrays(data, np.zeros(len(data), np.float32) if labels is None else labels)
+
     def missing_inputs(self) -> Iterator[SpecError]:
         """Yield what keeps a solver, which gives its nets no inputs, from running this one."""
         for layer in self.layers:

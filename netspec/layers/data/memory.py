@@ -189,7 +189,7 @@ class MemoryData(Layer):
 
     @override
     def missing_input(self) -> SpecError | None:
-        message = "has no data yet; call set_input_arrays(data, labels) on it first"
+        message = "has no data yet; call set_input_arrays(data, labels) on the net first"
         return self.error(message) if self._arrays is None else None
 
     @override

@@ -452,3 +452,16 @@ def test_memory_data_refuses_what_does_not_fit(build: Callable[..., Layer], imag
 def test_memory_data_needs_its_sizes(build: Callable[..., Layer]) -> None:
     with pytest.raises(SpecError, match="must all be given and above 0"):
         build('type: "MemoryData" memory_data_param { batch_size: 2 }', tops=2)
+
+
+def test_a_net_hands_its_arrays_to_its_memory_data(net_of: Callable[..., Any]) -> None:
+    net = net_of(f'layer {{ name: "m" {MEMORY} top: "data" top: "label" }}')
+    net.set_input_arrays(np.arange(12).reshape(4, 1, 1, 3), np.array([5, 6, 7, 8]))
+    assert [net()["label"].tolist() for _ in range(3)] == [[5, 6], [7, 8], [5, 6]]
+    net.set_input_arrays(np.ones((2, 1, 1, 3)))
+    assert net()["label"].tolist() == [0, 0]
+    assert net.blobs["data"].unique().tolist() == [1]
+    with pytest.raises(SpecError, match=r'net.prototxt:1:38: layer "m" \(MemoryData\): found images \(3, 1, 1, 3\)'):
+        net.set_input_arrays(np.ones((3, 1, 1, 3)))
+    with pytest.raises(SpecError, match="for nets with a MemoryData layer, and this one has none"):
+        net_of("").set_input_arrays(np.ones((2, 1, 1, 3)))
