@@ -8,7 +8,7 @@ faults of its text the first is reported, of one layer's own settings too.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -22,7 +22,9 @@ from netspec.layers.base import Shape
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions, not_to_be_given
+from netspec.net.recovered import recover_net
 from netspec.net.weights import load_weights
+from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import TEST, NetParameter, PhaseValue, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import parse_net, parse_solver
@@ -65,12 +67,16 @@ def check_file(
 ) -> list[Checked]:
     """Check a net for a phase, level and stages, or a solver, whose training net gets these, and all its nets.
 
+    Of a .caffemodel, the net inside it is checked (:func:`netspec.net.recovered.recover_net`).
+
     ``shapes`` are those of data layers' tops; the data of the others is opened with ``open_data``. ``weights``, paths
     separated by commas, are what a training would begin with, in the place of a solver's own; with ``strict`` they
     must have every layer. A file that cannot be read comes alone, without a net.
     """
     manner = _Manner(shapes or {}, open_data, allow_python, strict)
     given = [weights] if weights else []
+    if is_net_binary(path):
+        return [_check_weights(path, manner)]
     unknown: list[SpecError] = []
     try:
         net, source = parse_net(path, report=unknown.append)
@@ -96,6 +102,18 @@ def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
     """Return how far into a file a reader came: further as a net or as a solver tells which of them it is."""
     where = faults[-1].where
     return (where.line, where.column) if where else (0, 0)
+
+
+def _check_weights(path: str | Path, manner: _Manner) -> Checked:
+    """Check the net inside a .caffemodel, as a deploy net, and its weights."""
+    try:
+        net, source = recover_net(path, manner.shapes)
+    except SpecError as fault:
+        return Checked(str(path), None, [fault])
+    types = list(unknown_types(net, source))
+    if types:
+        return Checked(str(path), None, gathered(types))
+    return _check_net(with_state(net, TEST), source, str(path), [str(path)], replace(manner, shapes={}))
 
 
 def _check_net(

@@ -7,8 +7,9 @@ import logging
 from pathlib import Path
 
 from netspec import log
-from netspec.cli.arguments import device, positive
+from netspec.cli.arguments import device, positive, shape
 from netspec.cli.run import Commands
+from netspec.command_line import WrongUsage
 from netspec.errors import SpecError
 
 
@@ -31,13 +32,22 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--gpu", default="all", help="one number, several separated by commas, or all (the default)")
 
     for name, function, what in (
-        ("upgrade_net_proto_text", _upgrade_net_text, "a net's prototxt"),
+        ("upgrade_net_proto_text", _upgrade_net_text, "a net's prototxt, or the net inside a .caffemodel,"),
         ("upgrade_net_proto_binary", _upgrade_net_binary, "a .caffemodel"),
         ("upgrade_solver_proto_text", _upgrade_solver_text, "a solver's prototxt"),
     ):
         p = commands.add(name, function, f"write {what} in the current format")
         p.add_argument("input", metavar="IN")
         p.add_argument("output", metavar="OUT")
+        if name == "upgrade_net_proto_text":
+            p.add_argument(
+                "--shape",
+                action="append",
+                default=[],
+                type=shape,
+                metavar="BLOB=N,C,H,W",
+                help="of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input",
+            )
 
     commands.add("layers", _layers, "print the layers it knows, from their own descriptions", quiet=True)
 
@@ -77,9 +87,18 @@ def _device_query(arguments: argparse.Namespace) -> None:
 
 
 def _upgrade_net_text(arguments: argparse.Namespace) -> None:
+    from netspec.proto.binary import is_net_binary
     from netspec.proto.text import read_net, write_text
 
-    _write(arguments.output, write_text(read_net(arguments.input)).encode())
+    if is_net_binary(arguments.input):
+        from netspec.net.recovered import recover_net
+
+        net, _ = recover_net(arguments.input, dict(arguments.shape))
+    elif arguments.shape:
+        raise WrongUsage("--shape is for the net inside a .caffemodel; a prototxt has its own shapes")
+    else:
+        net = read_net(arguments.input)
+    _write(arguments.output, write_text(net).encode())
     log.info("upgrade_net_proto_text.cpp:49", f"Wrote upgraded NetParameter text proto to {arguments.output}")
 
 

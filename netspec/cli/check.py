@@ -16,7 +16,7 @@ def add_to(commands: Commands) -> None:
     p = commands.add(
         "check", _check, "build a net, or a solver's nets, and report every fault; nothing is written", True
     )
-    p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
+    p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt, or a .caffemodel")
     add_state(p, phase="TEST")
     p.add_argument(
         "--shape",

@@ -55,6 +55,18 @@ def parse_net_binary(path: str | Path, upgrade: bool = True) -> tuple[NetParamet
     return upgrade_net(net, source) if upgrade else (net, source)
 
 
+def is_net_binary(path: str | Path) -> bool:
+    """Say whether a file is a .caffemodel, by what it holds: the layers of a net in protobuf's binary form."""
+    try:
+        data = Path(path).read_bytes()
+        if b"\0" not in data:  # every number in it has one, and no text does
+            return False
+        net = NetParameter.FromString(data)
+    except (OSError, DecodeError):
+        return False
+    return bool(net.layer or net.layers)
+
+
 def _guess(data: bytes) -> str:
     """Say what else a file seems to be."""
     if data.startswith(b"\x89HDF\r\n\x1a\n"):

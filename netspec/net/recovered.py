@@ -1,0 +1,128 @@
+"""The net inside a .caffemodel, which holds its layers beside their weights: for weights whose prototxt is lost.
+
+What is in the file is the net as it ran, mostly a training: with Split layers, in one phase, reading a database.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from netspec import log
+from netspec.errors import SpecError, Where, did_you_mean
+from netspec.layers import layer_class
+from netspec.layers.base import Shape
+from netspec.proto.binary import parse_net_binary
+from netspec.proto.schema import LayerParameter, NetParameter
+from netspec.proto.source_map import SourceMap
+from netspec.proto.text import write_text
+
+
+def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParameter, SourceMap]:
+    """Return the deploy net of a .caffemodel, without its weights, and a map that knows the file only.
+
+    Layers that read data, and blobs that nothing makes, become Input layers of the ``shapes`` (blob -> shape) given. Of
+    a layer that reads cropped images the shape is known: one image, with the channels that the first layer's filters
+    have. What needs a label, or another blob that is not given, is left out; so are Split layers, phases and rules.
+    Raises SpecError where a shape is neither given nor known, and for a file that holds weights only.
+    """
+    trained, source = parse_net_binary(path)
+    where = Where(str(path))
+    if not any(layer.type for layer in trained.layer):
+        raise SpecError("holds weights, but no net", where)
+    layers = _without_splits(trained)
+    inputs = _inputs(layers)
+    for name in shapes:
+        if name not in inputs:
+            hint = did_you_mean(name, list(inputs)) or ";"
+            raise SpecError(f'--shape names "{name}"{hint} inputs of this net: {", ".join(inputs)}', where)
+    given = {name: shapes.get(name) or known for name, known in inputs.items()}
+    given = {name: shape for name, shape in given.items() if shape and 0 not in shape}
+    made = set(given)
+    net = NetParameter(name=trained.name)
+    for name, shape in given.items():
+        net.layer.add(name=name, type="Input", top=[name]).input_param.shape.add().dim.extend(shape)
+    missing = {name for name in inputs if name not in given}
+    without = []
+    for layer in layers:
+        if _reads_data(layer) or layer.type == "Input":
+            continue
+        if missing & set(layer.bottom):
+            missing.update(top for top in layer.top if top not in made)
+            without.append(layer.name)
+            continue
+        made.update(layer.top)
+        kept = net.layer.add()
+        kept.CopyFrom(layer)
+        for name in ("blobs", "phase", "include", "exclude"):
+            kept.ClearField(name)
+    if len(net.layer) == len(given):
+        advice = " or ".join(_advice(inputs))
+        raise SpecError(f"the file does not tell the shape of its input; say {advice}", where)
+    if without:
+        blobs = ", ".join(name for name in inputs if name not in given)
+        log.warning("net.cpp:746", f"{path}: left out, since no --shape says what {blobs} is: {', '.join(without)}")
+    return net, source.with_layers([source.net] * len(net.layer))
+
+
+def _without_splits(net: NetParameter) -> list[LayerParameter]:
+    """Return the layers without Split layers, their tops named again as what they copy."""
+    names: dict[str, str] = {}
+    layers = []
+    for layer in net.layer:
+        if layer.type == "Split":
+            names.update((top, names.get(layer.bottom[0], layer.bottom[0])) for top in layer.top)
+            continue
+        copy = LayerParameter()
+        copy.CopyFrom(layer)
+        copy.bottom[:] = [names.get(bottom, bottom) for bottom in layer.bottom]
+        layers.append(copy)
+    return layers
+
+
+def _reads_data(layer: LayerParameter) -> bool:
+    cls = layer_class(layer.type)
+    return not layer.bottom and (cls is None or cls.reads_data or layer.type == "Python")
+
+
+def _inputs(layers: list[LayerParameter]) -> dict[str, Shape]:
+    """Return the blobs that come from outside, and their shapes as far as the file tells: 0 is an unknown size."""
+    inputs: dict[str, Shape] = {}
+    made: set[str] = set()
+    for layer in layers:
+        if layer.type == "Input":
+            shapes = [tuple(shape.dim) for shape in layer.input_param.shape]
+            shapes = shapes * len(layer.top) if len(shapes) == 1 else shapes
+            inputs.update(zip(layer.top, shapes, strict=False))
+        elif _reads_data(layer):
+            inputs.update((top, _shape_of_images(layer, top, layers)) for top in layer.top)
+        for bottom in layer.bottom:
+            if bottom not in made and bottom not in inputs:
+                inputs[bottom] = (1, _channels(bottom, layers), 0, 0)
+        made.update(layer.top)
+    return inputs
+
+
+def _shape_of_images(reader: LayerParameter, top: str, layers: list[LayerParameter]) -> Shape:
+    side = reader.transform_param.crop_size
+    channels = _channels(top, layers)
+    if channels and (reader.transform_param.mean_value or reader.transform_param.scale != 1):
+        settings = " ".join(write_text(reader.transform_param).split())
+        log.warning("net.cpp:746", f'the net was trained with transform_param {{ {settings} }} for blob "{top}"')
+    return (1, channels, side, side)
+
+
+def _channels(blob: str, layers: list[LayerParameter]) -> int:
+    """Return the channels that the filters of the first convolution of a blob have; 0 where there is none."""
+    for layer in layers:
+        if blob in layer.bottom and layer.type == "Convolution" and layer.blobs:
+            shape = layer.blobs[0]
+            channels = shape.shape.dim[1] if len(shape.shape.dim) > 1 else shape.channels
+            return channels * layer.convolution_param.group
+    return 0
+
+
+def _advice(inputs: Mapping[str, Shape]) -> Iterator[str]:
+    for name, shape in inputs.items():
+        sizes = [str(size or letter) for size, letter in zip(shape, "NCHW", strict=False)]
+        yield f"--shape {name}={','.join(sizes)}"
