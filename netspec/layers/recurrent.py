@@ -102,8 +102,11 @@ class Recurrent(Layer):
             names = ", ".join(("the output", *self.state_names[:exposed]))
             raise self.error(f"found {self.num_tops} top blob(s), expected {names}", "top")
         x = self.bottom_shapes[0]
-        if len(x) < 2:
-            raise self.error(f"found a bottom of shape {x}, expected (time steps, streams, ...)", "bottom", 0)
+        if len(x) < 3:
+            raise self.error(f"found a bottom of shape {x}, expected (time steps, streams, inputs, ...)", "bottom", 0)
+        if self.has_static and len(self.bottom_shapes[2]) < 2:
+            message = f"found x_static of shape {self.bottom_shapes[2]}, expected (streams, inputs, ...)"
+            raise self.error(message, "bottom", 2)
         rows = self.gates * self.hidden
         self.add_blob((rows, math.prod(x[2:])), p.weight_filler)
         self.add_blob((rows,), p.bias_filler)

@@ -5,6 +5,7 @@ Caffe: SGDSolver::SnapshotSolverState, RestoreSolverState (src/caffe/solvers/sgd
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,34 @@ def read_state(path: str | Path) -> State:
         except ValueError as fault:
             raise SpecError(f"history blob {i}: {fault}", Where(str(path))) from None
     return State(proto.iter, proto.learned_net, proto.current_step, history)
+
+
+def has_squares(history: Sequence[np.ndarray], solver_type: str) -> bool:
+    """Say whether the second half of a history is a second set, such as Adam's: squares, where the type has none."""
+    half = len(history) // 2
+    first, second = (any((array < 0).any() for array in part) for part in (history[:half], history[half:]))
+    return not second and (first or solver_type in ("SGD", "Nesterov"))
+
+
+def merge_shared(history: list[np.ndarray], owners: Sequence[int]) -> list[np.ndarray]:
+    """Return one array for each learnable parameter, of a history with one for each layer that shares it.
+
+    So wrote Caffe before its commit of August 2015 that gave shared parameters one gradient: ``owners`` has, for each
+    blob of each layer, the number of its parameter. There each layer's gradient had its own history, and the sum of
+    their updates moved the parameter, so the histories are added up. Equal ones are copies, and count once.
+    """
+    sets = len(history) // len(owners)
+    parts: dict[tuple[int, int], list[np.ndarray]] = {}
+    for i, array in enumerate(history):
+        parts.setdefault((i // len(owners), owners[i % len(owners)]), []).append(array)
+    assert len(parts) == sets * (max(owners) + 1), "every parameter is some layer's"
+    merged = []
+    for _, arrays in sorted(parts.items(), key=lambda item: item[0]):
+        first = arrays[0]
+        others = [array.reshape(first.shape) for array in arrays[1:]]
+        copies = all(np.array_equal(first, other) for other in others)
+        merged.append(first if copies else np.sum([first, *others], axis=0, dtype=first.dtype))
+    return merged
 
 
 def write_state(path: str | Path, state: State) -> None:

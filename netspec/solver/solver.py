@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from netspec.solver.checks import check_prefix, check_settings, fields_without_e
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
-from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
+from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.tally import Outputs, Tally, as_scores, score_lines
 
 _CREATING = {
@@ -419,7 +420,7 @@ class Solver:
         state does not fit this solver's type and net.
         """
         where = Where(str(path))
-        state = read_state(path)
+        state = self._of_today(read_state(path), where)
         if len(state.history) != len(self.history):
             found, expected = len(state.history), len(self.history)
             message = (
@@ -440,6 +441,23 @@ class Solver:
         for net in (self.net, *self.test_nets):
             net.restart_data()
         self.replicas.restart_data()
+
+    def _of_today(self, state: State, where: Where) -> State:
+        """Return a state in today's form, where it has a history for each layer that shares a parameter."""
+        number = {id(learnable.parameter): i for i, learnable in enumerate(self.net.learnable)}
+        owners = [number[id(blob)] for layer in self.net.layers for blob in layer.blobs]
+        shapes = [shape for layer in self.net.layers for shape in layer.blob_shapes]
+        if len(state.history) == len(self.history) or len(state.history) != self._rule.sets * len(owners):
+            return state
+        if len(state.history) == 2 * len(self.history) and has_squares(state.history, self.param.type):
+            return state  # not of this type: the second half is another type's second set
+        for i, theirs in enumerate(state.history):
+            mine = shapes[i % len(shapes)]
+            if not _same_shape(mine, theirs.shape):
+                raise SpecError(f"history blob {i} has shape {theirs.shape}, expected {mine}", where)
+        told = "has a history for each layer, as before August 2015; those of shared parameters are added up"
+        log.warning("sgd_solver.cpp:336", f"{where}: {told}")
+        return replace(state, history=merge_shared(state.history, owners))
 
     def close(self) -> None:
         """Let go of the files and threads of all nets."""

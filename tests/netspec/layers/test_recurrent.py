@@ -193,7 +193,19 @@ def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
             text("LSTM"),
             [(T,), (T, N)],
             1,
-            "bottom.0: found a bottom of shape (4,), expected (time steps, streams, ...)",
+            "bottom.0: found a bottom of shape (4,), expected (time steps, streams, inputs, ...)",
+        ),
+        (
+            text("RNN"),
+            [(T, N), (T, N)],
+            1,
+            "bottom.0: found a bottom of shape (4, 2), expected (time steps, streams, inputs, ...)",
+        ),
+        (
+            text("RNN"),
+            [(T, N, 3), (T, N), (N,)],
+            1,
+            "bottom.2: found x_static of shape (2,), expected (streams, inputs, ...)",
         ),
         (
             text("RNN"),
