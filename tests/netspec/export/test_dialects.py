@@ -81,6 +81,7 @@ CASES: dict[str, tuple[str, str, dict[str, Shape]]] = {
     "BN of PSPNet": ("blocks", "type: 'BN' bn_param { frozen: true }", {"x": MAP}),
     "BN of SegNet": ("blocks", "type: 'BN' bn_param { bn_mode: INFERENCE }", {"x": MAP}),
     "BN by the batch": ("blocks", "type: 'BN' bn_param { bn_mode: LEARN }", {"x": MAP}),
+    "Transpose": ("layout", "type: 'Transpose' transpose_param { dim: [0, 2, 3, 1] }", {"x": MAP}),
     "Dropout": ("rcnn", "type: 'Dropout' dropout_param { dropout_ratio: 0.25 scale_train: false }", {"x": MAP}),
     "SmoothL1Loss": (
         "rcnn",
