@@ -1,17 +1,21 @@
 """Fast and Faster R-CNN and R-FCN: rbgirshick/caffe-fast-rcnn, daijifeng001/caffe-rfcn.
 
-Their proposals, anchors and targets are Python layers of py-faster-rcnn, which run with ``--allow-python-layers``.
+The anchors' targets, and proposals that are Python layers of py-faster-rcnn, run with ``--allow-python-layers``.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from netspec.dialects._boxes import as_array
+from netspec.dialects._proposals import all_anchors, base_anchors, moved, suppress
 from netspec.layers import Layer, common, register
 from netspec.layers.base import Shape, rounded
 from netspec.layers.loss.base import BATCH_SIZE, Loss, onnx_normalized_sum
@@ -32,7 +36,18 @@ message PSROIPoolingParameter {
   required int32 output_dim = 2;
   required int32 group_size = 3;
 }
+message ProposalParameter {
+  optional uint32 feat_stride = 1 [default = 16];
+  optional uint32 base_size = 2 [default = 16];
+  optional uint32 min_size = 3 [default = 16];
+  repeated float ratio = 4;
+  repeated float scale = 5;
+  optional uint32 pre_nms_topn = 6 [default = 6000];
+  optional uint32 post_nms_topn = 7 [default = 300];
+  optional float nms_thresh = 8 [default = 0.7];
+}
 extend LayerParameter {
+  optional ProposalParameter proposal_param = 10002;
   optional PSROIPoolingParameter psroi_pooling_param = 10001;
   optional ROIPoolingParameter roi_pooling_param = 8266711;
   optional SmoothL1LossParameter smooth_l1_loss_param = 8266712;
@@ -274,6 +289,72 @@ class PSROIPooling(_RegionPooling):
         ends = steps + start[:, None]
         pixels = torch.arange(size, dtype=first.dtype, device=first.device)
         return ((pixels >= ends[:, :-1, None].floor()) & (pixels < ends[:, 1:, None].ceil())).to(first.dtype)
+
+
+@register("Proposal", "proposal_param")
+class Proposal(Layer):
+    """Propose regions: anchors moved by what is predicted, the best of those that do not overlap.
+
+    An anchor for each ``ratio`` (height / width; 0.5, 1, 2) and each ``scale`` (8, 16, 32) of base_size pixels lies at
+    every feat_stride pixels. Of the pre_nms_topn of highest score, at most post_nms_topn stay, none of which overlaps a
+    better one by more than nms_thresh. Boxes with a side below min_size times the image's scale count as score 0. There
+    may be fewer regions than the top's declared shape says.
+
+    bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
+    bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor
+    bottom[2]  (1, 3) or (1, 4): height, width, scale of the image, or its scales of height and width
+    top[0]     regions (n, 5): 0, x1, y1, x2, y2
+    top[1]     optional: their scores (n,)
+    Fork: PVANet's and Intel's caffe, src/caffe/layers/proposal_layer.cpp
+    """
+
+    bottoms = (3, 3)
+    tops = (1, 2)
+    label_bottoms = frozenset({0, 1, 2})
+
+    @override
+    def setup(self) -> None:
+        """Make the anchors of one pixel."""
+        param = value(self.param, "proposal_param")
+        for name in ("feat_stride", "base_size", "pre_nms_topn", "post_nms_topn"):
+            if getattr(param, name) < 1:
+                raise self.error(f"{name} must be at least 1", "proposal_param", name)
+        for name in ("ratio", "scale"):
+            if any(number <= 0 for number in getattr(param, name)):
+                raise self.error(f"{name} must be above 0", "proposal_param", name)
+        self.anchors = base_anchors(param.base_size, param.ratio or (0.5, 1, 2), param.scale or (8, 16, 32))
+
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        scores, deltas, image = bottom_shapes
+        count = len(self.anchors)
+        if len(scores) != 4 or scores[:2] != (1, 2 * count):
+            raise self.error(f"found scores of shape {scores}, expected (1, {2 * count}, H, W)", "bottom", 0)
+        if deltas != (1, 4 * count, *scores[2:]):
+            expected = (1, 4 * count, *scores[2:])
+            raise self.error(f"found boxes of shape {deltas}, expected {expected}", "bottom", 1)
+        if image[:1] != (1,) or math.prod(image) not in (3, 4):
+            raise self.error(f"found an image's sizes of shape {image}, expected (1, 3) or (1, 4)", "bottom", 2)
+        most = value(self.param, "proposal_param").post_nms_topn
+        return [(most, 5), (most,)][: self.num_tops]
+
+    @override
+    def forward(self, scores: torch.Tensor, deltas: torch.Tensor, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the regions and their scores."""
+        param = value(self.param, "proposal_param")
+        count, (height, width) = len(self.anchors), scores.shape[2:]
+        sizes = as_array(image).reshape(-1)
+        anchors = all_anchors(self.anchors, param.feat_stride, height, width)
+        moves = as_array(deltas)[0].reshape(count, 4, height, width).transpose(2, 3, 0, 1).reshape(-1, 4)
+        boxes = moved(anchors, moves, sizes[0], sizes[1])
+        least = param.min_size * sizes[[-1, 2]]  # of width and height
+        large = (boxes[:, 2:] - boxes[:, :2] + 1 >= least).all(axis=1)
+        found = np.where(large, as_array(scores)[0, count:].transpose(1, 2, 0).reshape(-1), np.float32(0))
+        order = np.argsort(-found, kind="stable")[: param.pre_nms_topn]
+        order = order[suppress(boxes[order], param.nms_thresh, param.post_nms_topn)]
+        regions = np.concatenate([np.zeros((len(order), 1), np.float32), boxes[order]], axis=1)
+        tops = (torch.from_numpy(regions), torch.from_numpy(found[order]))
+        return tuple(top.to(scores) for top in tops[: self.num_tops])
 
 
 @register("SmoothL1Loss", "smooth_l1_loss_param")

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from netspec.dialects import use_dialect
+from netspec.dialects._proposals import base_anchors
 from netspec.errors import SpecError
 from netspec.layers import Layer
 from netspec.net.build import build_net
@@ -178,3 +179,80 @@ def test_fields_that_a_dialects_layers_read_are_not_warned_of(caplog: pytest.Log
     build_net(*parse_net_text(text, "f"), BuildOptions())
     (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "roi_pooling_param has no effect: a layer of type ReLU does not read it" in warning
+
+
+# Proposal
+
+# What py-faster-rcnn's generate_anchors gives for its defaults, as its own comments list them (x1, y1, x2, y2).
+ANCHORS = [
+    [-84, -40, 99, 55],
+    [-176, -88, 191, 103],
+    [-360, -184, 375, 199],
+    [-56, -56, 71, 71],
+    [-120, -120, 135, 135],
+    [-248, -248, 263, 263],
+    [-36, -80, 51, 95],
+    [-80, -168, 95, 183],
+    [-168, -344, 183, 359],
+]
+SETTINGS = "ratio: 1 scale: 1 feat_stride: 10 base_size: 10 min_size: 4 nms_thresh: 0.3"
+ONE = f"type: 'Proposal' proposal_param {{ {SETTINGS} %s }}"
+
+
+def test_the_anchors_are_those_of_faster_rcnn() -> None:
+    np.testing.assert_array_equal(base_anchors(16, (0.5, 1, 2), (8, 16, 32)), ANCHORS)
+
+
+def proposals(build: Build, scores: list[list[float]], more: str = "", **moves: float) -> tuple[np.ndarray, np.ndarray]:
+    """Regions and scores for a map of one anchor per pixel, 10 x 10 pixels each, in an image of 25 x 30."""
+    objects = torch.tensor(scores, dtype=torch.float32)[None, None]
+    deltas = torch.zeros(1, 4, *objects.shape[2:])
+    for name, number in moves.items():
+        deltas[0, ("dx", "dy", "dw", "dh").index(name), 0, 0] = number
+    layer = build("rcnn", ONE % more, (1, 2, *objects.shape[2:]), tuple(deltas.shape), (1, 3), tops=2)
+    regions, found = layer.run(torch.cat([1 - objects, objects], 1), deltas, torch.tensor([[25.0, 30.0, 1.0]]))
+    return regions.numpy(), found.numpy()
+
+
+def test_proposals_are_the_anchors_by_score_cut_at_the_border(build: Build) -> None:
+    regions, scores = proposals(build, [[0.5, 0.75, 0.125], [0.25, 1, 0.625], [0.375, 0.0625, 0.875]])
+    assert scores.tolist() == [1, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0625]
+    # An anchor of 10 to 19 becomes 10 to 20: its size counts both corners, the box made of it does not.
+    assert regions[0].tolist() == [0, 10, 10, 20, 20]
+    assert regions[1].tolist() == [0, 20, 20, 29, 24]
+    assert regions[2].tolist() == [0, 10, 0, 20, 10]
+    assert len(proposals(build, [[0.5, 0.75]], "post_nms_topn: 1")[0]) == 1
+
+
+def test_proposals_are_moved_and_scaled(build: Build) -> None:
+    regions, _ = proposals(build, [[1, 0]], dx=0.5, dy=0.2, dw=math.log(2), dh=math.log(0.5))
+    # The anchor is 10 x 10 around (5, 5): around (10, 7), 20 x 5.
+    np.testing.assert_allclose(regions[0], [0, 0, 4.5, 20, 9.5], atol=1e-5)
+
+
+def test_of_overlapping_proposals_the_best_stays(build: Build) -> None:
+    # Moved 5 pixels, the first is (5, 0, 15, 10) and shares 6 x 11 pixels with (10, 0, 20, 10): of 176, 0.375.
+    regions, scores = proposals(build, [[0.5, 0.75]], dx=0.5)
+    assert scores.tolist() == [0.75]
+    assert len(regions) == 1
+    assert len(proposals(build, [[0.5, 0.75]], "pre_nms_topn: 1")[0]) == 1
+
+
+def test_small_proposals_have_no_score(build: Build) -> None:
+    _, scores = proposals(build, [[1, 0.5]], dw=math.log(0.25))
+    assert scores.tolist() == [0.5, 0]
+
+
+@pytest.mark.parametrize(
+    ("shapes", "fault"),
+    [
+        (((2, 2, 3, 3), (2, 4, 3, 3), (1, 3)), r"found scores of shape .*, expected \(1, 2, H, W\)"),
+        (((1, 2, 3, 3), (1, 4, 3, 2), (1, 3)), r"found boxes of shape .*, expected \(1, 4, 3, 3\)"),
+        (((1, 2, 3, 3), (1, 4, 3, 3), (1, 2)), r"expected \(1, 3\) or \(1, 4\)"),
+    ],
+)
+def test_proposal_refuses_other_shapes(build: Build, shapes: tuple, fault: str) -> None:
+    with pytest.raises(SpecError, match=fault):
+        build("rcnn", ONE % "", *shapes)
+    with pytest.raises(SpecError, match="scale must be above 0"):
+        build("rcnn", "type: 'Proposal' proposal_param { scale: -1 }", *shapes)

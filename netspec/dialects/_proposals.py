@@ -1,0 +1,60 @@
+"""Region proposals as Faster R-CNN makes them: anchors, moved by what is predicted, the best ones kept.
+
+A box is (x1, y1, x2, y2) in pixels of the image, both corners included. Arrays are float32.
+Forks: Intel's caffe and PVANet, src/caffe/layers/proposal_layer.cpp; the Python layer of py-faster-rcnn
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+Array = np.ndarray
+
+
+def base_anchors(base_size: int, ratios: Sequence[float], scales: Sequence[float]) -> Array:
+    """Return the boxes (R S, 4) around the square of a first pixel of the map: for each ratio each scale.
+
+    A ratio is height / width; sides are rounded to pixels before they are scaled.
+    """
+    center = (base_size - 1) / 2
+    anchors = []
+    for ratio in ratios:
+        width = np.floor(np.sqrt(base_size * base_size / ratio) + 0.5)
+        height = np.floor(width * ratio + 0.5)
+        for scale in scales:
+            x, y = (width * scale - 1) / 2, (height * scale - 1) / 2
+            anchors.append([center - x, center - y, center + x, center + y])
+    return np.array(anchors, np.float32)
+
+
+def all_anchors(base: Array, stride: int, height: int, width: int) -> Array:
+    """Return the anchors of all pixels of a map: (height width A, 4), the pixels row after row."""
+    y, x = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
+    shifts = np.stack([x, y, x, y], axis=2).reshape(-1, 1, 4) * stride
+    return (shifts + base).reshape(-1, 4).astype(np.float32)
+
+
+def moved(anchors: Array, deltas: Array, height: float, width: float) -> Array:
+    """Return the anchors (n, 4) moved and scaled by the deltas (dx, dy, log dw, log dh), cut at the image's border."""
+    sizes = anchors[:, 2:] - anchors[:, :2] + 1
+    centers = anchors[:, :2] + sizes / 2 + deltas[:, :2] * sizes
+    halves = np.exp(deltas[:, 2:]) * sizes / 2
+    boxes = np.concatenate([centers - halves, centers + halves], axis=1)
+    return np.clip(boxes, 0, np.array([width - 1, height - 1] * 2, np.float32)).astype(np.float32)
+
+
+def suppress(boxes: Array, threshold: float, most: int) -> list[int]:
+    """Return the first ``most`` of boxes (n, 4), in this order, that overlap none kept before by more than that."""
+    areas = np.prod(boxes[:, 2:] - boxes[:, :2] + 1, axis=1)
+    left = np.arange(len(boxes))
+    kept: list[int] = []
+    while len(left) and len(kept) < most:
+        first, left = left[0], left[1:]
+        kept.append(int(first))
+        low = np.maximum(boxes[first, :2], boxes[left, :2])
+        high = np.minimum(boxes[first, 2:], boxes[left, 2:])
+        shared = np.prod(np.maximum(high - low + 1, 0), axis=1)
+        left = left[shared / (areas[first] + areas[left] - shared) <= np.float32(threshold)]
+    return kept
