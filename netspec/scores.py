@@ -67,4 +67,4 @@ def read_scores(path: str | Path) -> Scores:
     except OSError as fault:
         raise SpecError(f"cannot be read: {fault.strerror}", where) from None
     except (ValueError, KeyError, TypeError) as fault:
-        raise SpecError(f"this is no file of scores (netspec train --scores): {fault}", where) from None
+        raise SpecError(f"this is not a scores file (of netspec train --scores): {fault}", where) from None

@@ -40,9 +40,9 @@ def net_advice(net: Net) -> Iterator[str]:
 def solver_advice(solver: Any, node: Place, nets: list[Net]) -> Iterator[str]:
     """Yield a line for each thing in a solver, with its built nets (training net first), that is likely wrong."""
     if solver.snapshot > solver.max_iter:
-        yield f"{node.find('snapshot')}: snapshot {solver.snapshot} never fires in max_iter {solver.max_iter}"
+        yield f"{node.find('snapshot')}: snapshot {solver.snapshot} is more than max_iter {solver.max_iter}: no effect"
     elif not solver.snapshot and not solver.snapshot_after_train:
-        yield f"{node.where}: no snapshot is ever taken; set snapshot, or snapshot_after_train: true"
+        yield f"{node.where}: no snapshot is taken; set snapshot, or snapshot_after_train: true"
     for name in _settings_without_effect(solver):
         yield f"{node.find(name)}: {name} has no effect with type {solver.type} and lr_policy {solver.lr_policy}"
     for k, net in enumerate(nets[1:]):
@@ -102,7 +102,7 @@ def _losses(net: Net) -> Iterator[str]:
         return
     for i, weights in enumerate(net.loss_weights):
         if any(weights) and not net.backward_plan.layers[i]:
-            yield f"{_place(net, i)}: nothing that learns reaches this loss"
+            yield f"{_place(net, i)}: this loss depends on no learnable parameter"
 
 
 def _unused(net: Net) -> Iterator[str]:
@@ -113,7 +113,7 @@ def _unused(net: Net) -> Iterator[str]:
         for v in node.tops:
             name = net.plan.blobs[v]
             if net.plan.outputs.get(name) == v and not weighted[name] and not layer.label_bottoms and not layer.is_loss:
-                yield f'{_place(net, i)}: blob "{name}" is used by nothing'
+                yield f'{_place(net, i)}: no layer uses blob "{name}"'
 
 
 def _bare_batch_norms(net: Net) -> Iterator[str]:
@@ -123,7 +123,7 @@ def _bare_batch_norms(net: Net) -> Iterator[str]:
             readers.setdefault(v, set()).add(node.type)
     for i, node in enumerate(net.plan.nodes):
         if node.type == "BatchNorm" and "Scale" not in readers.get(node.tops[0], set()):
-            yield f"{_place(net, i)}: no Scale layer follows; Caffe's BatchNorm has no scale and shift of its own"
+            yield f"{_place(net, i)}: no Scale layer follows; Caffe's BatchNorm itself does not scale and shift"
 
 
 def _namesakes(net: Net) -> Iterator[str]:
@@ -131,7 +131,7 @@ def _namesakes(net: Net) -> Iterator[str]:
     names: set[str] = set()
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
         if node.name in names and layer.blob_shapes:
-            yield f"{_place(net, i)}: an earlier layer has this name, and gets the weights that are loaded by it"
+            yield f"{_place(net, i)}: an earlier layer has the same name; loaded weights go to that layer only"
         names.add(node.name)
 
 

@@ -21,7 +21,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("weights", help="the trained weights")
     p.add_argument("model", help="the net's prototxt, with a data layer")
     p.add_argument("blobs", help="blob names, separated by commas")
-    p.add_argument("databases", help="as many databases to write, separated by commas")
+    p.add_argument("databases", help="the databases to write, one per blob, separated by commas")
     p.add_argument("batches", type=positive, help="mini-batches to run")
     p.add_argument("db_type", choices=("lmdb", "leveldb"))
     p.add_argument("mode", nargs="?", choices=("CPU", "GPU"), default="CPU")
@@ -39,7 +39,7 @@ def add_to(commands: Commands) -> None:
         p.add_argument("input", metavar="IN")
         p.add_argument("output", metavar="OUT")
 
-    commands.add("layers", _layers, "print the layers it knows, from their own descriptions", quiet=True)
+    commands.add("layers", _layers, "list the layer types, each with its description", quiet=True)
 
 
 def _extract_features(arguments: argparse.Namespace) -> None:

@@ -33,7 +33,7 @@ class Commands(command_line.Commands):
         if quiet:
             added.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
             added.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
-        plugin = "a dialect: a fork's layers, by the name they come under or by a file of one's own; may be repeated"
+        plugin = "a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated"
         added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=plugin)
         return added
 

@@ -33,7 +33,7 @@ def add_to(commands: Commands) -> None:
     add_device(p)
     add_state(p, phase=None)
     p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
-    p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="default: snapshot")
+    p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="what SIGHUP does (default: snapshot)")
     add_python(p)
     add_exact(p)
 

@@ -60,14 +60,14 @@ def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) 
         if found != backend.lower():
             default = " (LEVELDB is Caffe's default)" if found == "lmdb" else ""
             named = found.upper()
-            raise ValueError(f"is of backend {named}, not {backend.upper()}{default}; say backend: {named}")
+            raise ValueError(f"has backend {named}, not {backend.upper()}{default}; set backend: {named}")
         identity = os.stat(os.path.join(source, "data.mdb") if found == "lmdb" else source)
         with _open_lock:
             reader = _open_readers.get((identity.st_dev, identity.st_ino))
             if reader is None:
                 reader = _LmdbReader(source) if found == "lmdb" else _LevelDbReader(source)
                 if not len(reader):
-                    raise ValueError("is empty: it holds no record")
+                    raise ValueError("is empty: it contains no records")
                 _open_readers[identity.st_dev, identity.st_ino] = reader
     except (ValueError, OSError) as fault:
         raise SpecError(f'database "{source}" {fault}', where or Where(source)) from None
@@ -83,14 +83,14 @@ def _kind(source: str) -> str:
     """Return the backend of the database in a folder."""
     folder = Path(source)
     if not folder.exists():
-        raise ValueError(f"is not there (relative paths start from {os.getcwd()})")
+        raise ValueError(f"does not exist (relative paths start from {os.getcwd()})")
     if not folder.is_dir():
-        raise ValueError("is a file; expected a folder with data.mdb (LMDB) or CURRENT (LevelDB) in it")
+        raise ValueError("is a file; expected a folder that contains data.mdb (LMDB) or CURRENT (LevelDB)")
     if (folder / "data.mdb").is_file():
         return "lmdb"
     if (folder / "CURRENT").is_file():
         return "leveldb"
-    raise ValueError("is a folder without data.mdb (LMDB) or CURRENT (LevelDB) in it, so it is no database")
+    raise ValueError("is a folder without data.mdb (LMDB) or CURRENT (LevelDB), so it is not a database")
 
 
 class _LmdbReader(Reader):
@@ -104,7 +104,7 @@ class _LmdbReader(Reader):
         stat = self._env.stat()
         pages = 2 + stat["branch_pages"] + stat["leaf_pages"] + stat["overflow_pages"]
         if size < pages * stat["psize"]:  # a read beyond the end of a mapped file kills the process
-            raise ValueError(f"is cut short: data.mdb has {size} bytes of at least {pages * stat['psize']}")
+            raise ValueError(f"is truncated: data.mdb has {size} bytes, expected at least {pages * stat['psize']}")
         self._length: int = stat["entries"]
         self._keys: list[bytes] = []
         self._lock = threading.Lock()
@@ -168,7 +168,7 @@ def _plyvel() -> ModuleType:
     try:
         import plyvel
     except ImportError:
-        raise ValueError("is a LevelDB, which needs a package more: pip install plyvel") from None
+        raise ValueError("is a LevelDB, which needs an extra package: pip install plyvel") from None
     return plyvel
 
 
@@ -191,7 +191,7 @@ class Writer:
 
     def __enter__(self) -> Writer:
         if os.path.lexists(self.path):
-            raise SpecError("exists already; remove it or choose another name for the database", Where(self.path))
+            raise SpecError("already exists; remove it or choose another name for the database", Where(self.path))
         try:
             os.makedirs(self._partial)
             self._store = (_LmdbStore if self._backend == "lmdb" else _LevelDbStore)(self._partial)
@@ -229,7 +229,7 @@ class Writer:
             if kind is None:
                 os.rename(self._partial, self.path)
         except (lmdb.Error, OSError) as fault:
-            raise SpecError(f"cannot put the finished database in its place ({fault})", Where(self.path)) from None
+            raise SpecError(f"cannot rename the finished database to its path ({fault})", Where(self.path)) from None
         finally:
             self._store = None
             shutil.rmtree(self._partial, ignore_errors=True)
@@ -250,7 +250,7 @@ class _LmdbStore:
 
     def put(self, key: bytes, value: bytes) -> None:
         if not 0 < len(key) <= self._longest:
-            raise lmdb.BadValsizeError(f"a key has 1 to {self._longest} bytes, not {len(key)}")
+            raise lmdb.BadValsizeError(f"found a key of {len(key)} bytes, expected 1 to {self._longest}")
         self._batch.append((key, value))
         self._bytes += len(key) + len(value)
         if len(self._batch) >= _COMMIT_RECORDS or self._bytes >= _COMMIT_BYTES:

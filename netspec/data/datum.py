@@ -22,7 +22,7 @@ def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
     Raises ValueError where the array has not three axes.
     """
     if array.ndim != 3:
-        raise ValueError(f"a Datum holds channels x height x width, found an array of shape {array.shape}")
+        raise ValueError(f"a Datum contains channels x height x width, found an array of shape {array.shape}")
     channels, height, width = array.shape
     datum = Datum(channels=channels, height=height, width=width)
     if array.dtype == np.uint8:
@@ -54,7 +54,7 @@ def parse_datum(record: bytes) -> Datum:
     try:
         return Datum.FromString(record)
     except DecodeError:
-        raise ValueError(f"is no Datum ({len(record)} bytes)") from None
+        raise ValueError(f"is not a Datum ({len(record)} bytes)") from None
 
 
 def datum_to_array(datum: Any, color: bool | None = None) -> np.ndarray:
@@ -71,7 +71,7 @@ def datum_to_array(datum: Any, color: bool | None = None) -> np.ndarray:
     values = np.frombuffer(data, np.uint8) if data else np.array(datum.float_data, np.float32)
     if len(values) != np.prod(shape) or len(values) == 0:
         field = "data" if data else "float_data"
-        raise ValueError(f"holds {len(values)} values in {field}, but says channels x height x width = {times(shape)}")
+        raise ValueError(f"contains {len(values)} values in {field}, but channels x height x width is {times(shape)}")
     return values.reshape(shape)
 
 
@@ -90,7 +90,7 @@ def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
     if pixels is None:
         raise ValueError("cannot be decoded as an image")
     if pixels.dtype != np.uint8:
-        raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits a channel can be read")
+        raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits per channel can be read")
     return pixels
 
 

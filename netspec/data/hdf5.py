@@ -103,7 +103,7 @@ class Hdf5Source:
     def _rows_of(self, name: str, place: Where) -> int:
         count, shapes = _row_shapes(name, place, self._tops)
         if shapes != self._row_shapes:
-            message = f'rows of "{name}" have the shapes {shapes}, those of "{self._files[0]}" {self._row_shapes}'
+            message = f'rows of "{name}" have shapes {shapes}, those of "{self._files[0]}" have {self._row_shapes}'
             raise SpecError(f"{message}; all files must agree", place)
         return count
 
@@ -117,14 +117,14 @@ def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list
                 dataset = file.get(top)
                 if not isinstance(dataset, h5py.Dataset):
                     found = ", ".join(f'"{key}"' for key in file) or "nothing"
-                    message = f'HDF5 file "{name}" has no dataset named like top "{top}"; it has {found}'
+                    message = f'HDF5 file "{name}" has no dataset "{top}", the name of a top; it has {found}'
                     raise SpecError(message, place)
                 datasets.append(dataset)
                 if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
-                    raise SpecError(f'dataset "{top}" of "{name}" holds no rows of numbers', place)
+                    raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', place)
             counts = [len(dataset) for dataset in datasets]
             if min(counts) != max(counts) or not counts[0]:
-                raise SpecError(f'datasets of "{name}" have {counts} rows; expected one number of rows, above 0', place)
+                raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', place)
             return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
     except OSError as fault:
         raise SpecError(f'HDF5 file "{name}" cannot be read: {fault}', place) from None
@@ -157,7 +157,7 @@ class Hdf5Sink:
             dataset = self._file[name]
             assert isinstance(dataset, h5py.Dataset)
             if dataset.shape[1:] != rows.shape[1:]:
-                message = f'rows of "{name}" had the shape {dataset.shape[1:]} so far, now {rows.shape[1:]}'
+                message = f'rows of "{name}" had shape {dataset.shape[1:]} in earlier batches, found {rows.shape[1:]}'
                 raise SpecError(message, self._where)
             dataset.resize(len(dataset) + len(rows), axis=0)
             dataset[-len(rows) :] = rows

@@ -73,7 +73,7 @@ def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:
         except ValueError:
             name = ""
         if not name:
-            raise SpecError(f'found "{line}", expected an image name, a blank and a whole-number label', place)
+            raise SpecError(f'found "{line}", expected an image name, a space and an integer label', place)
     if not images:
         raise SpecError(f'the image list "{path}" is empty', where or Where(path))
     return images

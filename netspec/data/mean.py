@@ -30,9 +30,9 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     except OSError as fault:
         raise SpecError(f'mean file "{path}" cannot be read: {fault.strerror}', where) from None
     except (DecodeError, ValueError) as fault:
-        raise SpecError(f'mean file "{path}" is no BlobProto of a mean image ({fault})', where) from None
+        raise SpecError(f'mean file "{path}" is not a BlobProto with a mean image ({fault})', where) from None
     if mean.ndim != 3 and not (mean.ndim == 4 and mean.shape[0] == 1):
-        raise SpecError(f'mean file "{path}" holds a blob of shape {mean.shape}, expected one image', where)
+        raise SpecError(f'mean file "{path}" contains a blob of shape {mean.shape}, expected one image', where)
     return mean.reshape(mean.shape[-3:]).astype(np.float32)
 
 
@@ -56,8 +56,8 @@ def compute_mean(reader: Reader, where: Where) -> np.ndarray:
             log.info("compute_image_mean.cpp:70", "Starting iteration")
             first, total = name, np.zeros(image.shape)
         if image.shape != total.shape:
-            message = f'record "{name}" is {times(image.shape)}, but the first one, "{first}", {times(total.shape)}'
-            raise SpecError(f"{message}; a mean needs images of one size", where)
+            message = f'record "{name}" is {times(image.shape)}, but the first, "{first}", is {times(total.shape)}'
+            raise SpecError(f"{message}; all images must have the same size", where)
         total += image
         if (i + 1) % 10000 == 0:
             log.info("compute_image_mean.cpp:95", f"Processed {i + 1} files.")

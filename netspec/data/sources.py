@@ -134,8 +134,8 @@ class _ImageSource:
     def _check_shape(self, item: _Item) -> None:
         shape = self._transform.output_shape(item.image.shape)
         if shape != self._shape:
-            first = f'the first one, "{self._first_name}", {times(self._shape)}'
-            advice = "all records must be of one size (or batch_size 1)"
+            first = f'the first record, "{self._first_name}", gives {times(self._shape)}'
+            advice = "all records must have the same size (or set batch_size: 1)"
             raise SpecError(f'record "{item.name}" gives {times(shape)}, but {first}; {advice}', item.where)
 
 

@@ -22,14 +22,14 @@ from netspec.proto.schema import TRAIN
 def contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
     """Yield a SpecError for each two settings of a transform_param that exclude each other."""
     if param.force_color and param.force_gray:
-        yield SpecError("force_color and force_gray exclude each other", at("transform_param", "force_gray"))
+        yield SpecError("force_color and force_gray cannot both be set", at("transform_param", "force_gray"))
     yield from mean_contradictions(param, at)
 
 
 def mean_contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
     """Yield a SpecError where a transform_param has two kinds of mean."""
     if param.HasField("mean_file") and param.mean_value:
-        yield SpecError("mean_file and mean_value exclude each other", at("transform_param", "mean_value"))
+        yield SpecError("mean_file and mean_value cannot both be set", at("transform_param", "mean_value"))
 
 
 class Transformer:
@@ -71,8 +71,8 @@ class Transformer:
         if self.crop_size > min(height, width):
             raise self._error(f"crop_size {self.crop_size} is larger than the image, {times(shape)}", "crop_size")
         if self._mean is not None and self._mean.shape != shape:
-            mean = f'the mean of "{self._mean_file}" is {times(self._mean.shape)}'
-            raise self._error(f"{mean}, the image (uncropped) {times(shape)}; they must be equal", "mean_file")
+            mean = f'the mean of "{self._mean_file}" has shape {times(self._mean.shape)}'
+            raise self._error(f"{mean}, the image before cropping {times(shape)}; they must be equal", "mean_file")
         if len(self.mean_values) not in (0, 1, channels):
             message = f"found {len(self.mean_values)} mean_value for {channels} channels, expected 1 or {channels}"
             raise self._error(message, "mean_value")

@@ -87,7 +87,7 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
             x1, y1, x2, y2 = map(int, corners)
             if overlap >= param.fg_threshold:
                 if label <= 0:
-                    raise SpecError(f"found label {label:g} for a foreground window, expected one above 0", place)
+                    raise SpecError(f"found label {label:g} for a foreground window, expected a label above 0", place)
                 found.foreground.append(Window(image, int(label), x1, y1, x2, y2))
             elif overlap < param.bg_threshold:
                 found.background.append(Window(image, 0, x1, y1, x2, y2))
@@ -127,7 +127,7 @@ class WindowSource:
         self._kinds = [self._file.background] * (param.batch_size - foreground) + [self._file.foreground] * foreground
         for kind, name in ((self._file.background, "background"), (self._file.foreground, "foreground")):
             if not kind and any(wanted is kind for wanted in self._kinds):
-                raise SpecError(f'"{param.source}" has no {name} windows, of which each batch needs some', where)
+                raise SpecError(f'"{param.source}" has no {name} windows, but each batch needs some', where)
         self._seed, self._stream, self._where = seed, stream, where
         count = len(self._file.foreground) + len(self._file.background)
         self.cursor = Cursor(count, param.batch_size, rank=rank, ranks=ranks)
@@ -167,7 +167,7 @@ class WindowSource:
         box, (top, left), (height, width) = self._fit(window, pixels.shape[0], pixels.shape[1], mirror)
         x1, y1, x2, y2 = box
         if not (0 <= x1 <= x2 < pixels.shape[1] and 0 <= y1 <= y2 < pixels.shape[0]):
-            raise SpecError(f'the window {window} does not lie within image "{path}"', self._where)
+            raise SpecError(f'the window {window} is not inside image "{path}"', self._where)
         if not (height and width):
             return
         patch = cv2.resize(pixels[y1 : y2 + 1, x1 : x2 + 1], (width, height), interpolation=cv2.INTER_LINEAR)

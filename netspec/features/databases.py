@@ -28,7 +28,8 @@ def extract_features(net: Net, blobs: Sequence[str], databases: Sequence[str], b
     """
     where = Where(net.plan.source.file)
     if len(blobs) != len(databases):
-        raise SpecError(f"found {len(blobs)} blob names and {len(databases)} databases, expected as many", where)
+        message = f"found {len(blobs)} blob names and {len(databases)} databases, expected one database per blob"
+        raise SpecError(message, where)
     check_blobs(blobs, net.shapes, net.plan.source.file)
     for name in blobs:
         if not 1 <= len(net.shapes[name]) <= 4:

@@ -45,13 +45,13 @@ class Scaling:
 
     def __str__(self) -> str:
         if not self.layer:
-            return "0 to 255, since no transform_param says otherwise"
+            return "0 to 255 (no transform_param)"
         values = self.mean.reshape(-1)
         channels = values[:1] if np.all(values == values[0]) else values
         told = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
         mean = f", minus {told}" if np.any(values) else ""
         scale = f", times {self.scale:g}" if self.scale != 1 else ""
-        return f'0 to 255{mean}{scale}, as the transform_param of layer "{self.layer}" says'
+        return f'0 to 255{mean}{scale} (transform_param of layer "{self.layer}")'
 
 
 class ImageNet:
@@ -170,8 +170,8 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
         if p.scale != 1 or p.mean_value or p.mean_file:
             settings = " ".join(write_text(p).split())
             log.logger.warning(
-                f"{weights} was trained with transform_param {{ {settings} }}, which {model} lacks: its images go in "
-                "as they are, 0 to 255; give the prototxt of the training as the model"
+                f"{weights} was trained with transform_param {{ {settings} }}, but {model} has no transform_param: its "
+                "pixels stay 0 to 255; use the training prototxt as the model"
             )
             return
 
@@ -179,7 +179,7 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
 def _read(path: Path, channels: int) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR if channels == 3 else cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise SpecError("cannot read this image", Where(str(path)))
+        raise SpecError("cannot be read as an image", Where(str(path)))
     return image
 
 

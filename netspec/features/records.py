@@ -25,7 +25,7 @@ def with_sources(net: Any, source: Any, sources: dict[str, str]) -> Any:
         if not layers:
             readers = [layer.name for layer in net.layer if layer.HasField("data_param")]
             known = ", ".join(dict.fromkeys(readers)) or "none"
-            raise SpecError(f'no data layer "{name}" to give a source to; this net\'s: {known}', Where(source.file))
+            raise SpecError(f'no data layer "{name}" in this net; its data layers: {known}', Where(source.file))
         for layer in layers:
             layer.data_param.source = path
     return changed
@@ -60,7 +60,7 @@ def extract_records(
                 value = net.blobs[name]
                 if value.dim() == 0 or value.shape[0] != batch:
                     message = (
-                        f'blob "{name}" has shape {tuple(value.shape)}, expected one row a record ({batch} a batch)'
+                        f'blob "{name}" has shape {tuple(value.shape)}, expected one row per record ({batch} per batch)'
                     )
                     raise SpecError(message, Where(net.plan.source.file))
                 parts[name].append(value.reshape(batch, -1).cpu().numpy())

@@ -45,7 +45,7 @@ def filter_net(net: NetParameter, source: SourceMap, report: Report = raise_faul
     for index, layer in enumerate(net.layer):
         if layer.include and layer.exclude:
             where = source.at(index, "exclude", layer=layer.name, type=layer.type)
-            report(SpecError("found both include and exclude rules, expected either one; remove one kind", where))
+            report(SpecError("found both include and exclude rules, expected only one kind; remove the other", where))
         if _included(net.state, layer):
             filtered.layer.add().CopyFrom(layer)
             kept.append(source.layers[index])

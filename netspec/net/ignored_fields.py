@@ -34,10 +34,10 @@ def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
     for (kind, path, reason), places in found.items():
         first = places[0]
         where = plan.source.at(first, *path, layer=plan.nodes[first].name, type=kind)
-        others = f" (nor in {len(places) - 1} more of these layers)" if len(places) > 1 else ""
+        others = f" (also in {len(places) - 1} more of these layers)" if len(places) > 1 else ""
         yield f"{where}: {'.'.join(path)} has no effect: {reason}{others}"
     if plan.net.debug_info:
-        yield f"{plan.source.net.find('debug_info')}: debug_info has no effect: only the solver's has"
+        yield f"{plan.source.net.find('debug_info')}: debug_info has no effect in a net; set it in the solver"
 
 
 def _unused(layer: Layer) -> Iterator[tuple[Path, str]]:

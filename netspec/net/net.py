@@ -312,7 +312,7 @@ class Net(torch.nn.Module):
                 continue
             shapes = (layer.blob_shapes, theirs.blob_shapes)
             if shapes[0] != shapes[1]:
-                message = f"cannot share weights with the training net: blobs {shapes[0]} here, {shapes[1]} there"
+                message = f"cannot share weights with the training net: shapes are {shapes[0]} here, {shapes[1]} there"
                 report(layer.error(message))
                 continue
             for j, blob in enumerate(theirs.blobs):

@@ -130,7 +130,7 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
     with _opened(path) as file:
         data = file.get("data")
         if not isinstance(data, h5py.Group):
-            raise SpecError("these are not weights: the HDF5 file has no group /data", Where(str(path)))
+            raise SpecError("this is not a weights file: the HDF5 file has no group /data", Where(str(path)))
         for name, arrays in _layer_groups(data):
             target = targets.get(name)
             if target is None:

@@ -58,4 +58,4 @@ def _guess(data: bytes) -> str:
         return "an HDF5 file; its name should end in .h5"
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:1000]):
         return "text"
-    return "something else, or a part of one: is the file whole?"
+    return "another kind of data, or a truncated file"

@@ -81,7 +81,7 @@ class _Reader:
             raise self._error(self._unknown_field(message, name.text), name)
         if not field.repeated and field.present(message):
             first = children[alias][0].where.line
-            raise self._error(f'"{alias}" was given already, in line {first}; it can be given once', name)
+            raise self._error(f'"{alias}" was already given in line {first}; it can be given only once', name)
         nodes = children.setdefault(alias, [])
         if self._at(":"):
             self._next()
@@ -261,7 +261,7 @@ class _Reader:
         for field in fields_of(message.DESCRIPTOR).values():
             if field.required and not field.present(message):
                 place = self._open[-1][1]
-                raise self._error(f'{message.DESCRIPTOR.name} lacks "{field.name}", which it requires', place)
+                raise self._error(f'{message.DESCRIPTOR.name} lacks the required field "{field.name}"', place)
 
     def _expected(self, what: str, where: str = "", token: Token | None = None, advice: str = "") -> SpecError:
         token = token or self.token

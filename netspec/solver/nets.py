@@ -49,7 +49,7 @@ def solver_nets(param: SolverParameter, node: Place, report: Report = raise_faul
     names = [name for name in TRAIN_FIELDS if param.HasField(name)]
     expected = f"expected exactly one of {', '.join(TRAIN_FIELDS)}"
     if not names:
-        report(SpecError(f"the solver names no net to train, {expected}", node.where))
+        report(SpecError(f"the solver has no net to train, {expected}", node.where))
     if len(names) > 1:
         report(SpecError(f"found {' and '.join(names)}, {expected}", node.find(names[1])))
     found = [read(name) for name in names]

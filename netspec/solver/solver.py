@@ -93,11 +93,11 @@ def choose_device(param: Any, node: Place) -> torch.device:
     count = torch.cuda.device_count()
     if not count:
         place = node.find("solver_mode")
-        log.warning("caffe.cpp:197", f"{place}: solver_mode GPU, but torch finds no GPU here: running on the CPU")
+        log.warning("caffe.cpp:197", f"{place}: solver_mode GPU, but torch finds no GPU: running on the CPU")
         return torch.device("cpu")
     if not 0 <= param.device_id < count:
         raise SpecError(
-            f"found device_id {param.device_id}, but torch finds {count} GPU(s) here", node.find("device_id")
+            f"found device_id {param.device_id}, but torch finds {count} GPU(s) on this machine", node.find("device_id")
         )
     return torch.device("cuda", param.device_id)
 

@@ -246,7 +246,7 @@ def test_a_missing_list_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_an_existing_database_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str], pair_list: str) -> None:
     (tmp_path / "db").mkdir()
-    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, pair_list], "exists already")
+    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, pair_list], "already exists")
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ def test_the_mean_image_and_its_log_are_caffes(tmp_path: Path, capsys: pytest.Ca
 
 def test_the_mean_of_a_missing_database_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute_image_mean([f"{tmp_path}/nix"]) == 1
-    assert capsys.readouterr().err.startswith(f'{tmp_path}/nix: database "{tmp_path}/nix" is not there')
+    assert capsys.readouterr().err.startswith(f'{tmp_path}/nix: database "{tmp_path}/nix" does not exist')
 
 
 @pytest.mark.slow

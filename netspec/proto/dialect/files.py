@@ -43,7 +43,7 @@ def known_files() -> dict[str, DialectFile]:
         except Exception:  # whatever another package does when it is imported, it must not hide the user's own fault
             spec = None
         if spec is None or spec.origin is None:
-            log.logger.warning(f'dialect "{point.name}": there is no module {module}; it is left out')
+            log.logger.warning(f'dialect "{point.name}": there is no module {module}; the dialect is ignored')
         else:
             found[point.name] = DialectFile(point.name, Path(spec.origin), module)
     for folder, package in FOLDERS:
@@ -59,8 +59,9 @@ def find_file(name: str | Path) -> DialectFile:
         return DialectFile(re.sub(r"\W", "_", path.stem), path)
     files = known_files()
     if str(name) not in files:
-        close = did_you_mean(str(name), list(files)) or f"; known ones: {', '.join(files)}, or the path of a .py file"
-        raise SpecError(f'there is no dialect "{name}"{close}')
+        known = f"; expected one of: {', '.join(files)}, or the path of a .py file"
+        close = did_you_mean(str(name), list(files)) or known
+        raise SpecError(f'unknown dialect "{name}"{close}')
     return files[str(name)]
 
 
@@ -73,7 +74,7 @@ def read_dialect(file: DialectFile) -> Dialect:
         raise SpecError(f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(str(file.path))) from None
     except SyntaxError as fault:
         place = Where(str(file.path), fault.lineno or 0, fault.offset or 0)
-        raise SpecError(f"this is not Python: {fault.msg}", place) from None
+        raise SpecError(f"this is not valid Python: {fault.msg}", place) from None
     source = ""
     for node in tree.body:
         if isinstance(node, ast.Assign) and any(_name(target) == "DECLARATIONS" for target in node.targets):
@@ -113,4 +114,4 @@ def announce_known() -> None:
         try:
             announce(read_dialect(file))
         except SpecError as fault:
-            log.logger.warning(f'dialect "{file.name}" is left out: {fault}')
+            log.logger.warning(f'dialect "{file.name}" is ignored: {fault}')

@@ -92,7 +92,7 @@ def activate(dialect: Dialect) -> None:
     file = dialect.declarations
     for full_name, field in dialect.fields():
         if field in fields_of(pool.FindMessageTypeByName(full_name)):
-            raise SpecError(f'{full_name} has a field "{field}" already', Where(file.name))
+            raise SpecError(f'{full_name} already has a field "{field}"', Where(file.name))
     _check_numbers(dialect)
     try:
         pool.FindFileByName(file.name)
@@ -109,8 +109,8 @@ def _check_numbers(dialect: Dialect) -> None:
     numbers = dialect.numbers()
     for other in _active.values():
         for key in numbers.keys() & other.numbers().keys():
-            message = f'number {key[1]} of {key[0]} is taken, by "{other.numbers()[key]}" of dialect "{other.name}"'
-            raise SpecError(f'{message}; give "{numbers[key]}" another one', Where(dialect.declarations.name))
+            message = f'number {key[1]} of {key[0]} is used by "{other.numbers()[key]}" of dialect "{other.name}"'
+            raise SpecError(f'{message}; give "{numbers[key]}" another number', Where(dialect.declarations.name))
 
 
 def _add(file: FileDescriptorProto) -> None:

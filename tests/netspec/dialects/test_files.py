@@ -90,15 +90,15 @@ def test_several_plugins_at_once(fork: Path, capsys: pytest.CaptureFixture[str])
 
 
 FAULTS = {
-    "no such dialect": (None, "ssdd", 'there is no dialect "ssdd"; did you mean "ssd"?'),
+    "no such dialect": (None, "ssdd", 'unknown dialect "ssdd"; did you mean "ssd"?'),
     "nothing like it": (
         None,
         "x" * 20,
-        f'there is no dialect "{"x" * 20}"; known ones: blocks, rcnn, ssd, or the path',
+        f'unknown dialect "{"x" * 20}"; expected one of: blocks, rcnn, ssd, or the path',
     ),
     "no such file": (None, "{path}", "{path}: cannot be read: No such file or directory"),
     "not text": (b"\xff\xfe", "{path}", "{path}: cannot be read: 'utf-8' codec can't decode"),
-    "not Python": (b"a = 1\nclass B(:\n", "{path}", "{path}:2:9: this is not Python: "),
+    "not Python": (b"a = 1\nclass B(:\n", "{path}", "{path}:2:9: this is not valid Python: "),
     "nothing in it": (b"a = 1\n", "{path}", "{path}: declares no dialect: neither DECLARATIONS nor a layer"),
     "declarations that are computed": (
         b"import os\nDECLARATIONS = os.linesep\n",
@@ -113,7 +113,7 @@ FAULTS = {
     "a field that Caffe has": (
         b'DECLARATIONS = "extend LayerParameter { optional int32 name = 990; }"\n',
         "{path}",
-        '{path}: caffe.LayerParameter has a field "name" already',
+        '{path}: caffe.LayerParameter already has a field "name"',
     ),
     "a type that Caffe has": (
         b'from netspec.layers import *\n@register("ReLU")\nclass A(Layer): pass\n',
@@ -150,7 +150,7 @@ def test_two_dialects_with_one_type_number_or_name_do_not_go_together(fork: Path
     third = tmp_path / "same_number.py"
     third.write_text('DECLARATIONS = "extend LayerParameter { optional int32 even_more = 1000; }"\n')
     with pytest.raises(
-        SpecError, match=r'number 1000 of caffe\.LayerParameter is taken, by "times_param" of dialect "doub'
+        SpecError, match=r'number 1000 of caffe\.LayerParameter is used by "times_param" of dialect "doub'
     ):
         use_dialect(third)
     namesake = tmp_path / "elsewhere" / "doubling.py"
@@ -254,8 +254,8 @@ def test_a_packages_entry_point_is_hinted_at_and_used(tmp_path: Path, capsys: py
     assert main(["check", str(net)]) == 1
     error = capsys.readouterr().err
     assert 'dialect "doubling_too" has "thrice_param"; add --plugin doubling_too' in error
-    assert 'dialect "absent": there is no module forky.absent; it is left out' in error
-    assert 'dialect "nothing" is left out: ' in error
+    assert 'dialect "absent": there is no module forky.absent; the dialect is ignored' in error
+    assert 'dialect "nothing" is ignored: ' in error
     assert "forky.doubling" not in sys.modules
     assert main(["check", str(net), "--plugin", "doubling_too"]) == 0
     cls = layer_class("Thrice")
