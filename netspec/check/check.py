@@ -1,7 +1,7 @@
-"""What a file builds: shapes, parameters, memory, multiply-adds; and all that is wrong with it, at once.
+"""What a file builds: shapes, parameters, memory, multiply-adds; and all errors in it at once.
 
-Whatever a training would refuse before its first iteration is found here, without writing anything and, unless asked,
-without opening data. Of one text file that cannot be read the first fault is reported, of one layer's own settings too.
+All errors that would stop a training before its first iteration are found here. Nothing is written, and data is opened
+only on request. A text file that cannot be parsed gives its first error only; so do the settings of one layer.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from netspec.solver.solver import choose_device
 
 @dataclass
 class Checked:
-    """One net of the file: ``label`` says which; ``advice`` is about what is legal but likely wrong.
+    """One net of the file, named by ``label``; ``advice`` lists what is legal but likely wrong.
 
-    A solver comes first, under its own path and without a net.
+    A solver comes first: its label is its path, and it has no net.
     """
 
     label: str
@@ -59,11 +59,11 @@ def check_file(
     weights: str | None = None,
     allow_python: bool = False,
 ) -> list[Checked]:
-    """Check a net for a phase, level and stages, or a solver, whose training net gets these, and all its nets.
+    """Check a net for a phase, level and stages; or a solver and all its nets, where the training net gets these.
 
-    ``shapes`` are those of data layers' tops; the data of the others is opened with ``open_data``. ``weights``, paths
-    separated by commas, are what a training would begin with, in the place of a solver's own. Raises SpecError where
-    the file itself cannot be read.
+    ``shapes`` are given shapes of data layers' tops; other data is opened if ``open_data`` is set. ``weights`` are
+    paths, separated by commas, of the weights that a training would start from; they replace the solver's own. Raises
+    SpecError if the file itself cannot be read.
     """
     manner = _Manner(shapes or {}, open_data, allow_python)
     given = [weights] if weights else []
@@ -82,14 +82,14 @@ def check_file(
 
 
 def _reach(fault: SpecError) -> tuple[int, int]:
-    """Return how far into a file a reader came: further as a net or as a solver tells which of them it is."""
+    """Return the place of a read error: the reader that gets further (net or solver) is the right one."""
     return (fault.where.line, fault.where.column) if fault.where else (0, 0)
 
 
 def _check_net(
     net: NetParameter, source: SourceMap, label: str, weights: Iterable[str], manner: _Manner, seed: int = 0
 ) -> Checked:
-    """Build a net (its ``state`` set) on no device, hold weights against it, and collect the faults."""
+    """Build a net (its ``state`` set) without memory, check weights against it, and collect the errors."""
     faults: list[SpecError] = []
     options = BuildOptions(
         torch.device("meta"),

@@ -1,4 +1,4 @@
-"""What is legal and yet likely a mistake: the warnings of ``netspec check``."""
+"""What is legal but likely a mistake: the warnings of ``netspec check``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from netspec.net.net import Net
 from netspec.proto.schema import TRAIN
 from netspec.proto.source_map import Place
 
-FAR = 0.1  # of the records may be missed, or met twice, by a test
-#: What of the settings of a rate policy, and of an update rule, each reads.
+FAR = 0.1  # share of the records that a test may skip, or read twice
+#: The settings that each rate policy, and each update rule, reads.
 POLICY_SETTINGS = {
     "step": ("gamma", "stepsize"),
     "exp": ("gamma",),
@@ -59,7 +59,7 @@ def _settings_without_effect(solver: Any) -> Iterator[str]:
 
 
 def missing_data(net: Any, kept: Any, source: Any) -> Iterator[str]:
-    """Yield a line where every data layer of ``net`` was filtered away and nothing feeds what is ``kept``."""
+    """Yield a line if every data layer of ``net`` was filtered out, so that nothing feeds the ``kept`` layers."""
     readers = [i for i, layer in enumerate(net.layer) if not layer.bottom and layer.type != "Input"]
     fed = any(not layer.bottom for layer in kept.layer)
     if readers and kept.layer and not fed:
@@ -69,7 +69,7 @@ def missing_data(net: Any, kept: Any, source: Any) -> Iterator[str]:
 
 
 def _towers(net: Net) -> Iterator[str]:
-    """A ContrastiveLoss compares two towers: whatever one of them learns, the other should share."""
+    """A ContrastiveLoss compares two towers: they should share all their parameters."""
     producer = {v: i for i, node in enumerate(net.plan.nodes) for v in node.tops}
 
     def upstream(v: int) -> set[int]:
@@ -107,7 +107,7 @@ def _losses(net: Net) -> Iterator[str]:
 
 def _unused(net: Net) -> Iterator[str]:
     if not any(any(weights) for weights in net.loss_weights):
-        return  # a deploy net: its outputs are what it is for
+        return  # a deploy net: its outputs are its purpose
     weighted = net.output_loss_weights
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
         for v in node.tops:
@@ -127,7 +127,7 @@ def _bare_batch_norms(net: Net) -> Iterator[str]:
 
 
 def _namesakes(net: Net) -> Iterator[str]:
-    """Saved weights find their layer by its name."""
+    """Saved weights are assigned to layers by name."""
     names: set[str] = set()
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
         if node.name in names and layer.blob_shapes:
@@ -136,7 +136,7 @@ def _namesakes(net: Net) -> Iterator[str]:
 
 
 def _test_size(iterations: int, where: Where, net: Net) -> Iterator[str]:
-    """Compare the records that a test reads with those there are, where the data is open."""
+    """Compare the number of records that a test reads with the number that exists, if the data is open."""
     for layer in net.layers:
         records = getattr(layer, "num_records", 0)
         if records:

@@ -1,4 +1,4 @@
-"""Options that several commands have, and what their words mean."""
+"""Options that several commands share, and how their values are read."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def stages(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 
 def devices(gpu: str) -> list[Any]:
-    """Return the torch devices of ``--gpu``: the CPU where it is empty, every GPU for ``all``, else those numbered."""
+    """Return the torch devices of ``--gpu``: the CPU where it is empty, every GPU for ``all``, else the listed ones."""
     import torch
 
     if not gpu:
@@ -104,7 +104,7 @@ def bar(description: str, unit: str) -> Callable[[Any], Any]:
 
 
 def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str) -> Any:
-    """Return the net of ``--model``, on the device of ``--gpu``; the sites are where Caffe logs which device."""
+    """Return the net of ``--model``, on the device of ``--gpu``; the sites are where Caffe logs the device."""
     from netspec.net.build import load_net
 
     chosen = device(arguments.gpu)

@@ -17,7 +17,7 @@ def add_to(commands: Commands) -> None:
     p = commands.add(
         "extract_features", _extract_features, "write blobs to databases of float Datums (extract_features)"
     )
-    p.set_defaults(log_level=logging.WARNING)  # Caffe's tool does not tell how it builds the net
+    p.set_defaults(log_level=logging.WARNING)  # Caffe's tool does not log how it builds the net
     p.add_argument("weights", help="the trained weights")
     p.add_argument("model", help="the net's prototxt, with a data layer")
     p.add_argument("blobs", help="blob names, separated by commas")

@@ -73,7 +73,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:
-    """Have the solver write its scores; a training that goes on keeps those that it found before."""
+    """Make the solver write its scores; a resumed training keeps the earlier ones."""
     scores = read_scores(path).before(solver.iteration) if resumed and Path(path).exists() else Scores()
     scores.write(path)
 

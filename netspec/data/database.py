@@ -22,14 +22,14 @@ from netspec import log
 from netspec.errors import SpecError, Where
 
 BACKENDS = ("lmdb", "leveldb")
-_SCAN = 4096  # keys listed ahead of the one that is asked for
+_SCAN = 4096  # keys listed ahead of the requested one
 _PATIENCE = 1.0  # seconds
 _FIRST_MAP_SIZE = 1 << 20  # Caffe's
 _COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a batch stays in memory until it is committed
 
 
 class Reader(ABC):
-    """Read access to a database, by record number; safe in threads."""
+    """Read access to a database, by record number; thread-safe."""
 
     @abstractmethod
     def __len__(self) -> int:
@@ -44,15 +44,15 @@ class Reader(ABC):
         """Return the value of record ``i``."""
 
 
-# A database cannot be opened twice in a process; the training and the test net, say, may name the same one.
+# A database cannot be opened twice in a process, but two nets (training and test, for example) may use the same one.
 _open_readers: weakref.WeakValueDictionary[tuple[int, int], Reader] = weakref.WeakValueDictionary()
 _open_lock = threading.Lock()
 
 
 def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) -> Reader:
-    """Open a database for reading; it is closed when nobody refers to the reader any more.
+    """Open a database for reading; it is closed when the last reference to the reader is gone.
 
-    ``where`` is the place that names the source. Raises SpecError for a database that is missing, empty, damaged or of
+    ``where`` is the place that names the source. Raises SpecError for a database that is missing, empty, damaged or has
     the other backend.
     """
     try:
@@ -94,7 +94,7 @@ def _kind(source: str) -> str:
 
 
 class _LmdbReader(Reader):
-    """An LMDB, opened without locks, so that read-only media and forked workers are fine."""
+    """An LMDB, opened without locks, so that it works on read-only media and in forked workers."""
 
     def __init__(self, source: str) -> None:
         size = os.path.getsize(os.path.join(source, "data.mdb"))
@@ -124,7 +124,7 @@ class _LmdbReader(Reader):
         return value
 
     def _list_keys(self, upto: int) -> None:
-        """Walk on from the last key known: on a slow disk a walk over all keys of a large database takes minutes."""
+        """Continue from the last known key: on a slow disk, listing all keys of a large database takes minutes."""
         with self._lock, self._env.begin() as transaction, transaction.cursor() as cursor:
             more = cursor.set_key(self._keys[-1]) and cursor.next() if self._keys else cursor.first()
             while more and len(self._keys) < upto:
@@ -133,7 +133,7 @@ class _LmdbReader(Reader):
 
 
 def _open_lmdb(source: str) -> lmdb.Environment:
-    """Open an environment, with patience: a reader that another thread has just let go of may still be closing."""
+    """Open an environment, with retries: a reader that another thread has just released may still be closing."""
     patience = time.monotonic() + _PATIENCE
     while True:
         try:
@@ -173,11 +173,11 @@ def _plyvel() -> ModuleType:
 
 
 class Writer:
-    """Writes a new database that appears at its path only when it is whole.
+    """Writes a new database that appears at its path only when it is complete.
 
-    A context manager: records are put into a hidden folder beside, which takes the path's name at the end, and is
-    removed if anything went wrong. Missing folders above it are made. Memory stays flat, and real Caffe reads the
-    result. Raises SpecError where the path exists already (as Caffe does) or cannot be written to.
+    A context manager: records are put into a hidden folder beside the path, which is renamed at the end, or removed
+    after an error. Missing parent folders are made. Memory use is constant, and real Caffe reads the result. Raises
+    SpecError if the path already exists (as Caffe does) or cannot be written to.
     """
 
     def __init__(self, path: str, backend: str = "lmdb") -> None:
@@ -202,7 +202,7 @@ class Writer:
         return self
 
     def put(self, key: bytes, value: bytes) -> None:
-        """Add a record; a second one of the same key takes the place of the first."""
+        """Add a record; a second one with the same key replaces the first."""
         assert self._store is not None, "put() outside of the with block"
         try:
             self._store.put(key, value)
@@ -211,7 +211,7 @@ class Writer:
             raise SpecError(f'cannot write record "{name}" ({fault})', Where(self.path)) from None
 
     def commit(self) -> None:
-        """Hand what was put so far to the file system."""
+        """Write the records put so far to the file system."""
         assert self._store is not None, "commit() outside of the with block"
         try:
             self._store.commit()
@@ -236,9 +236,9 @@ class Writer:
 
 
 class _LmdbStore:
-    """A growing LMDB: a batch that finds the map full is written once more, into a map twice as large.
+    """A growing LMDB: if the map is full, the batch is written again into a map twice as large.
 
-    Caffe: LMDBTransaction (src/caffe/util/db_lmdb.cpp), whose files these are byte for byte as long as 1000 records are
+    Caffe: LMDBTransaction (src/caffe/util/db_lmdb.cpp); the files are equal byte for byte as long as 1000 records are
     no more than ``_COMMIT_BYTES``.
     """
 

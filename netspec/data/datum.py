@@ -19,7 +19,7 @@ from netspec.proto.schema import Datum
 def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
     """Return a Datum of an array (C, H, W): uint8 goes into ``data``, any other type as floats into ``float_data``.
 
-    Raises ValueError where the array has not three axes.
+    Raises ValueError if the array does not have three axes.
     """
     if array.ndim != 3:
         raise ValueError(f"a Datum contains channels x height x width, found an array of shape {array.shape}")
@@ -38,8 +38,8 @@ def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
 def encoded_datum(image: bytes, label: int | None = None, shape: tuple[int, int, int] | None = None) -> Datum:
     """Return a Datum of an image file's bytes (PNG, JPEG, ...).
 
-    ``shape`` (C, H, W) is written for an image that was encoded here, and left out for a file stored as it is, which is
-    how Caffe has it (EncodeCVMatToDatum, ReadFileToDatum).
+    ``shape`` (C, H, W) is written for an image that was encoded here, and omitted for a file stored as it is, as in
+    Caffe (EncodeCVMatToDatum, ReadFileToDatum).
     """
     datum = Datum(data=image, encoded=True)
     if shape is not None:
@@ -50,7 +50,7 @@ def encoded_datum(image: bytes, label: int | None = None, shape: tuple[int, int,
 
 
 def parse_datum(record: bytes) -> Datum:
-    """Return the Datum that a record holds; raises ValueError where it holds none."""
+    """Return the Datum of a record; raises ValueError if the record is not a Datum."""
     try:
         return Datum.FromString(record)
     except DecodeError:
@@ -58,10 +58,10 @@ def parse_datum(record: bytes) -> Datum:
 
 
 def datum_to_array(datum: Any, color: bool | None = None) -> np.ndarray:
-    """Return the values (C, H, W): uint8 from ``data``, float32 from ``float_data``; ``data`` where both are given.
+    """Return the values (C, H, W): uint8 from ``data``, float32 from ``float_data``; ``data`` if both are given.
 
-    An encoded image is decoded, to three channels where ``color`` is true, to one where it is false, and to what the
-    file has where it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that
+    An encoded image is decoded: to three channels if ``color`` is true, to one if it is false, to the file's channels
+    if it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that
     contradicts itself or cannot be decoded.
     """
     if datum.encoded:

@@ -18,14 +18,14 @@ from netspec.data.random_words import permutation
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
 
-_FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may straddle two
+_FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may span two
 
 
 class Hdf5Source:
-    """The datasets named like the tops, row by row, from the files that ``list_file`` names (blank-separated).
+    """The datasets with the names of the tops, row by row, from the files listed in ``list_file`` (space-separated).
 
-    A batch may straddle files. With ``shuffle`` each epoch has its own order of files, and of the rows within each.
-    Raises SpecError for a missing file or dataset, and where rows differ in shape between files.
+    A batch may span files. With ``shuffle`` each epoch has its own order of files, and of the rows within each file.
+    Raises SpecError for a missing file or dataset, and if rows differ in shape between files.
     """
 
     def __init__(
@@ -133,8 +133,8 @@ def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list
 class Hdf5Sink:
     """A new HDF5 file with the growing datasets ``data`` and ``label``, both 4-D as Caffe writes them.
 
-    Caffe stops at the second batch, since its datasets exist by then; here batches are appended, and each call leaves
-    the file readable. Raises SpecError where the file cannot be written or a batch does not go with those before it.
+    Caffe stops at the second batch, because its datasets then exist; here batches are appended. The file is readable
+    after each call. Raises SpecError if the file cannot be written or a batch has another shape than those before it.
     """
 
     NAMES = ("data", "label")

@@ -22,7 +22,7 @@ from netspec.whole_file import whole_file
 def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     """Return the mean image of a .binaryproto file: float32 (C, H, W).
 
-    ``where`` is the place that names the file. Raises SpecError where it cannot be read or holds no image.
+    ``where`` is the place that names the file. Raises SpecError if it cannot be read or is not an image.
     """
     log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
     try:
@@ -39,8 +39,8 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
 def compute_mean(reader: Reader, where: Where) -> np.ndarray:
     """Return the mean of all records of a database, encoded or not: float32 (C, H, W).
 
-    Sums are exact, where Caffe's floats begin to round at some 65,000 images. Raises SpecError for a record that is no
-    image, or of another size than the first.
+    Sums are exact; Caffe's floats begin to round at about 65,000 images. Raises SpecError for a record that is not an
+    image, or has another size than the first.
     """
     first, total = "", np.zeros(0)
     for i in range(len(reader)):
@@ -76,7 +76,7 @@ def write_mean(path: str, mean: np.ndarray) -> None:
 
 
 def channel_means(mean: np.ndarray) -> list[float]:
-    """Return the mean of each channel, summed one by one in float32 as compute_image_mean does."""
+    """Return the mean of each channel, summed one by one in float32 like compute_image_mean."""
     log.info("compute_image_mean.cpp:114", f"Number of channels: {len(mean)}")
     means = [float(np.cumsum(channel, dtype=np.float32)[-1] / np.float32(channel.size)) for channel in mean]
     for c, value in enumerate(means):

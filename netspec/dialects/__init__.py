@@ -39,7 +39,7 @@ To write one, put this into a file, say ``doubling.py``, and pass ``--plugin dou
 fork, new fields of Caffe's messages in ``extend``; one plain string. A layer is as Caffe's own are
 (netspec/layers/base.py);
 ``@register`` has its type and the fields of LayerParameter that it reads: a net warns of those that nobody reads.
-``@register("Dropout", ..., replaces=Dropout)`` puts a subclass in the place of one of Caffe's layers, to honour a
+``@register("Dropout", ..., replaces=Dropout)`` puts a subclass in the place of one of Caffe's layers, to honor a
 field that the fork added to it. To offer a dialect with a package, name its module in that package's pyproject.toml::
 
     [project.entry-points."netspec.dialects"]
@@ -75,7 +75,7 @@ def use_dialect(name: str | Path) -> None:
     for layer_type in () if module in sys.modules else dialect.layer_types:
         cls = layer_class(layer_type)
         if cls is not None:
-            message = f'layer type "{layer_type}" is there already, from {cls.__module__}'
+            message = f'layer type "{layer_type}" already exists, from {cls.__module__}'
             raise SpecError(message, Where(str(file.path)))
     activate(dialect)
     try:

@@ -336,10 +336,10 @@ class Normalize(Layer):
 
 @register("PriorBox", "prior_box_param")
 class PriorBox(Layer):
-    """Lay boxes of some sizes and aspect ratios around the centre of every pixel of a map.
+    """Lay boxes of some sizes and aspect ratios around the center of every pixel of a map.
 
     For each min_size: a square of it; with max_sizes a square of sqrt(min_size max_size); then for each aspect_ratio
-    r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centres are at
+    r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centers are at
     (index + offset) step; where they are not given, the step is image / map and the image is bottom[1].
 
     bottom[0]  the map (N, C, H, W)
@@ -357,7 +357,7 @@ class PriorBox(Layer):
         if not param.min_size or min(param.min_size) < 1:
             raise self.error("min_size must be given and be at least 1", "prior_box_param", "min_size")
         if param.max_size and len(param.max_size) != len(param.min_size):
-            message = f"found {len(param.max_size)} max_size, expected none or {len(param.min_size)}, one a min_size"
+            message = f"found {len(param.max_size)} max_size, expected none or {len(param.min_size)}, one per min_size"
             raise self.error(message, "prior_box_param", "max_size")
         for i, (small, large) in enumerate(zip(param.min_size, param.max_size, strict=False)):
             if large <= small:

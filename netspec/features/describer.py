@@ -12,11 +12,11 @@ from netspec.features.views import read_zooms
 
 
 class Describer:
-    """A callable that gives blob ``blob`` of a net for an image that goes into its blob ``input``.
+    """A callable that returns blob ``blob`` of a net for an image given as its blob ``input``.
 
-    The net is the prototxt ``model`` in phase TEST, cut down to what computes the blob; the pixels are scaled as its
-    data layer's transform_param says. ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how
-    many. Raises SpecError for faults of the files.
+    The net is the prototxt ``model`` in phase TEST, reduced to the layers that compute the blob. Pixels are scaled by
+    the transform_param of its data layer. ``zooms``, such as "1,0.7", gives the views of each image, ``views`` their
+    number. Raises SpecError for errors in the files.
     """
 
     def __init__(

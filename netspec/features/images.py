@@ -1,4 +1,4 @@
-"""A blob of a net over image files: what Caffe's users wrote around pycaffe. The file it makes: docs/features.md."""
+"""A blob of a net for image files, as users of Caffe compute it with pycaffe. The file format: docs/features.md."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from netspec.proto.schema import TEST, LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 
-BATCH = 16  # images at once
+BATCH = 16  # images per forward pass
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """(x - mean) * scale; ``mean`` broadcasts against (C, H, W). ``layer`` is whose transform_param says so, if any."""
+    """(x - mean) * scale; ``mean`` broadcasts against (C, H, W). ``layer`` has the transform_param, if any."""
 
     mean: np.ndarray
     scale: float
@@ -48,18 +48,18 @@ class Scaling:
             return "0 to 255 (no transform_param)"
         values = self.mean.reshape(-1)
         channels = values[:1] if np.all(values == values[0]) else values
-        told = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
-        mean = f", minus {told}" if np.any(values) else ""
+        text = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
+        mean = f", minus {text}" if np.any(values) else ""
         scale = f", times {self.scale:g}" if self.scale != 1 else ""
         return f'0 to 255{mean}{scale} (transform_param of layer "{self.layer}")'
 
 
 class ImageNet:
-    """The part of a net that computes ``blob`` from images in ``input_blob``, and what its data layer does to pixels.
+    """The part of a net that computes ``blob`` from images in ``input_blob``, and the scaling of its data layer.
 
-    The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
-    None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning.
-    Raises SpecError for faults of the files; warns where the weights were trained on other pixels.
+    The net is the prototxt ``model`` in phase TEST. If ``shape`` (N, C, H, W) of the input is None, it comes from the
+    net: from its Input layer, or from the first record of its data layer. ``weights`` are files; later ones override
+    earlier ones. Raises SpecError for errors in the files; warns if the weights were trained on other pixel values.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class ImageNet:
                 _warn_of_other_pixels(path, model, readers)
 
     def __call__(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the blob (N, V D) float32, view after view, of images (H, W, 3) or (H, W), uint8, BGR, any sizes."""
+        """Return the blob (N, V D) float32, views in order, of images (H, W, 3) or (H, W), uint8, BGR, of any size."""
         views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
         pixels = (np.stack(views) - self.scaling.mean) * self.scaling.scale
         with torch.no_grad():
@@ -105,9 +105,9 @@ class ImageNet:
 
 
 def extract_images(describe: ImageNet, images: ImageList, progress: Progress = iter) -> dict[str, np.ndarray]:
-    """Return the arrays of a features.npz: features, names, seconds_per_image; stamps and zooms where there are any.
+    """Return the arrays of a features.npz: features, names, seconds_per_image; also stamps and zooms, if any.
 
-    The seconds are the whole way from file to feature: reading, resizing, the net.
+    The seconds include everything from file to feature: reading, resizing, the net.
     """
     parts = []
     begin = time.perf_counter()
@@ -127,7 +127,7 @@ def extract_images(describe: ImageNet, images: ImageList, progress: Progress = i
 
 
 def _shape_of(blob: str, net: NetParameter, source: SourceMap) -> Shape:
-    """Return the shape of a blob that the whole of a net computes; data is opened, memory is not used."""
+    """Return the shape of a blob of a net; data is opened, but no memory for blobs is used."""
     built = build_filtered(net, source, BuildOptions(torch.device("meta"), seed=0))
     built.close()
     return built.shapes[blob]
@@ -136,8 +136,8 @@ def _shape_of(blob: str, net: NetParameter, source: SourceMap) -> Shape:
 def _scaling(layer: LayerParameter, shape: Shape, file: str) -> Scaling:
     """Return a transform_param's mean and scale for one image of ``shape`` (C, H, W).
 
-    A pair's mean has the channels of both images: the first image's count. A mean image larger than the blob is cut at
-    its center, as Caffe cuts it with the image in phase TEST.
+    The mean of a pair has the channels of both images; those of the first image are used. From a mean image larger than
+    the blob the center is cut out, as Caffe crops it with the image in phase TEST.
     """
     param: Any = layer.transform_param
     channels, height, width = shape
@@ -155,10 +155,10 @@ def _scaling(layer: LayerParameter, shape: Shape, file: str) -> Scaling:
 
 
 def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Sequence[str]) -> None:
-    """Warn where a .caffemodel tells of a transform_param, and the net that gets its weights scales no pixels.
+    """Warn if a .caffemodel contains a transform_param, but the net that gets its weights does not scale pixels.
 
-    ``readers`` are the layers of that net that read the input. One that the trained net lacks is taken to do what the
-    transform_param did: a Power layer in a deploy file. An HDF5 file holds no settings.
+    ``readers`` are the layers of that net that read the input. If the trained net lacks one of them (a Power layer in a
+    deploy file, say), it is assumed to replace the transform_param. An HDF5 file contains no settings.
     """
     if h5py.is_hdf5(weights):
         return

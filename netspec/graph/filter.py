@@ -1,4 +1,4 @@
-"""Which layers of a net belong to a phase, level and set of stages (Caffe: Net::FilterNet, src/caffe/net.cpp)."""
+"""The layers of a net in a phase, level and set of stages (Caffe: Net::FilterNet, src/caffe/net.cpp)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from netspec.proto.source_map import SourceMap
 
 
 def in_state(net: NetParameter, *states: NetState) -> NetParameter:
-    """Return a copy of the net in the state that ``states`` give: each overrides those before it, stages add up."""
+    """Return a copy of the net in the state given by ``states``: later ones override earlier ones, stages are added."""
     stated = NetParameter()
     stated.CopyFrom(net)
     stated.ClearField("state")
@@ -29,7 +29,7 @@ def with_state(
 
 
 def with_train_state(solver: SolverParameter, level: int | None, stages: Iterable[str]) -> SolverParameter:
-    """Return a copy of the solver whose training net has this level (unless None) and these stages besides its own."""
+    """Return a copy of the solver; its training net gets this level (unless None) and these stages in addition."""
     stated = SolverParameter()
     stated.CopyFrom(solver)
     stated.train_state.MergeFrom(NetState(level=level, stage=stages))

@@ -277,7 +277,7 @@ class Layer(torch.nn.Module):
     def possible(self, shape: Sequence[int]) -> Shape:
         """Return a shape as a tuple; refuse one with a negative size, or of more numbers than Caffe can count."""
         if min(shape, default=0) < 0:
-            raise self.error(f"found shape {tuple(shape)}, expected no size below 0")
+            raise self.error(f"found shape {tuple(shape)}, expected no negative size")
         if math.prod(shape) > MOST:
             raise self.error(f"found shape {tuple(shape)}, {math.prod(shape):,} numbers, expected at most {MOST:,}")
         return tuple(shape)

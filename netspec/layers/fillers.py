@@ -37,7 +37,9 @@ def check(filler: Any, shape: Shape) -> None:
     if math.prod(shape) == 0:
         raise ValueError(f"cannot fill an empty blob of shape {shape}")
     if filler.sparse != -1 and filler.type != "gaussian":
-        raise ValueError(f'filler "{filler.type}" knows no sparse (found {filler.sparse}); only "gaussian" does')
+        raise ValueError(
+            f'filler "{filler.type}" does not support sparse (found {filler.sparse}); only "gaussian" does'
+        )
     if filler.type in _NEED_AN_AXIS and not shape:
         raise ValueError(f'filler "{filler.type}" needs a blob of at least one axis, found a scalar')
     if filler.type in _CHECKS:

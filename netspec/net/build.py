@@ -37,8 +37,8 @@ def load_net(
 ) -> Net:
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
 
-    ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
-    Raises SpecError for every fault of the files.
+    ``exact`` sets which sums equal Caffe's in every bit: "none", "small" or "all" (see netspec/exact/__init__.py).
+    Raises SpecError for any error in the files.
     """
     net, source = parse_net(path)
     number = PHASES[phase] if isinstance(phase, str) else PhaseValue(phase)

@@ -30,8 +30,8 @@ Copies = list[tuple[torch.Tensor, np.ndarray]]
 def load_weights(net: Net, path: str | Path, *, report: Report = raise_fault) -> None:
     """Copy the weights of a .caffemodel or .caffemodel.h5 into the layers of the same names, all or none.
 
-    Layers that only the file has are ignored, and named in the log; layers that only the net has stay as they are.
-    ``report`` gets a SpecError for a file that cannot be read, and for blobs of other number or shape than the net's.
+    Layers that only the file has are ignored, and named in the log; layers that only the net has are not changed.
+    ``report`` gets a SpecError for an unreadable file, and for blobs that differ in number or shape from the net's.
     """
     path = Path(path)
     try:
@@ -44,12 +44,12 @@ def load_weights(net: Net, path: str | Path, *, report: Report = raise_fault) ->
 
 
 def copy_weights(net: Net, message: NetParameter, path: str | Path, report: Report = raise_fault) -> None:
-    """Copy the weights in a message, read from ``path``, as :func:`load_weights` copies a file's."""
+    """Copy the weights of a message, read from ``path``, like :func:`load_weights`."""
     _copy(partial(_from_message, net, message, Path(path)), report)
 
 
 def _copy(find: Callable[[Report], Copies], report: Report) -> None:
-    """Copy what is found where nothing is wrong with any of it; on meta there is nothing to copy to."""
+    """Copy all weights found if none has an error; on the meta device there is no memory to copy to."""
     faults: list[SpecError] = []
     copies = find(faults.append)
     for fault in faults:
@@ -63,8 +63,8 @@ def _copy(find: Callable[[Report], Copies], report: Report) -> None:
 def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
     """Write all layers of the net, splits included, and their weights; with ``diff`` their gradients too.
 
-    A blob that layers share is written by each of them, in HDF5 by its owner alone. Raises SpecError where the file
-    cannot be written; then what was there before is there still.
+    A shared blob is written for each of its layers, in HDF5 only for its owner. Raises SpecError if the file cannot be
+    written; an older file is then not changed.
     """
     (write_hdf5 if str(path).endswith(".h5") else write_binary)(net, path, diff)
 
@@ -156,12 +156,12 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
 def _opened(path: Path) -> h5py.File:
     try:
         return h5py.File(path, "r")
-    except OSError as fault:  # it begins as HDF5 files do
+    except OSError as fault:  # it begins like an HDF5 file
         raise SpecError(f"cannot be read: {fault}", Where(str(path))) from None
 
 
 def _layer_groups(data: h5py.Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
-    """Walk the layers, in Caffe's (alphabetical) order; a layer with a slash in its name is a group within a group."""
+    """Yield the layers, in Caffe's (alphabetical) order; a layer with a slash in its name is a group within a group."""
     for name, group in data.items():
         if isinstance(group, h5py.Group):
             arrays = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
@@ -191,7 +191,7 @@ def _to_hdf5(net: Net, path: Path, diff: bool) -> None:
 
 
 def _layers_by_name(net: Net) -> dict[str, Any]:
-    """Return the layers by name, the first of a name winning, as in Caffe."""
+    """Return the layers by name; of equal names the first is used, as in Caffe."""
     return {layer.param.name: layer for layer in reversed(net.layers)}
 
 
@@ -218,7 +218,7 @@ def _gradient(layer: Any, j: int) -> np.ndarray:
     return gradient.detach().cpu().numpy().reshape(layer.blob_shapes[j])
 
 
-# The sentences
+# The messages
 
 
 def _ignore(name: str) -> None:

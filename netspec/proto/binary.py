@@ -1,4 +1,4 @@
-"""Messages in protobuf's binary form: .caffemodel, .solverstate, .binaryproto. Files of any size that memory holds."""
+"""Messages in protobuf's binary format: .caffemodel, .solverstate, .binaryproto. Any size that fits in memory."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ M = TypeVar("M", bound=Message)
 
 
 def read_binary(path: str | Path, message_class: type[M]) -> M:
-    """Return the message that a file holds.
+    """Return the message in a file.
 
-    Raises SpecError for a file that cannot be read, is empty, or holds something else. Protobuf's binary form has no
-    mark of its own: what decodes without a single known field is taken for something else.
+    Raises SpecError for a file that cannot be read, is empty, or has other contents. Protobuf's binary format has no
+    signature: data that decodes without any known field counts as other contents.
     """
     where = Where(str(path))
     try:
@@ -46,14 +46,14 @@ def read_net_binary(path: str | Path) -> NetParameter:
 
 
 def parse_net_binary(path: str | Path, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
-    """Return the net of a .caffemodel, and a map that knows the file only. Raises SpecError."""
+    """Return the net of a .caffemodel, and a map that has only the file name. Raises SpecError."""
     net = read_binary(path, NetParameter)
     source = SourceMap.unknown(str(path), len(net.layer) + len(net.layers))
     return upgrade_net(net, source) if upgrade else (net, source)
 
 
 def _guess(data: bytes) -> str:
-    """Say what else a file seems to be."""
+    """Return a guess at what a file is."""
     if data.startswith(b"\x89HDF\r\n\x1a\n"):
         return "an HDF5 file; its name should end in .h5"
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:1000]):

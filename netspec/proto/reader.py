@@ -1,8 +1,8 @@
-"""Protobuf's text format into a message, by reflection, with the place of everything that was read.
+"""Reads protobuf's text format into a message, by reflection, with the place of every part.
 
-What is accepted is what the C++ parser accepts that Caffe uses, so that a file which Caffe reads is read here, and one
-that it refuses is refused, in one line that says where and why. One word more belongs to the language: the
-``ceil_mode: true`` of a pooling_param, which so many forks write for ``round_mode: CEIL`` that no dialect need be on.
+It accepts what the C++ parser of Caffe accepts: a file that Caffe reads is read here, and a file that Caffe refuses is
+refused here, with one line that says where and why. One field is added: ``ceil_mode: true`` in a pooling_param, which
+many forks write for ``round_mode: CEIL``; it needs no dialect.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ class _Reader:
         self.token = next(self._tokens)
         return token
 
-    # ---- Faults ----
+    # ---- Errors ----
 
     def _check_required(self, message: Message) -> None:
         for field in fields_of(message.DESCRIPTOR).values():
@@ -287,7 +287,7 @@ class _Reader:
         return SpecError(message, place)
 
     def _unknown_field(self, message: Message, name: str) -> str:
-        """Say that a field is unknown, and as well as can be guessed what was meant."""
+        """Return an error for an unknown field, with a guess at what was meant."""
         descriptor = message.DESCRIPTOR
         fault = f'{descriptor.name} has no field "{name}"'
         announce_known()

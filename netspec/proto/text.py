@@ -1,4 +1,4 @@
-"""The doors of this room: text files in, upgraded messages and the places of their parts out; messages as text."""
+"""The functions to read text files into upgraded messages, with the places of their parts, and to write text."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ def read_solver(path: str | Path) -> SolverParameter:
 
 
 def parse_net(path: str | Path, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
-    """Return the net of a .prototxt and where its parts stand. Raises SpecError."""
+    """Return the net of a .prototxt and the places of its parts. Raises SpecError."""
     return parse_net_text(_text_of(path), str(path), upgrade)
 
 
 def parse_net_text(text: str, file: str, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
-    """Return the net that a text describes and where its parts stand; ``file`` is what errors call it."""
+    """Return the net of a text and the places of its parts; ``file`` is its name in errors."""
     net = NetParameter()
     source = SourceMap.of(read_text(text, file, net))
     return upgrades.upgrade_net(net, source) if upgrade else (net, source)
 
 
 def parse_solver(path: str | Path, upgrade: bool = True) -> tuple[SolverParameter, Place]:
-    """Return the solver of a .prototxt and where its parts stand. Raises SpecError.
+    """Return the solver of a .prototxt and the places of its parts. Raises SpecError.
 
     The nets in it are upgraded too; ``SourceMap.of(node.fields["net_param"][0])`` is the map of one.
     """
@@ -53,7 +53,7 @@ def parse_solver(path: str | Path, upgrade: bool = True) -> tuple[SolverParamete
 
 
 def parse_solver_text(text: str, file: str, upgrade: bool = True) -> tuple[SolverParameter, Place]:
-    """Return the solver that a text describes and where its parts stand; ``file`` is what errors call it."""
+    """Return the solver of a text and the places of its parts; ``file`` is its name in errors."""
     solver = SolverParameter()
     node = read_text(text, file, solver)
     if upgrade:
@@ -63,7 +63,7 @@ def parse_solver_text(text: str, file: str, upgrade: bool = True) -> tuple[Solve
 
 
 def _text_of(path: str | Path) -> str:
-    """Return a file's text without a byte-order mark; bytes that are not UTF-8 are left for the lexer to judge."""
+    """Return a file's text without a byte-order mark; the lexer checks bytes that are not UTF-8."""
     try:
         data = Path(path).read_bytes()
     except OSError as fault:

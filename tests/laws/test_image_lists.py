@@ -1,4 +1,4 @@
-"""The two wings, which may not import each other, read folders and lists of images by one rule: docs/images.md."""
+"""netspec and loopclosure, which may not import each other, read images by one rule: docs/images.md."""
 
 from pathlib import Path
 from typing import Any

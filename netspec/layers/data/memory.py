@@ -39,7 +39,7 @@ class Input(Layer):
         if not shapes and all(top in given for top in self.param.top):
             shapes = [given[top] for top in self.param.top]
         if len(shapes) not in (1, self.num_tops):
-            raise self.error(f"found {len(shapes)} shapes, expected 1 or one a top ({self.num_tops})", "input_param")
+            raise self.error(f"found {len(shapes)} shapes, expected 1 or one per top ({self.num_tops})", "input_param")
         shapes = shapes * self.num_tops if len(shapes) == 1 else shapes
         self.shapes = [given.get(top, shape) for top, shape in zip(self.param.top, shapes, strict=True)]
 
@@ -50,8 +50,8 @@ class Input(Layer):
     @override
     def missing_input(self) -> SpecError:
         blobs = " and ".join(f'"{top}"' for top in self.param.top)
-        advice = "a layer that reads data (Data, ImageData, HDF5Data, ...) must make them"
-        return self.error(f"nothing fills {blobs} while a solver runs; {advice}")
+        advice = "use a layer that reads data (Data, ImageData, HDF5Data, ...)"
+        return self.error(f"nothing fills {blobs} during training; {advice}")
 
     @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -127,7 +127,7 @@ class DummyData(Layer):
 
     def _one_a_top(self, values: list[T], field: str) -> list[T]:
         if len(values) not in (1, self.num_tops):
-            message = f"found {len(values)} {field}, expected 1 or one a top ({self.num_tops})"
+            message = f"found {len(values)} {field}, expected 1 or one per top ({self.num_tops})"
             raise self.error(message, "dummy_data_param", field)
         return values * self.num_tops if len(values) == 1 else values
 

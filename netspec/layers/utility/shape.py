@@ -141,7 +141,7 @@ class Concat(Layer):
         for i, shape in enumerate(bottom_shapes):
             others = zip(first[:axis] + first[axis + 1 :], shape[:axis] + shape[axis + 1 :], strict=False)
             if len(shape) != len(first) or any(a != b for a, b in others):
-                message = f"found bottoms of shapes {first} and {shape}, expected equal ones but for axis {axis}"
+                message = f"found bottoms of shapes {first} and {shape}, expected equal shapes except along axis {axis}"
                 raise self.error(message, "bottom", i)
         return [(*first[:axis], sum(shape[axis] for shape in bottom_shapes), *first[axis + 1 :])]
 
@@ -187,7 +187,7 @@ class Slice(Layer):
                 raise self.error(message, "slice_param", "slice_point")
             self.sizes = [end - start for start, end in zip([0, *points], [*points, size], strict=True)]
             if min(self.sizes) <= 0:
-                expected = f"rising ones above 0 and below {size}, the size of axis {axis}"
+                expected = f"increasing values above 0 and below {size}, the size of axis {axis}"
                 message = f"found slice_point {points} for a bottom of shape {shape}, expected {expected}"
                 raise self.error(message, "slice_param", "slice_point")
         elif size % self.num_tops:
@@ -355,17 +355,19 @@ class Filter(Layer):
     def setup(self) -> None:
         filtered = len(self.bottom_shapes) - 1
         if self.num_tops != filtered:
-            message = f"found {self.num_tops} top blob(s), expected {filtered}: one a bottom but for the selector"
+            message = f"found {self.num_tops} top blob(s), expected {filtered}: one per bottom except the selector"
             raise self.error(message, "top")
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         *data, selector = bottom_shapes
         if math.prod(selector[1:]) != 1:
-            raise self.error(f"found a selector of shape {selector}, expected one number an item", "bottom", len(data))
+            raise self.error(f"found a selector of shape {selector}, expected one number per item", "bottom", len(data))
         for i, shape in enumerate(data):
             if shape[:1] != selector[:1]:
-                message = f"found a bottom of shape {shape} and a selector of shape {selector}, expected as many items"
+                message = (
+                    f"found a bottom of shape {shape} and a selector of shape {selector}, expected equally many items"
+                )
                 raise self.error(message, "bottom", i)
         return data
 

@@ -52,8 +52,8 @@ def test_check_builds_all_nets_of_a_solver(run: Run, edited: Edit) -> None:
 def test_check_opens_no_data(run: Run) -> None:
     Path("pairs").unlink()
     assert run("check", NET, *PAIR_SHAPE).status == 0
-    wanted = f'{NET}:14:3: layer "pair_data" (Data): the shape of "pair_data" is known by its data only; '
-    assert run("check", NET).fault == wanted + "say --shape pair_data=50,C,H,W, or --data"
+    wanted = f'{NET}:14:3: layer "pair_data" (Data): the shape of "pair_data" is known only from its data; '
+    assert run("check", NET).fault == wanted + "give --shape pair_data=50,C,H,W, or --data"
 
 
 def test_check_gives_shapes_to_data_layers_and_inputs_only(run: Run) -> None:

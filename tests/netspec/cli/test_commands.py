@@ -199,7 +199,7 @@ def test_gpus_that_are_not_numbers_or_not_there(run: Run) -> None:
     fault = "--gpu first: expected the number of a GPU, several numbers separated by commas, or all"
     assert run("train", SOLVER, "--gpu=first").fault == fault
     count = torch.cuda.device_count()
-    assert f"this machine has {count or 'no'} GPU(s)" in run("train", SOLVER, "--gpu", f"0,{count + 1}").fault
+    assert f"torch finds {count or 'no'} GPU(s)" in run("train", SOLVER, "--gpu", f"0,{count + 1}").fault
 
 
 def test_a_typo_in_a_field_a_type_or_a_blob(run: Run, edited: Edit) -> None:
@@ -284,7 +284,7 @@ def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
     Path("net.prototxt").write_text(deploy)
     expected = "net.prototxt: no value for input 'x'; this net's inputs: x"
     assert run("test", "--model", "net.prototxt", "--weights", INIT).fault == expected
-    unfed = 'net.prototxt:1:1: layer "x" (Input): nothing fills "x" while a solver runs; a layer that reads data '
+    unfed = 'net.prototxt:1:1: layer "x" (Input): nothing fills "x" during training; use a layer that reads '
     assert run("train", edited(SOLVER, NET, "net.prototxt", "test_iter: 4", "")).fault.startswith(unfed)
     assert run("time", "--model", "net.prototxt", "--iterations", 1).status == 0
 

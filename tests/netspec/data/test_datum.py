@@ -46,13 +46,13 @@ def test_encoded_images_are_decoded_as_asked(color: bool | None, channels: int) 
         assert (found == COLOURS).all()
 
 
-def test_a_grey_file_stays_grey_unless_colour_is_forced() -> None:
+def test_a_gray_file_stays_gray_unless_color_is_forced() -> None:
     datum = encoded_datum(png(COLOURS[:1]))
     assert (datum_to_array(datum) == COLOURS[:1]).all()
     assert (datum_to_array(datum, color=True) == COLOURS[[0, 0, 0]]).all()
 
 
-def test_planar_takes_grey_and_colour() -> None:
+def test_planar_takes_gray_and_color() -> None:
     assert planar(np.zeros((4, 5), np.uint8)).shape == (1, 4, 5)
     assert planar(np.zeros((4, 5, 3), np.uint8)).shape == (3, 4, 5)
 

@@ -118,7 +118,7 @@ FAULTS = {
     "a type that Caffe has": (
         b'from netspec.layers import *\n@register("ReLU")\nclass A(Layer): pass\n',
         "{path}",
-        '{path}: layer type "ReLU" is there already, from netspec.layers.activation',
+        '{path}: layer type "ReLU" already exists, from netspec.layers.activation',
     ),
     "a fault when it runs": (
         b'from netspec.layers import register\n\nregister("Mine")(1 / 0)\n',
@@ -145,7 +145,7 @@ def test_two_dialects_with_one_type_number_or_name_do_not_go_together(fork: Path
     use_dialect(fork)
     other = tmp_path / "tripling.py"
     other.write_text('from netspec.layers import Layer, register\n@register("Times")\nclass A(Layer): pass\n')
-    with pytest.raises(SpecError, match='layer type "Times" is there already, from netspec_dialect_doubling'):
+    with pytest.raises(SpecError, match='layer type "Times" already exists, from netspec_dialect_doubling'):
         use_dialect(other)
     third = tmp_path / "same_number.py"
     third.write_text('DECLARATIONS = "extend LayerParameter { optional int32 even_more = 1000; }"\n')

@@ -150,7 +150,7 @@ def test_smooth_l1_loss(build: Build, gradcheck: Gradcheck, weights: int, sigma:
 
 
 def test_smooth_l1_loss_refuses(build: Build) -> None:
-    with pytest.raises(SpecError, match=r"found bottoms of shapes \(3, 4\) and \(3, 5\), expected one shape"):
+    with pytest.raises(SpecError, match=r"found bottoms of shapes \(3, 4\) and \(3, 5\), expected equal shapes"):
         build("rcnn", "type: 'SmoothL1Loss'", (3, 4), (3, 4), (3, 5), (3, 4))
     with pytest.raises(SpecError, match="sigma must be above 0, found 0"):
         build("rcnn", "type: 'SmoothL1Loss' smooth_l1_loss_param { sigma: 0 }", (3, 4), (3, 4))

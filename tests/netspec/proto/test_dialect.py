@@ -19,7 +19,7 @@ from netspec.proto.text import parse_net_text, write_text
 PROTO = Path(schema.__file__).parent
 
 SOURCE = """
-// A made-up fork.
+// A fictional fork.
 message WarpParameter {
   enum Border { ZERO = 0; EDGE = -1; }  /* two
                                            lines */

@@ -288,5 +288,7 @@ def test_gpu_mode_without_a_gpu_runs_on_the_cpu_and_warns_once(make, monkeypatch
 
 def test_a_gpu_that_is_not_there_is_refused(make, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(SpecError, match=r"^s\.prototxt:6:1: found device_id 3, but torch finds 1 GPU\(s\) on this machine"):
+    with pytest.raises(
+        SpecError, match=r"^s\.prototxt:6:1: found device_id 3, but torch finds 1 GPU\(s\) on this machine"
+    ):
         make("device_id: 3", settings=SETTINGS.replace("CPU", "GPU"))
