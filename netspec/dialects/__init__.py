@@ -2,8 +2,8 @@
 
 ``--plugin NAME`` on the command line, or ``netspec.use_dialect(NAME)``, switches one on for the whole process. NAME is
 one of netspec's own (the files in this folder), one that an installed package offers (an entry point of the group
-``netspec.dialects``), or the path of a .py file. A dialect that is not on still helps: an unknown field or layer type
-names the dialects that have it.
+``netspec.dialects``), or the path of a .py file. Errors about an unknown field or layer type also
+name the dialects that have it, even if they are not active.
 
 To write one, put this into a file, say ``doubling.py``, and pass ``--plugin doubling.py``::
 
@@ -38,7 +38,7 @@ To write one, put this into a file, say ``doubling.py``, and pass ``--plugin dou
 ``DECLARATIONS`` is in the language of caffe.proto (netspec/proto/dialect/registry.py): messages as they stand in the
 fork, new fields of Caffe's messages in ``extend``; one plain string. A layer is as Caffe's own are
 (netspec/layers/base.py);
-``@register`` has its type and the fields of LayerParameter that it reads: a net warns of those that nobody reads.
+``@register`` has its type and the fields of LayerParameter that it reads: a net warns of fields that no layer reads.
 ``@register("Dropout", ..., replaces=Dropout)`` puts a subclass in the place of one of Caffe's layers, to honor a
 field that the fork added to it. To offer a dialect with a package, name its module in that package's pyproject.toml::
 

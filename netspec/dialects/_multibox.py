@@ -1,6 +1,6 @@
 """SSD's MultiBoxLoss: which prior boxes are trained, the matched ones and the hardest background, and on what.
 
-n images have p priors each; boxes are predicted in k kinds, one for all classes or one a class.
+n images have p priors each; boxes are predicted in k kinds, one for all classes or one per class.
 Fork: weiliu89/caffe (ssd), src/caffe/util/bbox_util.cpp: FindMatches, MineHardExamples, EncodeLocPrediction
 """
 

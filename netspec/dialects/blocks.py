@@ -75,7 +75,7 @@ SEGNET_EPS = 1e-9  # added to the variance by SegNet's BN
 
 @register("Axpy")
 class Axpy(Layer):
-    """a x + y with one a a channel of each image: a squeeze-and-excitation block's end.
+    """a x + y with one factor a per channel of each image: the end of a squeeze-and-excitation block.
 
     bottom[0]  a (N, C) or (N, C, 1, 1)
     bottom[1]  x (N, C, ...)
@@ -154,7 +154,7 @@ class ReLU6(Activation):
 
 @register("DepthwiseConvolution", "convolution_param")
 class DepthwiseConvolution(Convolution):
-    """A convolution of each channel for itself: group must be the number of channels.
+    """A separate convolution of each channel: group must be the number of channels.
 
     bottom[i]  (N, C, H, W)
     top[i]     (N, num_output, H', W') as Convolution's
@@ -174,7 +174,7 @@ class DepthwiseConvolution(Convolution):
 
 @register("ConvolutionDepthwise", "convolution_param")
 class ConvolutionDepthwise(Convolution):
-    """A convolution of each channel for itself; num_output and group are not needed and not read.
+    """A separate convolution of each channel; num_output and group are not needed and not read.
 
     bottom[0]  (N, C, H, W)
     top[0]     (N, C, H', W') as Convolution's

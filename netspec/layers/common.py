@@ -178,7 +178,7 @@ class Embed(Layer):
 
     @override
     def forward(self, indices: torch.Tensor) -> torch.Tensor:
-        """Return the rows; raise SpecError for an index that is none."""
+        """Return the rows; raise SpecError for an invalid index."""
         rows, index = self.param.embed_param.input_dim, indices.long()
         wrong = indices[(index < 0) | (index >= rows) | (index != indices)]
         if len(wrong):

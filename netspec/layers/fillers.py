@@ -1,4 +1,4 @@
-"""What a blob holds before anything is learned: Caffe's seven fillers.
+"""Initial values of blobs: Caffe's seven fillers.
 
 Caffe: include/caffe/filler.hpp
 """

@@ -1,4 +1,4 @@
-"""Layers that bring values to a common scale: BatchNorm, Scale, Bias, LRN, MVN."""
+"""Layers that normalize or scale values: BatchNorm, Scale, Bias, LRN, MVN."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_OFFSET = 8  # means, in standard deviations, up to which torch's CPU kernel 
 
 @register("BatchNorm", "batch_norm_param")
 class BatchNorm(Layer):
-    """Subtract each channel's mean, divide by its standard deviation; of the batch in training, of the past in testing.
+    """Subtract each channel's mean, divide by its standard deviation: of the batch in training, averages in testing.
 
     y = (x - mean) / sqrt(var + eps) with the biased variance of the batch, or with blobs[0 and 1] / blobs[2] where
     ``use_global_stats`` (by default: in the test phase). Training adds to the sums: S = S moving_average_fraction + the

@@ -45,7 +45,7 @@ class BuildOptions:
 
 
 def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
-    """Return a fault for each given shape of a blob that no data layer (or Python layer) makes."""
+    """Return an error for each given shape whose blob is not a top of a data layer (or Python layer)."""
     makers = [layer for net in nets for layer in net.layer if not layer.bottom or layer.type == "Python"]
     blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
     known = ", ".join(blobs) or "none"

@@ -128,7 +128,7 @@ class ReadingLayer(Layer):
         return self._feed.position if self._feed else 0
 
     def keys(self, iteration: int) -> list[str]:
-        """Return the keys (or file names) of the records of an iteration, one a row of the tops."""
+        """Return the keys (or file names) of the records of an iteration, one per row of the tops."""
         return self.source.keys(iteration)
 
     @override
@@ -188,7 +188,7 @@ class ReadingLayer(Layer):
 def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:
     """Make a batch, in whatever thread; page-locked where it goes to a GPU, so that the copy need not wait.
 
-    It knows nothing of the layer, so that a layer nobody needs any more goes at once, and its threads with it.
+    It has no reference to the layer, so that an unused layer is deleted at once, and its threads are stopped.
     """
     tops = tuple(torch.from_numpy(array) for array in source.batch(iteration)[:num_tops])
     return tuple(top.pin_memory() if pinned else top for top in tops), source.cursor.wraps(iteration)

@@ -24,7 +24,7 @@ T = TypeVar("T")
 class Input(Layer):
     """Name blobs that the caller fills: ``net(data=array)``.
 
-    top[i]  the shape given for it; one shape may stand for all tops; the caller's own wins (``check --shape``)
+    top[i]  the shape given for it; one shape may be used for all tops; ``check --shape`` overrides it
     Caffe: src/caffe/layers/input_layer.cpp
     """
 
@@ -149,7 +149,7 @@ class DummyData(Layer):
 
 @register("MemoryData", "memory_data_param", "transform_param")
 class MemoryData(Layer):
-    """Hand out arrays that the program gives with ``set_input_arrays``, batch after batch, over and over.
+    """Return arrays that the program gives with ``set_input_arrays``, batch after batch, over and over.
 
     top[0]  images (batch_size, channels, height, width)
     top[1]  labels (batch_size,)

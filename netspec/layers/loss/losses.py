@@ -1,4 +1,4 @@
-"""Losses, and Accuracy. Each returns its plain value: whoever sums the losses applies loss_weight.
+"""Losses, and Accuracy. Each returns its plain value: the net applies loss_weight when it sums the losses.
 
 Caffe: include/caffe/layers/loss_layer.hpp
 """
@@ -94,7 +94,7 @@ class SoftmaxWithLoss(SoftmaxLoss):
     Caffe no gradient comes from it.
 
     bottom[0]  scores (N, C, ...), C at softmax_param.axis
-    bottom[1]  labels, one a prediction, (N,), (N, 1, ...) or (N, ...)
+    bottom[1]  labels, one per prediction, (N,), (N, 1, ...) or (N, ...)
     top[0]     the loss, ()
     top[1]     optional: the softmax, bottom[0]'s shape
     Caffe: src/caffe/layers/softmax_loss_layer.cpp
@@ -152,7 +152,7 @@ class InfogainLoss(SoftmaxLoss):
     The logarithm is taken of no less than 1e-20; the gradient takes no notice of that.
 
     bottom[0]  scores (N, C, ...), C at infogain_loss_param.axis
-    bottom[1]  labels, one a prediction
+    bottom[1]  labels, one per prediction
     bottom[2]  optional: the matrix H, C x C numbers in any shape; without it a BlobProto file is read (source)
     top[0]     the loss, ()
     top[1]     optional: the softmax, bottom[0]'s shape, without gradient
@@ -400,7 +400,7 @@ class EuclideanLoss(Loss):
     """The sum of (a - b)^2 / (2 N).
 
     bottom[0]  a (N, ...)
-    bottom[1]  b, as many numbers an item; gets a gradient too
+    bottom[1]  b, as many values per item; gets a gradient too
     top[0]     the loss, ()
     Caffe: src/caffe/layers/euclidean_loss_layer.cpp
     """
@@ -530,7 +530,7 @@ class Accuracy(Classified):
     It is 0 where every label is ignored. No gradient.
 
     bottom[0]  scores (N, C, ...), C at accuracy_param.axis
-    bottom[1]  labels, one a prediction
+    bottom[1]  labels, one per prediction
     top[0]     the accuracy, ()
     top[1]     optional: the accuracy of each class, (C,); 0 for a class that does not occur
     Caffe: src/caffe/layers/accuracy_layer.cpp

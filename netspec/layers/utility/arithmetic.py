@@ -1,4 +1,4 @@
-"""Utilities that compute: arithmetic between blobs and over axes; and the blob that stands by itself."""
+"""Arithmetic between blobs and over axes; and a learnable blob without bottoms."""
 
 from __future__ import annotations
 

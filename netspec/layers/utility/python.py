@@ -133,7 +133,7 @@ class Python(Layer):
         return code
 
     def _call(self, method: str, *arguments: Any) -> None:
-        """Call a method of the code; whatever it raises is a fault of the user's file."""
+        """Call a method of the code; anything it raises is an error in the user's file."""
         p = self.param.python_param
         try:
             with importable():

@@ -1,4 +1,4 @@
-"""Utilities that move numbers and compute none: shapes, parts, copies, rows."""
+"""Utilities that only move values: shapes, parts, copies, rows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
 
 @register("Flatten", "flatten_param")
 class Flatten(Layer):
-    """Make one axis of the axes from axis (default 1) to end_axis (default the last).
+    """Join the axes from axis (default 1) to end_axis (default the last) into one.
 
     bottom[0]  any shape
     top[0]     the same numbers, shape[:axis] + (product,) + shape[end_axis + 1:]
@@ -230,7 +230,7 @@ class Slice(Layer):
 
 @register("Split")
 class Split(Layer):
-    """Hand the bottom to several layers; their gradients add up. Nets insert it by themselves.
+    """Give the bottom to several layers; their gradients are added. Nets insert it automatically.
 
     bottom[0]  any shape
     top[i]     the bottom
@@ -247,7 +247,7 @@ class Split(Layer):
 
     @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return one tensor a top, so that each has a gradient of its own."""
+        """Return one tensor per top, so that each has its own gradient."""
         if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))

@@ -1,4 +1,4 @@
-"""Layers that slide a filter over a map, and Crop, which brings two maps to one size afterwards."""
+"""Layers that slide a filter over a map, and Crop, which cuts a map to the size of another."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _by(sizes: Shape) -> str:
 
 
 class _SlidingFilter(Layer):
-    """Base of the layers described by a ConvolutionParameter: the filter's geometry, one number a spatial axis."""
+    """Base of the layers described by a ConvolutionParameter: the filter's geometry, one number per spatial axis."""
 
     kernel: Shape
     stride: Shape

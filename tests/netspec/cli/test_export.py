@@ -148,7 +148,10 @@ def test_images_steps(onnx: Any, net: Net, run: Run) -> None:
     [
         (("--to", "onnx", "--out", "no/net.onnx"), "no/net.onnx: there is no folder no; make it first"),
         (("--to", "torch", "--out", "net.txt"), "--out net.txt: expected a name that ends in .py"),
-        (("--to", "onnx", "--out", "n.onnx", "--shape", "dat=1,3,8,8"), '--shape: no data layer has a top "dat"; did you mean "data"?'),
+        (
+            ("--to", "onnx", "--out", "n.onnx", "--shape", "dat=1,3,8,8"),
+            'no data layer has a top "dat"; did you mean "data"?',
+        ),
         (("--to", "onnx", "--out", "n.onnx", "--mean", "no.npy"), "no.npy: cannot be read as an array"),
         (("--to", "onnx", "--out", "n.onnx", "--swap", "--input", "x"), 'no input "x" in this net; it has: data'),
     ],
