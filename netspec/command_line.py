@@ -43,8 +43,8 @@ class Commands:
     ) -> argparse.ArgumentParser:
         """Return the parser of a new command that runs ``function``, to add its own arguments to.
 
-        An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. A command that shows no log
-        itself sets the default ``log_form`` to None.
+        An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. A command that shows no
+        log itself sets the default ``log_form`` to None.
         """
         added = self._parsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
         added.set_defaults(run=function, log_level=logging.INFO, log_form=log.GlogFormatter())

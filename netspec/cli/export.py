@@ -37,9 +37,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument(
         "--no-labels", action="store_true", help="leave out labels, and the losses and accuracies that need them"
     )
-    p.add_argument(
-        "--input", default="data", metavar="BLOB", help="the input for the options below (default: data)"
-    )
+    p.add_argument("--input", default="data", metavar="BLOB", help="the input for the options below (default: data)")
     p.add_argument("--crop", action="store_true", help="ONNX: take the middle of larger images")
     p.add_argument("--swap", action="store_true", help="ONNX: images come with reversed channels (RGB for BGR)")
     p.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="ONNX: multiply images by this first")
@@ -52,9 +50,7 @@ def add_to(commands: Commands) -> None:
         "fold", _fold, "write the deploy net with BatchNorm and Scale folded in: OUT.prototxt, OUT.caffemodel"
     )
     p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
-    p.add_argument(
-        "file", metavar="MODEL", help="the net's prototxt; of a training net, labels and losses are removed"
-    )
+    p.add_argument("file", metavar="MODEL", help="the net's prototxt; of a training net, labels and losses are removed")
     p.add_argument("--weights", required=True, help="the trained weights")
     p.add_argument("--out", required=True, type=Path, metavar="PREFIX", help="write PREFIX.prototxt and .caffemodel")
     _add_source(p)

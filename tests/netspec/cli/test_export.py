@@ -164,7 +164,7 @@ def test_faults_are_one_line(words: tuple[str, ...], fault: str, onnx: Any, net:
 def test_weights_that_are_not_there(onnx: Any, net: Net, run: Run) -> None:
     words = ("export", MODEL, "--to", "onnx", "--out", "n.onnx")
     assert "no.caffemodel: cannot be read: No such file or directory" in run(*words, "--weights", "no.caffemodel").fault
-    assert run(*words).err == "warning: no --weights: the net has random ones\n"
+    assert run(*words).err == "warning: no --weights given: the weights are random\n"
 
 
 def test_the_onnx_library_is_an_extra(net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,4 +199,4 @@ def test_folding_needs_weights(net: Net, run: Run) -> None:
 def test_steps_for_images_are_for_onnx(net: Net, run: Run) -> None:
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "n.pt2", "--swap")
     assert result.status == 2
-    assert "go with --to onnx" in result.err
+    assert "need --to onnx" in result.err

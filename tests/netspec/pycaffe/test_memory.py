@@ -353,7 +353,7 @@ def test_forward_backward_all(net_of: Callable[..., caffe.Net]) -> None:
         ("net.forward(data=np.ones((2, 3, 12, 12)))", ValueError, "Input is not batch sized: found shape (2, 3, 12, 1"),
         ("net.forward(data=np.ones((1, 3, 9, 12)))", ValueError, "from shape (1,3,9,12) into shape (1,3,12,12)"),
         ("net.blobs['data'].data[...] = np.ones((1, 4, 12, 12))", ValueError, "(1,4,12,12) into shape (1,3,12,12)"),
-        ("net.blobs['data'].reshape(1, -3)", ValueError, "found shape (1, -3), expected no size below 0"),
+        ("net.blobs['data'].reshape(1, -3)", ValueError, "found shape (1, -3), expected no negative size"),
         ("net.blobs['data'].reshape(1, 2.5)", TypeError, "float"),
         ("net.set_input_arrays(np.ones(1), np.ones(1))", RuntimeError, "if the first layer is a MemoryDataLayer"),
         ("net.copy_from('nowhere.caffemodel')", RuntimeError, "Could not open file nowhere.caffemodel"),
