@@ -120,7 +120,7 @@ def test_a_training_net_is_exported_with_its_loss(onnx: Any, run: Run) -> None:
         "--out",
         "net.onnx",
     )
-    assert "known by its data only; say --shape pair_data=" in run(*words).fault
+    assert "known only from its data; give --shape pair_data=" in run(*words).fault
     assert run(*words, "--shape", "pair_data=2,2,28,28").status == 0
     model = onnx.load("net.onnx")
     assert [each.name for each in model.graph.input] == ["pair_data", "sim"]
