@@ -51,6 +51,21 @@ __all__ = [
     "use_dialect",
 ]
 
+
+def load_ipython_extension(ipython: object) -> None:
+    """Let ``import caffe`` find netspec in a notebook: ``%load_ext netspec``."""
+    from netspec.scripts import finder
+
+    finder.install()
+
+
+def unload_ipython_extension(ipython: object) -> None:
+    """Undo :func:`load_ipython_extension`."""
+    from netspec.scripts import finder
+
+    finder.uninstall()
+
+
 FOLDERS.append((f"{__path__[0]}/dialects", "netspec.dialects"))  # told here: an error names them, whatever is imported
 __path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the names they had before
 

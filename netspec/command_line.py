@@ -13,7 +13,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from netspec import log
@@ -42,7 +42,8 @@ class Commands:
     ) -> argparse.ArgumentParser:
         """Return the parser of a new command that runs ``function``, to add its own arguments to.
 
-        An argument with ``action="store_true"`` is a Boolean flag in all of gflags' spellings.
+        An argument with ``action="store_true"`` is a Boolean flag in all of gflags' spellings. A command that shows no
+        log itself sets the default ``log_form`` to None.
         """
         added = self._parsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
         added.set_defaults(run=function, log_level=logging.INFO, log_form=log.GlogFormatter())
@@ -63,7 +64,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
     except SystemExit as end:  # argparse has said what is wrong, or printed its help
         return int(end.code or DONE)
     try:
-        with _logging(_level(arguments), arguments.log_form):
+        with _logging(_level(arguments), arguments.log_form) if arguments.log_form else nullcontext():
             return arguments.run(arguments) or DONE
     except (SpecError, *faults) as fault:
         print(fault, file=sys.stderr)

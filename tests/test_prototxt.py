@@ -13,6 +13,7 @@ from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.net.build import load_net
 from netspec.net.weights import load_weights, save_weights
+from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text, read_net, read_solver
 from paths import ROOT
 
@@ -66,7 +67,8 @@ def test_the_nets_of_one_kind_differ_in_their_last_layer_alone() -> None:
 
 
 def test_the_residual_net_has_27_convolutions_and_7x7x512_reach_the_features() -> None:
-    (checked,) = check_file(ROOT / "prototxt/siamese_resnet27_256/deploy.prototxt", phase=1)
+    (checked,) = check_file(ROOT / "prototxt/siamese_resnet27_256/deploy.prototxt", TEST)
+    assert checked.net is not None
     kinds = [layer.type for layer in checked.net.param.layer]
     assert kinds.count("Convolution") == kinds.count("BatchNorm") == kinds.count("Scale") == 27
     assert kinds.count("Eltwise") == 1 + 2 + 5 + 3
@@ -144,7 +146,10 @@ def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines(
     expected = torch.nn.functional.cross_entropy(10 * first @ second.T, torch.arange(48))
     np.testing.assert_allclose(loss.item(), expected.item(), rtol=1e-4)
     loss.backward()
-    assert all(np.abs(net.params[name][0].grad.numpy()).max() > 0 for name in ("conv1", "res6b", "words"))
+    for name in ("conv1", "res6b", "words"):
+        grad = net.params[name][0].grad
+        assert grad is not None, name
+        assert grad.abs().max() > 0, name
 
 
 def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
@@ -156,7 +161,8 @@ def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
         assert [p.name for p in train[name].param] == [p.name for p in train[f"{name}_p"].param]
         assert all(p.name for p in train[name].param)
         assert deploy[name] == train[name]
-    (checked,) = check_file(WORDS / "deploy.prototxt", phase=1)
+    (checked,) = check_file(WORDS / "deploy.prototxt", TEST)
+    assert checked.net is not None
     shapes = {name: checked.net.shapes[name] for name in checked.net.plan.outputs}
     assert shapes == {"feat": (1, 256 + 6 * 256)}
 
@@ -172,6 +178,6 @@ def test_every_net_checks_without_a_fault_or_advice(path: Path) -> None:
     batch = int(re.findall(r"batch_size: (\d+)", text)[0])
     label = re.findall(r'top: "(\w+)"', text)[1]
     shapes = {"pair_data": (batch, 6, 64, 64), label: (batch,)}
-    (checked,) = check_file(path, phase=0, shapes=shapes)
+    (checked,) = check_file(path, TRAIN, shapes=shapes)
     assert not checked.faults
     assert not checked.advice

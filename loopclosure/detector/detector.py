@@ -182,7 +182,7 @@ class LoopDetector:
 
     def add_descriptor(
         self,
-        descriptor: np.ndarray,
+        descriptor: Sequence[float] | np.ndarray,
         stamp: float | None = None,
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
@@ -280,7 +280,7 @@ class LoopDetector:
             detector.loops.append(LoopResult(**loop))
         return detector
 
-    def _checked(self, descriptor: np.ndarray, stamp: float | None) -> np.ndarray:
+    def _checked(self, descriptor: Sequence[float] | np.ndarray, stamp: float | None) -> np.ndarray:
         """Return the row that is kept, (views, D): of unit length for cosine."""
         row = np.asarray(descriptor, np.float32).reshape(-1)
         frames, views = self._frames, self.settings.views

@@ -6,16 +6,21 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import caffe_tools, check, export, extract, measure, train
+from netspec.cli import caffe_tools, check, export, extract, measure, run_script, train
 from netspec.cli.run import Commands
 from netspec.command_line import run
 
-_FAMILIES = (train, measure, check, extract, export, caffe_tools)
+_FAMILIES = (train, measure, check, extract, export, run_script, caffe_tools)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage."""
-    return run(parser(), list(sys.argv[1:] if argv is None else argv))
+    words, program = list(sys.argv[1:] if argv is None else argv), []
+    if words[:1] == [run_script.NAME]:
+        words, program = run_script.split(words)
+    made = parser()
+    made.set_defaults(program=program)
+    return run(made, words)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -1,7 +1,8 @@
 """SSD, the single shot detector: weiliu89/caffe, branch ssd.
 
-Not here are its AnnotatedData (databases of images with boxes, and their augmentation), DetectionEvaluate and the
-solver's ``eval_type``. To train, bring images and boxes by other layers: MultiBoxLoss says which rows it takes.
+Not here are its layers AnnotatedData (databases of images with boxes, and their augmentation) and DetectionEvaluate;
+their messages are, and the solver's fields for them, so that scripts can write such files. To train, bring images and
+boxes by other layers: MultiBoxLoss says which rows it takes.
 """
 
 from __future__ import annotations
@@ -125,11 +126,114 @@ message MultiBoxLossParameter {
   optional int32 sample_size = 22 [default = 64];
   optional bool use_prior_for_nms = 23 [default = false];
 }
+message LabelMapItem {
+  optional string name = 1;
+  optional int32 label = 2;
+  optional string display_name = 3;
+}
+message LabelMap {
+  repeated LabelMapItem item = 1;
+}
+message NormalizedBBox {
+  optional float xmin = 1;
+  optional float ymin = 2;
+  optional float xmax = 3;
+  optional float ymax = 4;
+  optional int32 label = 5;
+  optional bool difficult = 6;
+  optional float score = 7;
+  optional float size = 8;
+}
+message Annotation {
+  optional int32 instance_id = 1 [default = 0];
+  optional NormalizedBBox bbox = 2;
+}
+message AnnotationGroup {
+  optional int32 group_label = 1;
+  repeated Annotation annotation = 2;
+}
+message AnnotatedDatum {
+  enum AnnotationType { BBOX = 0; }
+  optional Datum datum = 1;
+  optional AnnotationType type = 2;
+  repeated AnnotationGroup annotation_group = 3;
+}
+message Sampler {
+  optional float min_scale = 1 [default = 1];
+  optional float max_scale = 2 [default = 1];
+  optional float min_aspect_ratio = 3 [default = 1];
+  optional float max_aspect_ratio = 4 [default = 1];
+}
+message SampleConstraint {
+  optional float min_jaccard_overlap = 1;
+  optional float max_jaccard_overlap = 2;
+  optional float min_sample_coverage = 3;
+  optional float max_sample_coverage = 4;
+  optional float min_object_coverage = 5;
+  optional float max_object_coverage = 6;
+}
+message BatchSampler {
+  optional bool use_original_image = 1 [default = true];
+  optional Sampler sampler = 2;
+  optional SampleConstraint sample_constraint = 3;
+  optional uint32 max_sample = 4;
+  optional uint32 max_trials = 5 [default = 100];
+}
+message AnnotatedDataParameter {
+  repeated BatchSampler batch_sampler = 1;
+  optional string label_map_file = 2;
+  optional AnnotatedDatum.AnnotationType anno_type = 3;
+}
+message DetectionEvaluateParameter {
+  optional uint32 num_classes = 1;
+  optional uint32 background_label_id = 2 [default = 0];
+  optional float overlap_threshold = 3 [default = 0.5];
+  optional bool evaluate_difficult_gt = 4 [default = true];
+  optional string name_size_file = 5;
+  optional ResizeParameter resize_param = 6;
+}
+message DistortionParameter {
+  optional float brightness_prob = 1 [default = 0];
+  optional float brightness_delta = 2 [default = 0];
+  optional float contrast_prob = 3 [default = 0];
+  optional float contrast_lower = 4 [default = 0];
+  optional float contrast_upper = 5 [default = 0];
+  optional float hue_prob = 6 [default = 0];
+  optional float hue_delta = 7 [default = 0];
+  optional float saturation_prob = 8 [default = 0];
+  optional float saturation_lower = 9 [default = 0];
+  optional float saturation_upper = 10 [default = 0];
+  optional float random_order_prob = 11 [default = 0];
+}
+message ExpansionParameter {
+  optional float prob = 1 [default = 1];
+  optional float max_expand_ratio = 2 [default = 1];
+}
+message EmitConstraint {
+  enum EmitType { CENTER = 0; MIN_OVERLAP = 1; }
+  optional EmitType emit_type = 1 [default = CENTER];
+  optional float emit_overlap = 2;
+}
+extend TransformationParameter {
+  optional ResizeParameter resize_param = 8;
+  optional EmitConstraint emit_constraint = 10;
+  optional uint32 crop_h = 11 [default = 0];
+  optional uint32 crop_w = 12 [default = 0];
+  optional DistortionParameter distort_param = 13;
+  optional ExpansionParameter expand_param = 14;
+}
+extend SolverParameter {
+  optional string eval_type = 43 [default = "classification"];
+  optional bool show_per_class_result = 44 [default = false];
+  optional string ap_version = 45 [default = "Integral"];
+}
 extend LayerParameter {
+  optional AnnotatedDataParameter annotated_data_param = 200;
   optional MultiBoxLossParameter multibox_loss_param = 201;
   optional PermuteParameter permute_param = 202;
   optional PriorBoxParameter prior_box_param = 203;
   optional DetectionOutputParameter detection_output_param = 204;
+  optional DetectionEvaluateParameter detection_evaluate_param = 205;
   optional NormalizeParameter norm_param = 206;
 }
 """

@@ -11,6 +11,7 @@ import torch
 from typing_extensions import override
 
 from netspec.errors import SpecError
+from netspec.exact import SMALL, check_choice
 from netspec.layers import Context, Layer, Random, layer_class, unknown_type
 from netspec.layers.base import Shape
 from netspec.net.net import Array
@@ -30,16 +31,19 @@ def layer(
     seed: int = 0,
     device: str | torch.device = "cpu",
     allow_python: bool = False,
+    exact: str = SMALL,
 ) -> OneLayer:
     """Return the layer that ``text``, what stands between the braces of ``layer { }``, describes.
 
     ``netspec.layer('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }')(x)`` is its top for the bottom ``x``.
     Bottoms and tops need no names; ``tops`` is how many there are, by default the fewest. The layer is built when the
-    shapes of its bottoms are known: at the first call, or at once where ``shapes`` gives them. Raises SpecError.
+    shapes of its bottoms are known: at the first call, or at once where ``shapes`` gives them. ``exact`` is what it is
+    for a net (netspec/exact). Raises SpecError, and ValueError for an unknown ``exact``.
     """
+    check_choice(exact)
     number = PHASES[phase] if isinstance(phase, str) else phase
     context = {"phase": number, "random": Random(seed), "data_seed": seed, "device": torch.device(device)}
-    return OneLayer(partial(make_layer, text, tops=tops, allow_python=allow_python, **context), shapes)
+    return OneLayer(partial(make_layer, text, tops=tops, allow_python=allow_python, exact=exact, **context), shapes)
 
 
 class OneLayer(torch.nn.Module):

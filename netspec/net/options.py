@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from netspec.errors import SpecError, Where, did_you_mean
-from netspec.exact import CHOICES, SMALL
+from netspec.exact import SMALL, check_choice
 from netspec.graph import Report, raise_fault
 from netspec.layers.base import Shape
 from netspec.proto.schema import NetParameter
@@ -41,8 +41,7 @@ class BuildOptions:
     accumulate_in_place: bool = False
 
     def __post_init__(self) -> None:
-        if self.exact not in CHOICES:
-            raise ValueError(f"found exact {self.exact!r}, expected {', '.join(map(repr, CHOICES))}")
+        check_choice(self.exact)
 
 
 def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:

@@ -8,7 +8,9 @@ import sys
 from netspec.layers import layer_types as layer_type_list
 from netspec.layers.utility import pycaffe_shim
 from netspec.layers.utility.pycaffe_shim import TEST, TRAIN, Layer
-from netspec.pycaffe import logs
+from netspec.pycaffe import classifier, coord_map, detector, draw, io, logs, net_spec, proto
+from netspec.pycaffe.classifier import Classifier
+from netspec.pycaffe.detector import Detector
 from netspec.pycaffe.logs import init_log
 from netspec.pycaffe.logs import log_message as log
 from netspec.pycaffe.mode import (
@@ -23,6 +25,7 @@ from netspec.pycaffe.mode import (
     solver_rank,
 )
 from netspec.pycaffe.net import Net
+from netspec.pycaffe.net_spec import NetSpec, layers, params, to_proto
 from netspec.pycaffe.parallel import NCCL, Timer, has_nccl
 from netspec.pycaffe.solver import (
     AdaDeltaSolver,

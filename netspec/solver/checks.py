@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
+from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Place
 from netspec.solver.lr_policy import policy_faults
 from netspec.solver.update import rule_faults
@@ -33,6 +35,13 @@ def check_settings(param: Any, node: Place, report: Report = raise_fault) -> Non
             report(SpecError(f"found test_iter {count}, expected at least 0", node.find("test_iter", i)))
     if param.snapshot > 0 and not param.snapshot_prefix:
         report(SpecError("snapshot is given but snapshot_prefix is not", node.find("snapshot")))
+
+
+def fields_without_effect(param: Any, node: Place) -> Iterator[str]:
+    """Yield a line for each field of a fork that is given: dialects bring such fields, but no solver reads them."""
+    for name, field in added_fields.get(param.DESCRIPTOR.full_name, {}).items():
+        if field.present(param):
+            yield f"{node.find(name)}: {name} has no effect: it is a fork's, and no solver here reads it"
 
 
 def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_it: bool = True) -> None:

@@ -28,7 +28,7 @@ from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
-from netspec.solver.checks import check_prefix, check_settings
+from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
@@ -135,6 +135,8 @@ class Solver:
         node = node or Place(Where("<solver>"))
         log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
         check_settings(param, node)
+        for line in fields_without_effect(param, node):
+            log.warning("solver.cpp:45", line)
         if param.snapshot:
             check_prefix(param, node)
         self.param = param

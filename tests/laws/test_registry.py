@@ -15,21 +15,20 @@ from google.protobuf import text_format
 from netspec.errors import SpecError, Where
 from netspec.layers import Context, Layer, Random, layer_class, layer_types
 from netspec.layers.data.memory import MemoryData
-from netspec.proto.schema import LayerParameter
+from netspec.proto.schema import TEST, TRAIN, LayerParameter, PhaseValue
 from paths import GOLDEN
 from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 Shape = tuple[int, ...]
-TRAIN, TEST = 0, 1
 MAPS = (2, 4, 5, 6)
 
 
 def labels(shape: Shape) -> torch.Tensor:
-    return torch.arange(np.prod(shape)).reshape(shape) % 4
+    return torch.arange(int(np.prod(shape))).reshape(shape) % 4
 
 
 def flags(shape: Shape) -> torch.Tensor:
-    return torch.arange(np.prod(shape)).reshape(shape) % 2
+    return torch.arange(int(np.prod(shape))).reshape(shape) % 2
 
 
 def ones(shape: Shape) -> torch.Tensor:
@@ -56,7 +55,7 @@ class Example:
     shapes: tuple[Shape, ...] = (MAPS,)
     tops: int = 1
     values: dict[int, Callable[[Shape], torch.Tensor]] = field(default_factory=dict)
-    phase: int = TEST
+    phase: PhaseValue = TEST
     batch: int | None = 0
     smooth: bool = True
 

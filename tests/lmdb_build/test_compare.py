@@ -66,7 +66,7 @@ def test_it_trains_chooses_the_snapshot_that_validates_best_and_judges_it(
     assert main(["compare", SOLVER, "--out", "out"]) == 0
     said = capfd.readouterr()
     scores = {score.iteration: score.outputs["loss"][0] for score in read_scores("out/sgd_step.scores.json").tests}
-    assert sorted(scores) == [0, 5, 10]
+    assert set(scores) == {0, 5, 10}
     assert row("out")["net"] == "sgd_step"
     assert int(row("out")["iteration"]) == min((5, 10), key=scores.__getitem__)
     assert float(row("out")["ROC AUC"]) > 0.8  # Caffe's own weights tell the synthetic places apart

@@ -42,7 +42,9 @@ def records(path: Path) -> list[tuple[bytes, bytes]]:
 
 
 def image(name: str, flag: int = cv2.IMREAD_COLOR) -> np.ndarray:
-    return cv2.imread(PNG + name, flag)
+    found = cv2.imread(PNG + name, flag)
+    assert found is not None, name
+    return found
 
 
 def pairs_in(path: Path) -> list[tuple[str, np.ndarray, int]]:

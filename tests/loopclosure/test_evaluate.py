@@ -9,6 +9,7 @@ from loopclosure.errors import InputError
 from loopclosure.evaluate import evaluate, named_method
 from loopclosure.methods.base import METHODS, MethodContext, MethodResult, make_method
 from loopclosure.methods.features import FeatureMethod
+from loopclosure.methods.seqslam import SeqSlam
 from loopclosure.places.datasets import load_tum
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 
@@ -78,6 +79,7 @@ def test_labels(text, name):
 
 def test_methods_that_refine_another():
     method = make_method("seqslam+features:a.npz:cosine", MethodContext(exclude_frames=7))
+    assert isinstance(method, SeqSlam)
     assert method.name == "seqslam+a (cosine)"
     assert method.inner == FeatureMethod(Path("a.npz"), Path("a.npz"), "cosine")
     assert method.exclude_frames == 7

@@ -2,20 +2,29 @@
 
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import threadpoolctl
 
+from fresh_dialects import fresh_dialects
 from netspec.cli import main
 from netspec.graph.filter import with_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
+from netspec.proto.schema import TEST, PhaseValue
 from netspec.proto.text import parse_net_text
 from paths import GOLDEN
+
+
+@pytest.fixture
+def leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let a test use dialects; switch them off when it is done."""
+    yield from fresh_dialects(monkeypatch)
 
 
 @pytest.fixture(scope="session")
@@ -50,9 +59,9 @@ def work_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Pa
 
 @pytest.fixture
 def net_of() -> Callable[..., Net]:
-    """``net_of(text, phase=1, **options)``: the net of a prototxt's text; faults are in ``net.prototxt``."""
+    """``net_of(text, phase=TEST, **options)``: the net of a prototxt's text; faults are in ``net.prototxt``."""
 
-    def build(text: str, phase: int = 1, **options: object) -> Net:
+    def build(text: str, phase: PhaseValue = TEST, **options: Any) -> Net:
         net, source = parse_net_text(text, "net.prototxt")
         return build_net(with_state(net, phase), source, BuildOptions(**{"seed": 0, **options}))
 
@@ -96,7 +105,8 @@ def run(work_in: Callable[..., Path], capfd: pytest.CaptureFixture[str]) -> Call
     def run_command(*words: object) -> Result:
         capfd.readouterr()
         status = main([str(word) for word in words])
-        return Result(status, *capfd.readouterr())
+        said = capfd.readouterr()
+        return Result(status, said.out, said.err)
 
     return run_command
 

@@ -7,6 +7,7 @@ import pytest
 
 from netspec.check.check import check_file
 from netspec.net.table import as_json
+from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_solver
 from paths import SHARED
 
@@ -33,7 +34,7 @@ def given_shapes(name: str) -> dict[str, tuple[int, ...]]:
 
 @pytest.mark.parametrize("name", sorted(SHAPES))
 def test_net_builds_with_caffes_shapes(name: str) -> None:
-    (checked,) = check_file(CORPUS / name, phase=1)
+    (checked,) = check_file(CORPUS / name, TEST)
     assert not checked.faults
     assert checked.net is not None
     found = as_json(checked.net)
@@ -46,7 +47,7 @@ def test_nets_with_data_layers_and_solvers_check(name: str, monkeypatch: pytest.
     root = CORPUS / Path(name).parts[0]
     monkeypatch.chdir((CORPUS / name).parent if name.startswith("forresti") else root)  # where its paths begin
     shapes = given_shapes(name)
-    for phase in (0, 1):
+    for phase in (TRAIN, TEST):
         checked = check_file(CORPUS / name, phase, stages=["test-on-test"], shapes=shapes)
         assert [str(fault) for part in checked for fault in part.faults] == []
         assert (checked[0].net is None) == (name in SOLVERS)

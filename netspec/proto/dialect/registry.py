@@ -131,6 +131,11 @@ def active() -> list[str]:
     return sorted(_active)
 
 
+def active_dialects() -> tuple[Dialect, ...]:
+    """Return the active dialects, in the order of their names."""
+    return tuple(_active[name] for name in active())
+
+
 def advice_for_field(message: str, field: str) -> str:
     """Return which known dialect has a field of a message (full name), and what to do; or an empty string."""
     return _advice(field, [d for d in _known.values() if (message, field) in d.fields()])

@@ -64,6 +64,7 @@ class TestMask:
 
     def test_what_is_not_compared_sets_no_gap(self, run: Path) -> None:
         mask = cv2.imread(str(run / "mask.png"), cv2.IMREAD_GRAYSCALE)
+        assert mask is not None
         mask[1, 0] = 255  # the left and the right image of one place
         cv2.imwrite(str(run / "mask.png"), mask)
         source = MaskSource(run / "mask.png", run / "run", run, camera="both")

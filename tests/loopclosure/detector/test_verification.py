@@ -20,8 +20,8 @@ def wall(seed):
 
 
 def seen_from_the_side(image):
-    corners = np.float32([[0, 0], [320, 0], [320, 240], [0, 240]])
-    moved = np.float32([[12, 6], [300, 18], [312, 228], [4, 236]])
+    corners = np.array([[0, 0], [320, 0], [320, 240], [0, 240]], np.float32)
+    moved = np.array([[12, 6], [300, 18], [312, 228], [4, 236]], np.float32)
     return cv2.warpPerspective(image, cv2.getPerspectiveTransform(corners, moved), (320, 240))
 
 

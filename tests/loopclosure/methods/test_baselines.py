@@ -21,7 +21,8 @@ WORDS = "words=200,lower_bound=0"
 
 def scene(seed: int) -> np.ndarray:
     noise = np.random.default_rng(seed).random((140, 180)).astype(np.float32)
-    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    blotches = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    return cv2.normalize(blotches, blotches, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def test_one_sequence(spec: str, images: dict[str, list[Path]]) -> None:
 
 
 def test_every_stage_is_shown_and_timed(images: dict[str, list[Path]]) -> None:
-    shown: dict[str, int] = {}
+    shown: dict[str, int | None] = {}
 
     def progress(items, stage, total=None):
         shown[stage] = total
@@ -154,7 +155,9 @@ def test_corridor_loop_with_its_two_images_without_features() -> None:
     )
     assert "2 of 84 images have no features: places without words" in result.notes
     assert np.isfinite(result.scores[np.tril_indices(84, -1)]).all()
-    truth = cv2.imread(str(corridor.parent / "samples_GT.bmp"), cv2.IMREAD_GRAYSCALE) > 0
+    mask = cv2.imread(str(corridor.parent / "samples_GT.bmp"), cv2.IMREAD_GRAYSCALE)
+    assert mask is not None
+    truth = mask > 0
     allowed = np.tri(84, 84, -11, dtype=bool)
     loops = np.flatnonzero((truth & allowed).any(axis=1))
     best = np.argmax(np.where(allowed, result.scores, -np.inf), axis=1)

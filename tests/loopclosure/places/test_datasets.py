@@ -98,7 +98,9 @@ def test_fabmap_cameras(fabmap_folder, tmp_path, camera, frames, loops):
     assert data.positions.shape == (len(frames), 2)
     np.testing.assert_allclose(data.positions[-1], [5.0, 15.5])
     if camera == "joined":
-        assert cv2.imread(str(data.query_images[0])).shape == (6, 16, 3)
+        joined = cv2.imread(str(data.query_images[0]))
+        assert joined is not None
+        assert joined.shape == (6, 16, 3)
     if camera == "both":
         assert not data.truth.judged[9, 0]
         assert "left and a right image" in data.notes[0]

@@ -102,6 +102,7 @@ def test_pictures_are_written_and_in_the_page(folder):
     assert page.count("data:image/png;base64,") == 4
     for name in ("precision_recall", "matrices", "matches", "map"):
         image = cv2.imread(str(folder / f"{name}.png"))
+        assert image is not None, name
         assert image.shape[0] > 300
         assert image.std() > 5
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.legend import Legend
 
 from loopclosure.evaluate import Evaluation, evaluate
 from loopclosure.methods.base import MethodResult
@@ -40,16 +42,23 @@ def evaluation_of(names: list[str]) -> Evaluation:
     return evaluate(data, [(name, Says(hard + rng.normal(size=hard.shape))) for name in names])
 
 
+def legend_of(axis: Axes) -> Legend:
+    legend = axis.get_legend()
+    assert legend is not None
+    return legend
+
+
 @pytest.mark.parametrize("count", [1, 3, 10, 20])
 def test_legends_of_curves_hide_nothing(count):
     figure = curves(evaluation_of([LONG_NAME, *(f"method {i}" for i in range(1, count))]))
     figure.draw_without_rendering()
     axes = [axis.get_window_extent() for axis in figure.axes]
-    legends = [axis.get_legend().get_window_extent() for axis in figure.axes]
+    legends = [legend_of(axis).get_window_extent() for axis in figure.axes]
     labels = [axis.xaxis.get_tightbbox() for axis in figure.axes]
     notes = [text.get_window_extent() for text in figure.texts]
     for legend in legends:
         for other in (*axes, *labels, *notes):
+            assert other is not None
             assert not legend.overlaps(other)
         assert figure.bbox.x0 <= legend.x0 < legend.x1 <= figure.bbox.x1
         assert figure.bbox.y0 <= legend.y0 < legend.y1 <= figure.bbox.y1
@@ -61,7 +70,7 @@ def test_legends_of_curves_hide_nothing(count):
 
 def test_every_curve_of_twenty_looks_different():
     axis = curves(evaluation_of([str(i) for i in range(20)])).axes[0]
-    lines = axis.get_legend().get_lines()
+    lines = legend_of(axis).get_lines()
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 20
 
 
@@ -69,7 +78,7 @@ def test_a_dollar_sign_in_a_name_is_no_formula():
     evaluation = evaluation_of([r"$\nonsense{$", "_hidden"])
     for draw in (curves, matrices, matches):
         draw(evaluation).draw_without_rendering()
-    labels = [text.get_text() for text in curves(evaluation).axes[0].get_legend().get_texts()]
+    labels = [text.get_text() for text in legend_of(curves(evaluation).axes[0]).get_texts()]
     assert [label.split()[1] for label in labels] == [r"$\nonsense{$", "_hidden"]
 
 

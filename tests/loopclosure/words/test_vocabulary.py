@@ -11,7 +11,7 @@ def texture(seed: int) -> np.ndarray:
     """Return a blotchy gray image (120, 160) that has features."""
     noise = np.random.default_rng(seed).random((120, 160)).astype(np.float32)
     blotches = cv2.GaussianBlur(noise, (0, 0), 2.5)
-    return cv2.normalize(blotches, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    return cv2.normalize(blotches, blotches, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def unit_vectors(count: int, size: int = 8, seed: int = 0) -> np.ndarray:

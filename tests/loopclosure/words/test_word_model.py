@@ -16,7 +16,8 @@ def write_textures(folder: Path, count: int, first_seed: int = 0) -> list[Path]:
     paths = []
     for i in range(count):
         noise = np.random.default_rng(first_seed + i).random((120, 160)).astype(np.float32)
-        image = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+        blotches = cv2.GaussianBlur(noise, (0, 0), 2.5)
+        image = cv2.normalize(blotches, blotches, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
         paths.append(folder / f"{i:03d}.png")
         cv2.imwrite(str(paths[-1]), image if i < count - 1 else np.full_like(image, 128))
     return paths

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from netspec.check.check import check_file
+from netspec.proto.schema import TRAIN, PhaseValue
 from paths import GOLDEN
 
 DATA = """layer { name: "d" type: "Data" top: "pair" top: "sim"
@@ -19,20 +20,20 @@ LOSS = 'layer { name: "loss" type: "ContrastiveLoss" bottom: "f1" bottom: "f2" b
 SHARED = ('param { name: "w" } param { name: "b" }',) * 2
 
 
-def siamese(params: tuple[str, str] = SHARED, extra: str = "", source: str = "nowhere") -> str:
+def siamese(params: tuple[str, ...] = SHARED, extra: str = "", source: str = "nowhere") -> str:
     towers = "".join(TOWER % {"k": k, "in": blob, "param": p} for k, blob, p in zip("12", "ab", params, strict=True))
     return DATA % source + towers + LOSS + extra
 
 
 @pytest.fixture
 def advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
-    """``advice(net, solver=None, phase=0)``: what is said of a net's text, or of a solver's that trains it.
+    """``advice(net, solver=None, phase=TRAIN)``: what is said of a net's text, or of a solver's that trains it.
 
     With ``open_data`` the data layers are opened, else their shapes are given.
     """
     monkeypatch.chdir(tmp_path)
 
-    def check(net: str, solver: str | None = None, phase: int = 0, open_data: bool = False) -> list[str]:
+    def check(net: str, solver: str | None = None, phase: PhaseValue = TRAIN, open_data: bool = False) -> list[str]:
         Path("net.prototxt").write_text(net)
         if solver is not None:
             Path("solver.prototxt").write_text('net: "net.prototxt"\n' + solver)

@@ -16,6 +16,7 @@ import netspec
 from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, random_inputs, run_module
 from netspec.net.net import Net
 
+Run = Callable[..., Any]  # the fixture of conftest.py
 MODEL, WEIGHTS = "deploy.prototxt", "deploy.caffemodel"
 TEXT = """name: "Cli"
 layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 8 } } }
@@ -33,7 +34,7 @@ def onnx() -> Any:
 
 
 @pytest.fixture
-def net(run: Callable[..., object]) -> Net:
+def net(run: Run) -> Net:
     """A net, whose files are in the working directory."""
     Path(MODEL).write_text(TEXT)
     net = netspec.load_net(MODEL, seed=1)
@@ -43,7 +44,7 @@ def net(run: Callable[..., object]) -> Net:
     return net
 
 
-def test_onnx(onnx: Any, net: Net, run: Callable[..., object]) -> None:
+def test_onnx(onnx: Any, net: Net, run: Run) -> None:
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "net.onnx")
     assert (result.status, result.out, result.err) == (0, "", "")
     inputs = random_inputs(net)
@@ -56,7 +57,7 @@ def test_onnx(onnx: Any, net: Net, run: Callable[..., object]) -> None:
     assert props["netspec.phase"] == "TEST"
 
 
-def test_torch(net: Net, run: Callable[..., object], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torch(net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "torch", "--out", "exported_cli.py")
     assert result.status == 0
     assert result.err == "note: the weights are in exported_cli.safetensors, beside the module\n"
@@ -68,20 +69,20 @@ def test_torch(net: Net, run: Callable[..., object], monkeypatch: pytest.MonkeyP
     del sys.modules["exported_cli"]
 
 
-def test_pt2(net: Net, run: Callable[..., object]) -> None:
+def test_pt2(net: Net, run: Run) -> None:
     assert run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "net.pt2").status == 0
     inputs = random_inputs(net)
     assert_same(run_module(torch.export.load("net.pt2").module(), net, inputs), here(net, inputs))
 
 
-def test_safetensors(net: Net, run: Callable[..., object]) -> None:
+def test_safetensors(net: Net, run: Run) -> None:
     assert run("export", MODEL, "--weights", WEIGHTS, "--to", "safetensors", "--out", "net.safetensors").status == 0
     found = load_file("net.safetensors")
     assert sorted(found) == ["bn.0", "bn.1", "bn.2", "conv.0", "conv.1"]
     np.testing.assert_array_equal(found["conv.0"], net.params["conv"][0].detach().numpy())
 
 
-def test_fold(net: Net, run: Callable[..., object]) -> None:
+def test_fold(net: Net, run: Run) -> None:
     result = run("fold", MODEL, "--weights", WEIGHTS, "--out", "small")
     assert result.status == 0
     assert result.err == "small.prototxt and small.caffemodel: 3 layers of 4\n"
@@ -91,7 +92,7 @@ def test_fold(net: Net, run: Callable[..., object]) -> None:
     assert_same(here(small, inputs), here(net, inputs))
 
 
-def test_a_training_net_folds_to_a_deploy_net(run: Callable[..., object]) -> None:
+def test_a_training_net_folds_to_a_deploy_net(run: Run) -> None:
     result = run(
         "fold",
         "sgd_step/train_val.prototxt",
@@ -108,7 +109,7 @@ def test_a_training_net_folds_to_a_deploy_net(run: Callable[..., object]) -> Non
     assert not any(layer.is_loss for layer in small.layers)
 
 
-def test_a_training_net_is_exported_with_its_loss(onnx: Any, run: Callable[..., object]) -> None:
+def test_a_training_net_is_exported_with_its_loss(onnx: Any, run: Run) -> None:
     words = (
         "export",
         "sgd_step/train_val.prototxt",
@@ -126,14 +127,14 @@ def test_a_training_net_is_exported_with_its_loss(onnx: Any, run: Callable[..., 
     assert [each.name for each in model.graph.output] == ["loss"]
 
 
-def test_part_of_a_net(onnx: Any, net: Net, run: Callable[..., object]) -> None:
+def test_part_of_a_net(onnx: Any, net: Net, run: Run) -> None:
     words = ("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "net.onnx", "--blob")
     assert run(*words, "conv").status == 0
     assert [node.op_type for node in onnx.load("net.onnx").graph.node] == ["Conv"]
     assert 'no blob "conf" in this net; did you mean "conv"?' in run(*words, "conf").fault
 
 
-def test_images_steps(onnx: Any, net: Net, run: Callable[..., object]) -> None:
+def test_images_steps(onnx: Any, net: Net, run: Run) -> None:
     words = ("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "net.onnx", "--mean", "1,2,3", "--swap")
     assert run(*words, "--scale", "0.5").status == 0
     inputs = random_inputs(net)
@@ -152,20 +153,18 @@ def test_images_steps(onnx: Any, net: Net, run: Callable[..., object]) -> None:
         (("--to", "onnx", "--out", "n.onnx", "--swap", "--input", "x"), 'no input "x" in this net; it has: data'),
     ],
 )
-def test_faults_are_one_line(
-    words: tuple[str, ...], fault: str, onnx: Any, net: Net, run: Callable[..., object]
-) -> None:
+def test_faults_are_one_line(words: tuple[str, ...], fault: str, onnx: Any, net: Net, run: Run) -> None:
     assert fault in run("export", MODEL, "--weights", WEIGHTS, *words).fault
     assert not list(Path().glob("n.onnx"))
 
 
-def test_weights_that_are_not_there(onnx: Any, net: Net, run: Callable[..., object]) -> None:
+def test_weights_that_are_not_there(onnx: Any, net: Net, run: Run) -> None:
     words = ("export", MODEL, "--to", "onnx", "--out", "n.onnx")
     assert "no.caffemodel: cannot be read: No such file or directory" in run(*words, "--weights", "no.caffemodel").fault
     assert run(*words).err == "warning: no --weights: the net has random ones\n"
 
 
-def test_the_onnx_library_is_an_extra(net: Net, run: Callable[..., object], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_onnx_library_is_an_extra(net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
     words = ("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "n.onnx")
     assert run(*words).fault == "--to onnx needs the onnx library: pip install 'netspec-caffe[onnx]'"
@@ -175,7 +174,7 @@ def test_the_onnx_library_is_an_extra(net: Net, run: Callable[..., object], monk
     ("target", "out"), [("torch", "n.py"), ("pt2", "n.pt2"), ("safetensors", "n.safetensors"), ("fold", "n")]
 )
 def test_a_fault_leaves_old_files_as_they_were(
-    target: str, out: str, net: Net, run: Callable[..., object], monkeypatch: pytest.MonkeyPatch
+    target: str, out: str, net: Net, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("fold", MODEL) if target == "fold" else ("export", MODEL, "--to", target)
     words = (*words, "--weights", WEIGHTS, "--out", out)
@@ -190,11 +189,11 @@ def test_a_fault_leaves_old_files_as_they_were(
     assert {path: path.read_bytes() for path in Path().iterdir() if path.name.lstrip(".")[:1] == "n"} == before
 
 
-def test_folding_needs_weights(net: Net, run: Callable[..., object]) -> None:
+def test_folding_needs_weights(net: Net, run: Run) -> None:
     assert run("fold", MODEL, "--out", "n").status == 2
 
 
-def test_steps_for_images_are_for_onnx(net: Net, run: Callable[..., object]) -> None:
+def test_steps_for_images_are_for_onnx(net: Net, run: Run) -> None:
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "n.pt2", "--swap")
     assert result.status == 2
     assert "go with --to onnx" in result.err

@@ -80,7 +80,9 @@ def images(run: Run) -> Path:
 
 
 def features_of(path: Path) -> np.ndarray:
-    image = cv2.resize(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (28, 28))
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    image = cv2.resize(image, (28, 28))
     pair = np.stack([image, image])[None].astype(np.float32) * 0.00390625
     net = netspec.load_net(NET, weights=INIT)
     layers = dict(zip([node.name for node in net.plan.nodes], net.layers, strict=True))
@@ -107,8 +109,9 @@ def test_extract_runs_a_training_nets_tower_over_a_folder_of_images(run: Run, im
 
 def test_extract_describes_the_middle_of_each_image_too(run: Run, images: Path) -> None:
     whole = images / "rgb" / "1.png"
-    middle = cv2.imread(str(whole))[9:26, 10:30]  # round(35 / 4) and round(40 / 4) off each side
-    cv2.imwrite("middle.png", middle)
+    image = cv2.imread(str(whole))
+    assert image is not None
+    cv2.imwrite("middle.png", image[9:26, 10:30])  # round(35 / 4) and round(40 / 4) off each side
     assert run("extract", *IMAGES, "--images", images / "rgb", "--zooms", "1,0.5").status == 0
     found = np.load("f.npz")
     assert found["zooms"].tolist() == [1, 0.5]

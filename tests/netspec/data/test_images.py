@@ -22,7 +22,9 @@ def test_an_image_is_planar_and_blue_green_red() -> None:
 
 def test_an_image_is_resized_without_antialiasing(tmp_path: Path) -> None:
     found = read_image(str(PNG / "0.png"), size=(12, 16))
-    assert (found.transpose(1, 2, 0) == cv2.resize(cv2.imread(str(PNG / "0.png")), (16, 12))).all()
+    whole = cv2.imread(str(PNG / "0.png"))
+    assert whole is not None
+    assert (found.transpose(1, 2, 0) == cv2.resize(whole, (16, 12))).all()
     stripes = np.zeros((8, 2), np.uint8)
     stripes[::4] = (
         255  # bilinear looks between rows 1 and 2, 5 and 6; an average over the area would see the bright ones

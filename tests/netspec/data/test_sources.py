@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from netspec.proto.schema import TransformationParameter
 PLACE = Where("net.prototxt", 9, 5)
 
 
-def source(path: Path, shapes: list[tuple[int, int, int]], batch_size: int, **transform: object) -> DatabaseSource:
+def source(path: Path, shapes: list[tuple[int, int, int]], batch_size: int, **transform: Any) -> DatabaseSource:
     with Writer(str(path)) as writer:
         for i, shape in enumerate(shapes):
             writer.put(b"%08d" % i, array_to_datum(np.full(shape, i, np.uint8), i).SerializeToString())

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ def at(*path: str | int) -> Where:
     return Where("net.prototxt", 3, 1, "data " + ".".join(map(str, path)), "Data")
 
 
-def transformer(phase: int = TEST, **fields: object) -> Transformer:
+def transformer(phase: int = TEST, **fields: Any) -> Transformer:
     return Transformer(TransformationParameter(**fields), phase, at, seed=5, stream="data")
 
 

@@ -56,9 +56,11 @@ def _compare_on_the_gpu(layer: Layer, bottoms: list[torch.Tensor]) -> None:
     expected = layer.run(*bottoms)
     with pretended_gpu():
         for tensors in (module._parameters for module in layer.modules()):
-            tensors.update({name: torch.nn.Parameter(p.detach().to(NAME)) for name, p in tensors.items()})
+            tensors.update(
+                {name: torch.nn.Parameter(p.detach().to(NAME)) for name, p in tensors.items() if p is not None}
+            )
         for tensors in (module._buffers for module in layer.modules()):
-            tensors.update({name: buffer.to(NAME) for name, buffer in tensors.items()})
+            tensors.update({name: b.to(NAME) for name, b in tensors.items() if b is not None})
         found = layer.run(*[bottom.to(NAME).requires_grad_() for bottom in bottoms])
         learned = [top for top in found if top.requires_grad]
         torch.autograd.backward(learned, [torch.ones_like(top) for top in learned])

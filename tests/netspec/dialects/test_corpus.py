@@ -6,6 +6,7 @@ import pytest
 
 from netspec.check.check import check_file
 from netspec.dialects import use_dialect
+from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net
 from paths import SHARED
 
@@ -19,11 +20,12 @@ PARAMETERS = {"SE-ResNet-50": 28.1, "SE-ResNet-101": 49.3, "SE-ResNet-152": 66.8
 def test_senets_build(path: Path) -> None:
     net, _ = parse_net(path)
     if any(layer.type == "Axpy" for layer in net.layer):
-        (refused,) = check_file(path, phase=1)
+        (refused,) = check_file(path, TEST)
         assert 'unknown layer type "Axpy"; dialect "blocks" has "Axpy"; add --plugin blocks' in str(refused.faults[0])
     use_dialect("blocks")
-    (checked,) = check_file(path, phase=1)
+    (checked,) = check_file(path, TEST)
     assert checked.faults == []
+    assert checked.net is not None
     assert checked.net.shapes["prob"] == (1, 1000)
     learned = sum(p.parameter.numel() for p in checked.net.learnable if p.lr_mult)
     if path.stem in PARAMETERS:

@@ -234,10 +234,10 @@ def test_loss_and_gradient(build: Build, gradcheck: Gradcheck, settings: dict[st
 
 @pytest.mark.parametrize("divide", ["VALID", "FULL", "BATCH_SIZE", "NONE"])
 def test_what_the_sum_is_divided_by(build: Build, divide: str) -> None:
-    scenery = scene()
-    given = bottoms(*scenery, TRUTH)
+    loc, conf, priors, variances = scene()
+    given = bottoms(loc, conf, priors, variances, TRUTH)
     (loss,) = layer_of(build, {}, given, f"loss_param {{ normalization: {divide} }}").run(*given)
-    expected = Oracle().loss(*(a.tolist() for a in scenery), TRUTH, divide)
+    expected = Oracle().loss(loc.tolist(), conf.tolist(), priors.tolist(), variances.tolist(), TRUTH, divide)
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
@@ -289,9 +289,10 @@ def test_objects_of_any_label_are_one_class(build: Build) -> None:
 
 def test_hard_examples_that_overlap_one_of_greater_loss_are_suppressed(build: Build) -> None:
     # Two priors nearly alike, of which only that of greater loss is trained, one apart, and one next to nothing.
-    priors = np.float32([[0.1, 0.1, 0.4, 0.4], [0.11, 0.1, 0.4, 0.4], [0.6, 0.6, 0.9, 0.9], [0.5, 0.5, 0.502, 0.502]])
+    boxes = [[0.1, 0.1, 0.4, 0.4], [0.11, 0.1, 0.4, 0.4], [0.6, 0.6, 0.9, 0.9], [0.5, 0.5, 0.502, 0.502]]
+    priors = np.array(boxes, np.float32)
     variances = np.full((4, 4), 0.1, np.float32)
-    conf = np.float32([[[0, 1, 0, 0], [0, 3, 0, 0], [0, 2, 0, 0], [0, 2.5, 0, 0]]])
+    conf = np.array([[[0, 1, 0, 0], [0, 3, 0, 0], [0, 2, 0, 0], [0, 2.5, 0, 0]]], np.float32)
     given = bottoms(np.zeros((1, 4, 1, 4), np.float32), conf, priors, variances, [(0, 1, 0, 0.0, 0.5, 0.05, 0.55, 0)])
     trained = []
     for nms in ("nms_param { nms_threshold: 0.5 top_k: 10 }", "nms_param { nms_threshold: 0.5 top_k: 1 }", ""):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from netspec.errors import SpecError
 from netspec.layers import Layer
 from netspec.net.build import build_net
 from netspec.net.options import BuildOptions
+from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
+from netspec.solver.solver import load_solver
 
 Build = Callable[..., Layer]
 Gradcheck = Callable[..., None]
@@ -126,7 +129,7 @@ def test_prior_boxes_are_clipped_and_have_their_variances(build: Build) -> None:
     (top,) = build("ssd", f"type: 'PriorBox' prior_box_param {{ {settings} }}", maps.shape).run(maps)
     expected = np.clip(priors((2, 2), (60, 60), (30, 30), [(50, 50)]), 0, 1)
     np.testing.assert_allclose(top[0, 0].reshape(-1, 4).numpy(), expected, rtol=1e-5)
-    np.testing.assert_array_equal(top[0, 1].numpy(), np.tile(np.float32([0.1, 0.2, 0.3, 0.4]), 4))
+    np.testing.assert_array_equal(top[0, 1].numpy(), np.tile(np.array([0.1, 0.2, 0.3, 0.4], np.float32), 4))
 
 
 @pytest.mark.parametrize(
@@ -220,7 +223,7 @@ def some_priors(count: int, rng: np.random.Generator) -> np.ndarray:
 def test_detection_output(build: Build, kind: str, shared: bool, limits: dict[str, float]) -> None:
     rng = np.random.default_rng(0)
     images, count, classes = 2, 20, 3
-    prior, variance = some_priors(count, rng), np.tile(np.float32([0.1, 0.1, 0.2, 0.2]), (count, 1))
+    prior, variance = some_priors(count, rng), np.tile(np.array([0.1, 0.1, 0.2, 0.2], np.float32), (count, 1))
     loc = rng.normal(size=(images, count, 1 if shared else classes, 4)).astype(np.float32)
     scores = rng.uniform(size=(images, count, classes)).astype(np.float32)
     nms = f"nms_threshold: {limits['nms']} eta: {limits.get('eta', 1)}"
@@ -338,9 +341,9 @@ NET = """
 def test_a_small_detector_learns_where_two_squares_are() -> None:
     use_dialect("ssd")
     net, source = parse_net_text(NET, "f")
-    net.state.phase = 0
+    net.state.phase = TRAIN
     train = build_net(net, source, BuildOptions(seed=1))
-    net.state.phase = 1
+    net.state.phase = TEST
     test = build_net(net, source, BuildOptions(seed=1))
     image = torch.zeros(2, 3, 64, 64)
     image[0, :, 10:40, 5:35] = 1
@@ -363,3 +366,13 @@ def test_a_small_detector_learns_where_two_squares_are() -> None:
         best = max(out[out[:, 0] == i], key=lambda found: float(found[2]))
         assert best[1] == row[1]
         assert overlap(tuple(best[3:].tolist()), tuple(row[3:7].tolist())) > 0.7
+
+
+def test_what_the_solver_of_ssd_has_more_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    use_dialect("ssd")
+    (tmp_path / "solver.prototxt").write_text(
+        'net_param { layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } } }\n'
+        'base_lr: 1 lr_policy: "fixed" eval_type: "detection"'
+    )
+    load_solver(tmp_path / "solver.prototxt")
+    assert "solver.prototxt:2:31: eval_type has no effect: it is a fork's" in caplog.text

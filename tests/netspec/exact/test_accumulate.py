@@ -52,8 +52,7 @@ def test_a_net_shows_its_gradients_to_hooks_and_to_autograd(net_of, exact: str) 
 
 def test_a_net_trains_side_by_side_as_torchs_wrappers_have_it(net_of, tmp_path) -> None:
     net, inputs = net_of(SIAMESE, phase=0), images()
-    store = torch.distributed.FileStore(str(tmp_path / "store"), 1)
-    torch.distributed.init_process_group("gloo", store=store, rank=0, world_size=1)
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path / 'store'}", rank=0, world_size=1)
     try:
         wrapped = torch.nn.parallel.DistributedDataParallel(net)
         wrapped(**inputs)["loss"].backward()

@@ -69,6 +69,7 @@ def test_a_recorded_net_computes_and_does_not_remember(net_of, exact: str) -> No
     for layer, shape in ((net.layers[1], (2, 1, 4, 4)), (net.layers[3], (2, 3))):
         data, other = torch.randn(2, *shape)
         traced = torch.jit.trace(layer, data, check_trace=False)
+        assert isinstance(traced, torch.nn.Module)
         exported = torch.export.export(layer, (data,)).module()
         compiled = torch.compile(layer, backend="eager", fullgraph=True)
         for recorded in (traced, exported, compiled):

@@ -13,6 +13,7 @@ from netspec.export.deploy import fold, with_inputs, write_caffe
 from netspec.net.build import build_net
 from netspec.net.fold import find_folds
 from netspec.net.net import Net
+from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net
 from paths import GOLDEN
 
@@ -123,7 +124,7 @@ def test_a_training_net_becomes_a_deploy_net(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.chdir(GOLDEN / "train" / "sgd_step")
     monkeypatch.chdir(GOLDEN)
     message, source = parse_net("train/sgd_step/train_val.prototxt")
-    message.state.phase = 1
+    message.state.phase = TEST
     deploy, source = with_inputs(message, source, {"pair_data": (4, 2, 28, 28)}, labels=False)
     net = build_net(deploy, source)
     assert net.inputs == ["pair_data"]

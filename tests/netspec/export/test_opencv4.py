@@ -18,6 +18,7 @@ from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.weights import save_weights
+from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text
 from paths import GOLDEN
 
@@ -60,7 +61,7 @@ np.save(out, net.forward())
 
 def residual_net() -> Net:
     message, source = parse_net_text(TEXT, "residual.prototxt")
-    message.state.phase = 1
+    message.state.phase = TEST
     return trained(build_net(message, source, BuildOptions(seed=0)))
 
 

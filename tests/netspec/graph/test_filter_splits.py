@@ -5,7 +5,7 @@ import pytest
 from netspec.errors import SpecError
 from netspec.graph.filter import filter_net, in_state, with_state
 from netspec.graph.splits import insert_splits
-from netspec.proto.schema import NetParameter, NetState
+from netspec.proto.schema import TRAIN, NetParameter, NetState, PhaseValue
 from netspec.proto.text import parse_net_text
 
 RULES = """
@@ -31,7 +31,7 @@ layer { name: "either" type: "Silence" include { stage: "val" } include { phase:
         (1, 1, ("deploy", "fast"), "always test shallow deploy no_val"),
     ],
 )
-def test_layers_that_a_state_includes(phase: int, level: int, stages: tuple[str, ...], expected: str) -> None:
+def test_layers_that_a_state_includes(phase: PhaseValue, level: int, stages: tuple[str, ...], expected: str) -> None:
     net, source = parse_net_text(RULES, "net")
     filtered, places = filter_net(with_state(net, phase, level, stages), source)
     assert " ".join(layer.name for layer in filtered.layer) == expected
@@ -53,7 +53,7 @@ def test_include_and_exclude_together_are_refused_with_their_place() -> None:
 
 def test_states_merge_as_the_solver_merges_them() -> None:
     net = NetParameter(state=NetState(level=7, stage=["own"]))
-    state = in_state(net, NetState(phase=0, level=1), NetState(stage=["a"]), NetState(level=3, stage=["b"])).state
+    state = in_state(net, NetState(phase=TRAIN, level=1), NetState(stage=["a"]), NetState(level=3, stage=["b"])).state
     assert (state.phase, state.level, list(state.stage)) == (0, 3, ["a", "b"])
     assert net.state.level == 7  # the argument is as it was
 

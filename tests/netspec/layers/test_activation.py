@@ -161,8 +161,10 @@ def test_clip_without_both_ends_is_refused(build) -> None:
 
     param = LayerParameter(type="Clip", bottom=["x"], top=["y"])
     param.clip_param.min = 0
+    clip = layer_class("Clip")
+    assert clip is not None
     with pytest.raises(SpecError, match="clip_param has no max; both min and max are required"):
-        layer_class("Clip")(param, [(3,)])
+        clip(param, [(3,)])
 
 
 # What Caffe's backward makes of memory that was written over (net/in_place.py): bottom and top are any data.

@@ -47,7 +47,8 @@ def softmax_loss(x: np.ndarray, labels: np.ndarray, mode: str, ignore: int | Non
         total -= math.log(max(p[i, label, j], FLT_MIN))
         grad[i, label, j] -= 1
         valid += 1
-    scale = normalizer(mode, *labels.shape, valid)
+    outer, inner = labels.shape
+    scale = normalizer(mode, outer, inner, valid)
     return total / scale, grad / scale
 
 
@@ -239,6 +240,8 @@ def test_euclidean_loss_is_over_2n_and_gives_both_bottoms_a_gradient(build) -> N
     difference = a.detach().numpy() - b.detach().numpy().reshape(4, 3)
     assert loss.item() == pytest.approx((difference**2).sum() / 8, rel=1e-6)
     loss.backward()
+    assert a.grad is not None
+    assert b.grad is not None
     np.testing.assert_allclose(a.grad.numpy(), difference / 4, atol=1e-7)
     np.testing.assert_allclose(b.grad.numpy().reshape(4, 3), -difference / 4, atol=1e-7)
 
@@ -288,6 +291,8 @@ def test_contrastive_loss_and_its_gradients(build, shape: tuple, legacy: bool) -
         a.detach().double().numpy().reshape(6, 5), b.detach().double().numpy().reshape(6, 5), labels.numpy(), 3, legacy
     )
     assert loss.item() == pytest.approx(expected, rel=1e-6)
+    assert a.grad is not None
+    assert b.grad is not None
     np.testing.assert_allclose(a.grad.numpy().reshape(6, 5), grad, atol=1e-6)
     np.testing.assert_allclose(b.grad.numpy().reshape(6, 5), -grad, atol=1e-6)
 

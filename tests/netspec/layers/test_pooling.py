@@ -83,6 +83,7 @@ def test_pooling_agrees_with_plain_loops_at_random_settings(build, method: str) 
         if method == "MAX":
             np.testing.assert_array_equal(tops[1], mask, err_msg=what)
         tops[0].backward(torch.from_numpy(top_diff))
+        assert bottom.grad is not None, what
         np.testing.assert_allclose(bottom.grad, diff, atol=1e-5, err_msg=what)
         cases += 1
         wide_pads += any(2 * p > k for p, k in zip(pad, kernel, strict=True))

@@ -2,7 +2,7 @@
 
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -140,7 +140,7 @@ class NoLayer(object):
 
 
 @pytest.fixture
-def python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Layer]:
+def python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Layer]]:
     """``python(class_name, *bottom_shapes, ...)``: a Python layer of CODE, which lies in the current directory."""
     (tmp_path / "layers_of_mine.py").write_text(CODE)
     monkeypatch.chdir(tmp_path)
@@ -159,7 +159,9 @@ def python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Lay
         param = LayerParameter(name="mine", type="Python", bottom=bottoms[: len(shapes)], top=tops)
         param.python_param.module, param.python_param.layer, param.python_param.param_str = module, name, param_str
         at = lambda *path: Where("net.prototxt", 7, 3, "mine", "Python")  # noqa: E731
-        return layer_class("Python")(param, shapes, Context(allow_python=allow_python, at=at, **context))
+        python_layer = layer_class("Python")
+        assert python_layer is not None
+        return python_layer(param, shapes, Context(allow_python=allow_python, at=at, **context))
 
     yield build
     sys.modules.pop("layers_of_mine", None)
@@ -195,6 +197,7 @@ def test_first_example_of_caffe(python, dtype: torch.dtype) -> None:
         assert torch.equal(top, 10 * bottom)
         diff = torch.randn(shape, dtype=dtype)
         top.backward(diff)
+        assert bottom.grad is not None
         assert torch.equal(bottom.grad, 10 * diff)
     assert layer.top_shapes == [(4, 5, 1)]
 
@@ -225,6 +228,7 @@ def test_second_example_of_caffe_is_told_which_bottoms_want_a_gradient(python) -
     assert loss.shape == (1,)
     assert loss.item() == pytest.approx(((a - b) ** 2).sum().item() / 8, rel=1e-6)
     loss.sum().backward()
+    assert a.grad is not None
     torch.testing.assert_close(a.grad, (a - b).detach() / 4)
     torch.testing.assert_close(b.grad, -a.grad)
     layer.run(a, b.detach())[0].sum().backward()
@@ -266,6 +270,7 @@ def test_in_place_bottom_and_top_are_one_blob(python) -> None:
         assert top.tolist() == [factor, 2 * factor, 3 * factor]
         assert bottom.tolist() == [1, 2, 3]  # other layers' gradients may need it
         top.backward(torch.tensor([5.0, 6.0, 7.0]))
+        assert bottom.grad is not None
         assert bottom.grad.tolist() == [5 * factor, 6 * factor, 7 * factor]
 
 
@@ -285,7 +290,7 @@ def test_a_caffe_that_is_there_is_left_alone(python, monkeypatch: pytest.MonkeyP
     from netspec.layers.utility import pycaffe_shim
 
     real = types.ModuleType("caffe")
-    real.Layer = type("Layer", (pycaffe_shim.Layer,), {})
+    monkeypatch.setattr(real, "Layer", type("Layer", (pycaffe_shim.Layer,), {}), raising=False)
     monkeypatch.setitem(sys.modules, "caffe", real)
     layer = python("TimesTen", (2, 3))
     assert isinstance(layer.code, real.Layer)

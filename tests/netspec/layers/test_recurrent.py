@@ -28,14 +28,12 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 def unroll(kind: str, blobs: list, x: np.ndarray, cont: np.ndarray, state: list, static: np.ndarray | None) -> tuple:
     """Return the outputs of all time steps and the last state; the blobs in Caffe's order."""
     w_x, b, *blobs = blobs
-    w_static = blobs.pop(0) if static is not None else None
+    from_static = 0 if static is None else static.reshape(len(static), -1) @ blobs.pop(0).T
     w_h, *out = blobs
     outputs = []
     for step, keep in zip(x, cont, strict=True):
         keep = keep[:, None]
-        z = step.reshape(len(keep), -1) @ w_x.T + b + (keep * state[0]) @ w_h.T
-        if static is not None:
-            z += static.reshape(len(keep), -1) @ w_static.T
+        z = step.reshape(len(keep), -1) @ w_x.T + b + (keep * state[0]) @ w_h.T + from_static
         if kind == "RNN":
             state = [np.tanh(z)]
             outputs.append(np.tanh(state[0] @ out[0].T + out[1]))
@@ -169,7 +167,7 @@ def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
     cont = torch.tensor([[1.0, 0.0]]).double().requires_grad_()
     cell, gates = torch.randn(1, N, D).double().requires_grad_(), torch.randn(1, N, 4 * D).double().requires_grad_()
     torch.autograd.gradcheck(lambda cell, gates: layer.run(cell, gates, cont), (cell, gates))
-    sum(top.sum() for top in layer.run(cell, gates, cont)).backward()
+    torch.autograd.backward([top.sum() for top in layer.run(cell, gates, cont)])
     assert cont.grad is None
 
 

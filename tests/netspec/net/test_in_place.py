@@ -9,9 +9,9 @@ import torch
 from netspec.graph.filter import with_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
+from netspec.proto.schema import TRAIN
 from netspec.proto.text import parse_net_text
 
-TRAIN = 0
 SHAPE = (6, 4)
 
 

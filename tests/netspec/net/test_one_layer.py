@@ -50,6 +50,16 @@ def test_a_layer_without_bottoms_a_loss_and_the_training_phase() -> None:
     assert set(dropped.tolist()) == {0, 2}
 
 
+def test_exact_says_whose_sums_are_made() -> None:
+    x = torch.randn(2, 3, requires_grad=True)
+
+    assert netspec.layer('type: "Sigmoid"', exact="all")(x).grad_fn.name() == "PointwiseBackward"  # the C library's
+    assert netspec.layer('type: "Sigmoid"', exact="none")(x).grad_fn.name() != "PointwiseBackward"
+    assert netspec.layer('type: "Sigmoid"')(x).grad_fn.name() != "PointwiseBackward"
+    with pytest.raises(ValueError, match="found exact 'some', expected 'none', 'small', 'all'"):
+        netspec.layer('type: "Sigmoid"', exact="some")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -12,7 +12,7 @@ from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights, net_to_proto, save_weights
-from netspec.proto.schema import BlobProto, NetParameter, V1LayerParameter
+from netspec.proto.schema import TRAIN, BlobProto, NetParameter, V1LayerParameter
 from netspec.proto.text import parse_net_text
 from paths import GOLDEN
 
@@ -45,6 +45,12 @@ def fill(net: Net) -> None:
             item.parameter.grad = torch.full_like(item.parameter, 0.5)
 
 
+def members(file: h5py.File, path: str) -> list[str]:
+    group = file[path]
+    assert isinstance(group, h5py.Group)
+    return sorted(group)
+
+
 @pytest.fixture
 def golden_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Return a function that builds the TRAIN net of one of Caffe's trainings."""
@@ -54,7 +60,7 @@ def golden_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def build(folder: str) -> Net:
         text = (GOLDEN / folder / "train_val.prototxt").read_text()
         net, source = parse_net_text(text, "train_val.prototxt")
-        net.state.phase = 0
+        net.state.phase = TRAIN
         return build_net(net, source)
 
     return build
@@ -82,10 +88,12 @@ def test_the_hdf5_form_has_caffes_structure(golden_net, tmp_path: Path):
         expected.visit(names[1].append)
         assert names[0] == names[1]
         for name in names[0]:
-            if isinstance(expected[name], h5py.Dataset):
-                assert mine[name].dtype == expected[name].dtype
-                assert mine[name].chunks is None
-                np.testing.assert_array_equal(mine[name][()], expected[name][()])
+            written, wanted = mine[name], expected[name]
+            if isinstance(wanted, h5py.Dataset):
+                assert isinstance(written, h5py.Dataset)
+                assert written.dtype == wanted.dtype
+                assert written.chunks is None
+                np.testing.assert_array_equal(written[()], wanted[()])
 
 
 @pytest.mark.parametrize("name", ["w.caffemodel", "w.caffemodel.h5"])
@@ -117,10 +125,12 @@ def test_gradients_are_written_where_asked_for(tmp_path: Path):
     assert list(net_to_proto(net, diff=True).layer[3].blobs[1].diff) == [0.5] * 4
     save_weights(net, tmp_path / "w.h5", diff=True)
     with h5py.File(tmp_path / "w.h5") as file:
-        assert sorted(file["data/ip"]) == ["0", "1", "p"]
-        assert sorted(file["data/ip/p"]) == []  # a sharer's data are its owner's; its diffs are written
-        assert sorted(file["diff/ip/p"]) == ["0", "1"]
-        assert file["diff/ip/0"][()].tolist() == [[0.5] * 3] * 4
+        assert members(file, "data/ip") == ["0", "1", "p"]
+        assert members(file, "data/ip/p") == []  # a sharer's data are its owner's; its diffs are written
+        assert members(file, "diff/ip/p") == ["0", "1"]
+        diff = file["diff/ip/0"]
+        assert isinstance(diff, h5py.Dataset)
+        assert diff[()].tolist() == [[0.5] * 3] * 4
 
 
 def test_a_sharer_of_another_shape_is_written_in_its_own(tmp_path: Path):
@@ -192,7 +202,7 @@ def test_double_data_is_read(tmp_path: Path):
 
 def test_weights_of_v1_nets_are_upgraded(tmp_path: Path):
     proto = NetParameter(name="old")
-    layer = V1LayerParameter(name="ip", type="INNER_PRODUCT")
+    layer = V1LayerParameter(name="ip", type=V1LayerParameter.INNER_PRODUCT)
     layer.blobs.append(BlobProto(num=1, channels=1, height=4, width=3, data=range(12)))
     layer.blobs.append(BlobProto(num=1, channels=1, height=1, width=4, data=range(4)))
     proto.layers.append(layer)
@@ -234,13 +244,13 @@ def test_in_hdf5_only_the_blobs_of_an_owner_may_not_lack(tmp_path: Path):
         load_weights(net, path)
     save_weights(net, path)
     with h5py.File(path, "r+") as file:
-        file["data/ip"].create_dataset("2", data=[1.0])
+        file.create_dataset("data/ip/2", data=[1.0])
     with pytest.raises(SpecError, match="incompatible number of blobs for layer 'ip': 3 in the file, 2 in the net"):
         load_weights(net, path)
     save_weights(net, path)
     with h5py.File(path, "r+") as file:
         del file["data/ip/1"]
-        file["data/ip"].create_dataset("1", data=np.zeros((1, 4), np.float32))
+        file.create_dataset("data/ip/1", data=np.zeros((1, 4), np.float32))
     with pytest.raises(SpecError, match=r"Source param shape is 1 4 \(4\); target param shape is 4 \(4\)"):
         load_weights(net, path)
 

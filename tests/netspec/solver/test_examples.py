@@ -44,7 +44,8 @@ def test_follows_caffe(run: str, folder: Path, same_blas: bool, monkeypatch: pyt
     solver.close()
     for key in golden.files:
         if key.startswith("out/"):
-            np.testing.assert_array_equal(np.float32([out[key[4:]] for out in outputs]), golden[key], key)
+            found = np.array([out[key[4:]] for out in outputs], np.float32)
+            np.testing.assert_array_equal(found, golden[key], key)
     for key, weights in parameters(solver.net, golden, "final/").items():
         np.testing.assert_array_equal(weights, golden[key], key)
     assert [{name: value for name, (value,) in scores.items()} for scores in solver.scores] == meta["tests_after"]
@@ -59,6 +60,7 @@ def test_begins_as_caffe_does_on_every_cpu(run: str, folder: Path, monkeypatch: 
     solver.close()
     golden = np.load(f"examples/runs/{run}/trajectory.npz")
     for learnable in solver.net.learnable:
+        assert learnable.parameter.grad is not None
         learnable.parameter.data.copy_(learnable.parameter.grad)  # the update, as Caffe leaves it there
     assert_same_layers(parameters(solver.net, golden, "update/"), golden, 1e-4)
 

@@ -45,7 +45,7 @@ def _contents(path: Path) -> dict[str, tuple]:
 
 @pytest.mark.parametrize("ending", ["solverstate", "solverstate.h5"])
 def test_what_is_written_is_read(ending: str, tmp_path: Path):
-    history = [np.arange(6, dtype=np.float32).reshape(2, 3), np.float32([7, 8])]
+    history = [np.arange(6, dtype=np.float32).reshape(2, 3), np.array([7, 8], np.float32)]
     write_state(tmp_path / f"x.{ending}", State(123, "somewhere/x.caffemodel", 4, history))
     state = read_state(tmp_path / f"x.{ending}")
     assert (state.iteration, state.learned_net, state.current_step) == (123, "somewhere/x.caffemodel", 4)
@@ -149,7 +149,9 @@ def test_resume_from_caffes_hdf5_state(work_in: Callable[..., Path]):
     solver = load_solver("sgd_step/solver.prototxt", snapshot="sgd_step/h5_iter_10.solverstate.h5")
     assert solver.iteration == 10
     with h5py.File("sgd_step/h5_iter_10.caffemodel.h5") as file:
-        np.testing.assert_array_equal(solver.net.params["conv2_p"][0].detach().numpy(), file["data/conv2/0"][()])
+        weights = file["data/conv2/0"]
+        assert isinstance(weights, h5py.Dataset)
+        np.testing.assert_array_equal(solver.net.params["conv2_p"][0].detach().numpy(), weights[()])
     np.testing.assert_array_equal(
         solver.history[2].numpy(), read_state("sgd_step/h5_iter_10.solverstate.h5").history[2]
     )

@@ -1,0 +1,71 @@
+"""``netspec run``: a program that was written for pycaffe."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from netspec.cli.run import Commands
+from netspec.command_line import VARIABLE, WrongUsage
+
+NAME = "run"
+_WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel")
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add(NAME, _run, "run a Python script; in it `import caffe` finds netspec")
+    p.set_defaults(log_form=None)  # pycaffe shows its log, and the script has its own
+    p.usage = "netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]"
+    p.add_argument("--shadow-caffe", action="store_true", help="use netspec also where a real Caffe is installed")
+    p.add_argument("--python2", action="store_true", help="translate from Python 2, also what runs as Python 3")
+    p.add_argument("--write-py3", type=Path, metavar="FILE", help="keep the translation of a script in Python 2")
+    p.add_argument("-m", dest="module", action="store_true", help="run a module, as python -m does")
+
+    p = commands.add(
+        "install-caffe", _install, "put a package `caffe` and Caffe's commands into this Python environment"
+    )
+    p.add_argument("--replace", action="store_true", help="move a real Caffe that is in the way aside")
+    commands.add("remove-caffe", _remove, "undo install-caffe")
+
+
+def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return what is for ``netspec run``, and the script or module with its own arguments, which nobody else reads."""
+    position = 1
+    while position < len(words) and words[position].startswith("-"):
+        name = "--" + words[position].lstrip("-")
+        position += 1
+        if words[position - 1] == "-m":
+            break
+        position += name in _WITH_VALUE
+    return list(words[:position]), list(words[position:])
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from netspec.scripts.program import Options, run_module, run_script
+
+    if not arguments.program:
+        raise WrongUsage("the following arguments are required: SCRIPT, or -m MODULE")
+    if arguments.minloglevel is not None:
+        os.environ[VARIABLE] = str(arguments.minloglevel)
+    options = Options(arguments.shadow_caffe, arguments.python2, arguments.write_py3)
+    name, *own = arguments.program
+    if arguments.module:
+        run_module(name, own, options)
+    run_script(name, own, options)
+
+
+def _install(arguments: argparse.Namespace) -> None:
+    from netspec.scripts.environment import install_caffe
+
+    for path in install_caffe(arguments.replace):
+        print(path)
+
+
+def _remove(arguments: argparse.Namespace) -> None:
+    from netspec.scripts.environment import remove_caffe
+
+    for path in remove_caffe():
+        print(path)

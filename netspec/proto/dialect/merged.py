@@ -1,0 +1,66 @@
+"""Caffe's schema with the additions of the active dialects as ordinary messages and fields.
+
+:mod:`netspec.proto.dialect.registry` adds the fields of dialects as extensions, so that they can come and go. Programs
+that were written for a fork know them as fields of the fork's own ``caffe_pb2``: ``layer.permute_param.order``. Their
+classes come from here. They have the same bytes and the same text.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from google.protobuf import descriptor_pb2, descriptor_pool
+
+from netspec.errors import SpecError, Where
+from netspec.proto.dialect.registry import Dialect, active_dialects
+from netspec.proto.schema import PACKAGE, pool
+
+_FILE = "caffe.proto"
+
+
+def merged_file() -> Any:
+    """Return the descriptor of caffe.proto as the active dialects have it; without any, the schema's own.
+
+    Raises SpecError where two active dialects have different messages of one name.
+    """
+    return _merged(active_dialects())
+
+
+@cache
+def _merged(dialects: tuple[Dialect, ...]) -> Any:
+    if not dialects:
+        return pool.FindFileByName(_FILE)
+    file = descriptor_pb2.FileDescriptorProto()
+    pool.FindFileByName(_FILE).CopyToProto(file)
+    messages = {declared.name: declared for declared in file.message_type}
+    for declared in messages.values():
+        del declared.extension_range[:]
+    for dialect in dialects:
+        additions = descriptor_pb2.FileDescriptorProto()
+        additions.CopyFrom(dialect.declarations)
+        for declared in additions.message_type:
+            _add_message(file, messages, declared, dialect)
+        file.enum_type.extend(additions.enum_type)
+        for field in additions.extension:
+            extended = messages[field.extendee.rpartition(".")[2]]
+            field.ClearField("extendee")
+            extended.field.append(field)
+    merged = descriptor_pool.DescriptorPool()
+    merged.Add(file)
+    return merged.FindFileByName(_FILE)
+
+
+def _add_message(
+    file: descriptor_pb2.FileDescriptorProto,
+    messages: dict[str, descriptor_pb2.DescriptorProto],
+    declared: descriptor_pb2.DescriptorProto,
+    dialect: Dialect,
+) -> None:
+    known = messages.get(declared.name)
+    if known is None:
+        file.message_type.append(declared)
+        messages[declared.name] = file.message_type[-1]
+    elif known != declared:
+        message = f'another active dialect, or Caffe, has another message "{PACKAGE}.{declared.name}"'
+        raise SpecError(message, Where(dialect.declarations.name))

@@ -1,0 +1,46 @@
+"""All messages and enums of Caffe's schema, and of the active dialects, under the names that protoc gives them.
+
+Nothing is generated and nothing is put into protobuf's default pool, so that another ``caffe_pb2`` in the process does
+not clash with this one. While no dialect is active, the classes are those of :mod:`netspec.proto.schema`.
+Caffe: src/caffe/proto/caffe.proto
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from google.protobuf import message_factory
+from google.protobuf.internal.enum_type_wrapper import EnumTypeWrapper
+
+from netspec.errors import did_you_mean
+from netspec.proto.dialect.merged import merged_file
+
+
+def __getattr__(name: str) -> Any:
+    if name == "DESCRIPTOR":
+        return merged_file()
+    names = _names(merged_file())
+    if name == "__all__":
+        return [public for public in names if not public.startswith("_")]
+    if name in names:
+        return names[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{did_you_mean(name, list(names))}")
+
+
+def __dir__() -> list[str]:
+    return sorted(_names(merged_file()))
+
+
+@cache
+def _names(file: Any) -> dict[str, Any]:
+    """Return what protoc would put into the module of a file, by name."""
+    names: dict[str, Any] = {}
+    for name, message in file.message_types_by_name.items():
+        names[name] = message_factory.GetMessageClass(message)
+        names[f"_{name.upper()}"] = message
+    for name, enum in file.enum_types_by_name.items():
+        names[name] = EnumTypeWrapper(enum)
+        names[f"_{name.upper()}"] = enum
+        names.update({value.name: value.number for value in enum.values})
+    return names

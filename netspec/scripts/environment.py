@@ -1,0 +1,109 @@
+"""Puts a ``caffe`` package and Caffe's commands into the current Python environment, and takes them away again.
+
+The package is a few lines that hand over to netspec.pycaffe, the commands are those of netspec and lmdb_build under
+Caffe's names. Every file that is written begins with a mark; nothing else is ever removed.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+from netspec.errors import SpecError
+from netspec.scripts.finder import MARK, NAME, real_caffe
+
+_PACKAGE = f'''{MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
+"""Caffe's Python interface, which netspec provides."""
+
+import importlib
+import sys
+
+from netspec.scripts import finder
+
+finder.install()
+sys.modules[__name__] = importlib.import_module(finder.HOME)
+'''
+_NETSPEC, _BUILD = "netspec.cli", "lmdb_build.cli"
+_COMMANDS: dict[str, tuple[str, list[str]]] = {
+    "caffe": (_NETSPEC, []),
+    "convert_imageset": (_BUILD, ["imageset"]),
+    "compute_image_mean": (_BUILD, ["mean"]),
+    "extract_features": (_NETSPEC, ["extract_features"]),
+    "upgrade_net_proto_text": (_NETSPEC, ["upgrade_net_proto_text"]),
+    "upgrade_net_proto_binary": (_NETSPEC, ["upgrade_net_proto_binary"]),
+    "upgrade_solver_proto_text": (_NETSPEC, ["upgrade_solver_proto_text"]),
+}
+_ASIDE = ".before-netspec"  # what a file in the way is called meanwhile
+
+
+def install_caffe(replace: bool = False) -> list[Path]:
+    """Write the package and the commands; return what was written. What is in their way is moved aside.
+
+    Raises SpecError where a real Caffe or a command of one of these names is there, unless ``replace``, and OSError
+    where the environment cannot be written to.
+    """
+    paths = {_package(): _PACKAGE} | {_scripts() / name: _command(name) for name in _COMMANDS}
+    in_the_way = [str(path) for path in paths if path.exists() and not _is_ours(path)]
+    real = real_caffe()
+    if real and real not in in_the_way:
+        in_the_way.append(real)
+    if in_the_way and not replace:
+        there = ", ".join(in_the_way)
+        raise SpecError(f"{there}: is there already and not netspec's; --replace puts netspec's in its place")
+    for path, text in paths.items():
+        owner = path.parent if path.name == "__init__.py" else path
+        if owner.exists() and not _is_ours(path):
+            owner.rename(owner.with_name(owner.name + _ASIDE))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, "utf-8")
+        if owner is path:
+            path.chmod(0o755)
+    return list(paths)
+
+
+def remove_caffe() -> list[Path]:
+    """Take away what :func:`install_caffe` wrote, and put back what it moved aside; return what was taken away."""
+    removed = []
+    for path in (_package(), *(_scripts() / name for name in _COMMANDS)):
+        owner = path.parent if path.name == "__init__.py" else path
+        if not _is_ours(path):
+            continue
+        if owner is path:
+            path.unlink()
+        else:
+            shutil.rmtree(owner)
+        removed.append(path)
+        aside = owner.with_name(owner.name + _ASIDE)
+        if aside.exists():
+            aside.rename(owner)
+    return removed
+
+
+def _package() -> Path:
+    return Path(sysconfig.get_path("purelib")) / NAME / "__init__.py"
+
+
+def _scripts() -> Path:
+    return Path(sysconfig.get_path("scripts"))
+
+
+def _command(name: str) -> str:
+    module, words = _COMMANDS[name]
+    return f"""#!{sys.executable}
+{MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
+import sys
+
+from {module} import main
+
+sys.exit(main([*{words}, *sys.argv[1:]]))
+"""
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        first = path.read_text("utf-8", errors="replace").splitlines()[:2]  # a command's first names Python
+    except OSError:
+        return False
+    return any(line.startswith(MARK) for line in first)

@@ -1,0 +1,99 @@
+"""The switch that puts a package ``caffe`` and Caffe's commands into an environment, in one made for the test."""
+
+import subprocess
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+
+COMMANDS = (
+    *("caffe", "convert_imageset", "compute_image_mean", "extract_features"),
+    *("upgrade_net_proto_text", "upgrade_net_proto_binary", "upgrade_solver_proto_text"),
+)
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> Path:
+    """An environment that finds this project, and what it depends on where this Python does."""
+    folder = tmp_path / "venv"
+    venv.create(folder, symlinks=True)
+    (site,) = folder.glob("lib/python*/site-packages")
+    paths = {str(ROOT), sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    (site / "dependencies.pth").write_text("\n".join(paths))
+    return folder
+
+
+def run(environment: Path, *words: str, rc: int = 0) -> subprocess.CompletedProcess[str]:
+    command, *rest = words
+    done = subprocess.run(
+        [str(environment / "bin" / command), *rest], cwd=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == rc, done.stderr
+    return done
+
+
+def files(environment: Path) -> set[Path]:
+    return {path for path in environment.rglob("*") if path.is_file() and "__pycache__" not in path.parts}
+
+
+IMPORT = "import caffe, caffe.io; from caffe.proto import caffe_pb2; print(caffe.__name__, caffe_pb2.TEST)"
+
+
+def test_it_is_put_in_and_taken_away(environment: Path) -> None:
+    before = files(environment)
+    run(environment, "python", "-c", IMPORT, rc=1)
+    said = run(environment, "python", "-m", "netspec", "install-caffe").stdout.splitlines()
+    assert {Path(line) for line in said} == files(environment) - before
+    assert run(environment, "python", "-c", IMPORT).stdout == "netspec.pycaffe 1\n"
+    for name in COMMANDS:
+        assert "usage" in run(environment, name, "--help").stdout
+    run(environment, "python", "-m", "netspec", "install-caffe")  # again: the same
+    (environment / "s.py").write_text(IMPORT)
+    ran = run(environment, "python", "-m", "netspec", "run", "s.py")
+    assert (ran.stdout, "installed" in ran.stderr) == ("netspec.pycaffe 1\n", False)  # it is no other Caffe
+    (environment / "s.py").unlink()
+    run(environment, "python", "-m", "netspec", "remove-caffe")
+    assert files(environment) == before
+    run(environment, "python", "-c", IMPORT, rc=1)
+
+
+def test_caffes_command_trains(environment: Path) -> None:
+    run(environment, "python", "-m", "netspec", "install-caffe")
+    data = 'layer { name: "x" type: "DummyData" top: "x" top: "y" dummy_data_param { shape { dim: 2 dim: 3 } } }'
+    ip = 'layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_product_param { num_output: 3 } }'
+    loss = 'layer { name: "l" type: "EuclideanLoss" bottom: "ip" bottom: "y" top: "l" }'
+    (environment / "net.prototxt").write_text(f"{data}\n{ip}\n{loss}\n")
+    (environment / "solver.prototxt").write_text(
+        'net: "net.prototxt" base_lr: 0.1 lr_policy: "fixed" max_iter: 2 snapshot_prefix: "s" solver_mode: CPU\n'
+    )
+    assert "Optimization Done." in run(environment, "caffe", "train", "-solver=solver.prototxt").stderr
+    assert (environment / "s_iter_2.caffemodel").is_file()
+    run(environment, "upgrade_net_proto_text", "net.prototxt", "new.prototxt")
+
+
+def test_what_is_there_already_is_refused_or_moved_aside(environment: Path) -> None:
+    (site,) = environment.glob("lib/python*/site-packages")
+    (site / "caffe").mkdir()
+    (site / "caffe" / "__init__.py").write_text("real = 1")
+    (environment / "bin" / "caffe").write_text("#!/bin/sh\necho real\n")
+    (environment / "bin" / "caffe").chmod(0o755)
+    before = files(environment)
+    refused = run(environment, "python", "-m", "netspec", "install-caffe", rc=1).stderr
+    assert refused.count("\n") == 1
+    assert f"{site / 'caffe' / '__init__.py'}, {environment / 'bin' / 'caffe'}: is there already" in refused
+    assert files(environment) == before
+    run(environment, "python", "-m", "netspec", "install-caffe", "--replace")
+    assert run(environment, "python", "-c", IMPORT).stdout == "netspec.pycaffe 1\n"
+    run(environment, "python", "-m", "netspec", "remove-caffe")
+    assert files(environment) == before
+    assert run(environment, "python", "-c", "import caffe; print(caffe.real)").stdout == "1\n"
+    assert run(environment, "caffe").stdout == "real\n"
+
+
+def test_a_real_caffe_elsewhere_on_the_path_is_refused(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (environment / "caffe.py").write_text("real = 1")
+    monkeypatch.setenv("PYTHONPATH", str(environment))
+    assert "caffe.py: is there already" in run(environment, "python", "-m", "netspec", "install-caffe", rc=1).stderr

@@ -1,0 +1,88 @@
+"""Each script of examples/ runs as it stands, in 60 lines or fewer, and says what it is to show."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+
+EXAMPLES = sorted(ROOT.glob("examples/*.py"))
+
+
+@pytest.fixture(scope="module", params=EXAMPLES, ids=lambda path: path.stem)
+def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str, Path]:
+    """The name of an example, what it printed, and the folder it worked in."""
+    if request.param.stem == "classification":
+        pytest.importorskip("skimage")
+    folder = tmp_path_factory.mktemp(request.param.stem)
+    done = subprocess.run(
+        [sys.executable, str(request.param), str(folder)],
+        env={**os.environ, "GLOG_minloglevel": "2", "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return request.param.stem, done.stdout, folder
+
+
+def numbers(text: str, pattern: str) -> list[float]:
+    return [float(found) for found in re.findall(pattern, text)]
+
+
+def check_lenet(said: str, folder: Path) -> None:
+    first, *_, last = numbers(said, r"(\d+) of 297 right")
+    assert first < 60
+    assert last > 230
+
+
+def check_siamese(said: str, folder: Path) -> None:
+    first, *_, last = numbers(said, r"loss ([\d.]+)")
+    assert last < first
+    assert (folder / "embedding.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def check_net_surgery(said: str, folder: Path) -> None:
+    assert "(10, 288) -> (10, 8, 6, 6)" in said
+    assert "a map of 9 by 9 places" in said
+
+
+def check_fine_tuning(said: str, folder: Path) -> None:
+    scratch, tuned = numbers(said, r"20 iterations: ([\d.]+)")
+    assert tuned > scratch
+
+
+def check_python_layers(said: str, folder: Path) -> None:
+    (slope,) = numbers(said, r"y = ([\d.]+) x")
+    assert abs(slope - 3) < 0.01
+
+
+def check_hdf5_classification(said: str, folder: Path) -> None:
+    theirs, ours, hidden = numbers(said, r": ([\d.]+)")
+    assert abs(theirs - ours) < 0.05
+    assert hidden > ours + 0.1
+
+
+def check_classification(said: str, folder: Path) -> None:
+    assert said.count("\n") == 6
+    assert sum(f"{kind}.png, center: {kind}" in said for kind in ("disc", "square", "cross")) >= 2
+
+
+def check_filters_and_activations(said: str, folder: Path) -> None:
+    assert {path.name for path in folder.glob("*.png")} == {"filters.png", "activations.png", "saliency.png"}
+    assert "conv1   (64, 16, 6, 6)" in said
+
+
+def test_it_runs(ran: tuple[str, str, Path]) -> None:
+    name, said, folder = ran
+    globals()[f"check_{name}"](said, folder)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_it_is_short(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 60
