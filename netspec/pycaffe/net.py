@@ -87,7 +87,7 @@ class Net:
         self._blob_names = list(passes.names)
         self._blobs = list(passes.blobs)
         self.blobs: Named[Blob] = Named("blob", zip(passes.names, passes.blobs, strict=True))
-        self.layers = [
+        self.layers: list[Any] = [
             layer.code if isinstance(layer, Python) else Layer(layer.type, blobs)
             for layer, blobs in zip(net.layers, passes.params, strict=True)
         ]

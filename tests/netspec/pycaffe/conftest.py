@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,7 +28,7 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]
 def net_of(write: Callable[..., str]) -> Callable[..., caffe.Net]:
     """``net_of(text, phase=caffe.TEST, **options)``: the net of a prototxt's text."""
 
-    def build(text: str, phase: int = caffe.TEST, **options: object) -> caffe.Net:
+    def build(text: str, phase: int = caffe.TEST, **options: Any) -> caffe.Net:
         return caffe.Net(write(text), phase, **options)
 
     return build

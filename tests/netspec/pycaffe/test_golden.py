@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,12 +115,12 @@ def test_caffes_examples(
         outputs.append({name: float(solver.net.blobs[name].data) for name in solver.net.outputs})
     for key in golden.files:
         if key.startswith("out/"):
-            np.testing.assert_array_equal(np.float32([out[key[4:]] for out in outputs]), golden[key], key)
+            np.testing.assert_array_equal(np.asarray([out[key[4:]] for out in outputs], np.float32), golden[key], key)
         if key.startswith("final/"):
             np.testing.assert_array_equal(sampled(solver, key, "data"), golden[key], key)
 
 
-def sampled(solver: caffe.SGDSolver, key: str, what: str) -> np.ndarray:
+def sampled(solver: Any, key: str, what: str) -> np.ndarray:
     """Return ``data`` or ``diff`` of the parameter KIND/LAYER/INDEX, sampled as the examples' files are."""
     _, layer, index = key.split("/")
     values = getattr(solver.net.params[layer][int(index)], what)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -267,7 +268,7 @@ def test_net_surgery(net_of: Callable[..., caffe.Net], write: Callable[..., str]
         "{ num_output: 5 kernel_size: 12 } }",
         "conv.prototxt",
     )
-    conv = caffe.Net("conv.prototxt", caffe.TEST)
+    conv: Any = caffe.Net("conv.prototxt", caffe.TEST)
     conv.params["fc-conv"][0].data.flat = dense.params["fc"][0].data.flat
     conv.params["fc-conv"][1].data[...] = dense.params["fc"][1].data
     data = image(1, 3, 12, 12)
@@ -304,7 +305,7 @@ def test_views_of_parameters_see_weights_that_are_read(net_of: Callable[..., caf
 
 
 def test_a_net_can_have_attributes(net_of: Callable[..., caffe.Net]) -> None:
-    net = net_of(PYRAMID)
+    net: Any = net_of(PYRAMID)
     net.transformer = net.mean = 5
     assert net.mean == 5
 
@@ -326,7 +327,8 @@ def test_forward_backward_all(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(PYRAMID)
     net.blobs["data"].reshape(2, 3, 12, 12)
     net.reshape()
-    data, tops = image(5, 3, 12, 12), {name: np.ones((5, *net.blobs[name].shape[1:])) for name in net.outputs}
+    data = image(5, 3, 12, 12)
+    tops: dict[str, Any] = {name: np.ones((5, *net.blobs[name].shape[1:])) for name in net.outputs}
     outputs, diffs = net.forward_backward_all(blobs=["pool1"], diffs=["conv1"], data=data, **tops)
     assert {name: array.shape for name, array in outputs.items()} == {
         "conv4-2": (5, 4, 5, 5), "prob1": (5, 2, 5, 5), "pool1": (5, 10, 5, 5)
@@ -335,7 +337,8 @@ def test_forward_backward_all(net_of: Callable[..., caffe.Net]) -> None:
     net.blobs["data"].reshape(1, 3, 12, 12)
     for i in range(5):
         net.forward(data=data[i : i + 1])
-        net.backward(**{name: top[:1] for name, top in tops.items()})
+        first: dict[str, Any] = {name: top[:1] for name, top in tops.items()}
+        net.backward(**first)
         np.testing.assert_allclose(diffs["data"][i], net.blobs["data"].diff[0], rtol=1e-4, atol=1e-5)
 
 

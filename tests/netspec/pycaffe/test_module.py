@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
+from netspec.pycaffe import mode
 from paths import ROOT
 from pycaffe_nets import SMALL
 
@@ -41,7 +42,7 @@ def test_timer() -> None:
 
 
 def test_a_seed_makes_nets_alike(net_of: Callable[..., caffe.Net], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(caffe.mode._mode, "seed", None)
+    monkeypatch.setattr(mode._mode, "seed", None)
     nets = []
     for _ in range(2):
         caffe.set_random_seed(5)
@@ -59,7 +60,7 @@ def test_a_seed_makes_nets_alike(net_of: Callable[..., caffe.Net], monkeypatch: 
 
 
 def test_no_gpu_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(caffe.mode._mode, "warned", False)
+    monkeypatch.setattr(mode._mode, "warned", False)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     caffe.set_mode_gpu()
     caffe.set_device(0)
@@ -67,7 +68,7 @@ def test_no_gpu_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.Log
     assert [record.getMessage() for record in caplog.records] == [
         "set_mode_gpu: torch finds no GPU here: nets run on the CPU"
     ]
-    assert caffe.mode.device().type == "cpu"
+    assert mode.device().type == "cpu"
     caffe.set_mode_cpu()
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -239,7 +240,7 @@ def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net], 
     nets = [python_net(text, caffe.TRAIN) for text in (own, caffes)]
     nets[1].share_with(nets[0])
     random = np.random.default_rng(0)
-    arrays = {"data": random.random((6, 5)), "wanted": random.random((6, 3))}
+    arrays: dict[str, Any] = {"data": random.random((6, 5)), "wanted": random.random((6, 3))}
     losses = [net.forward(**arrays)["loss"].reshape(()) for net in nets]
     assert losses[0] == pytest.approx(losses[1], rel=1e-6)
     for net in nets:
