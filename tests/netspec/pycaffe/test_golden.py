@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ import pytest
 import netspec.pycaffe as caffe
 from golden_cases import EVERY, SAMPLED, LayerCase, assert_same_layers, lay_out_examples, promised, set_parameters
 from netspec.pycaffe import mode
+from netspec.pycaffe.solver import Solver
 from paths import GOLDEN
 from pycaffe_cases import compute
 
@@ -115,12 +115,13 @@ def test_caffes_examples(
         outputs.append({name: float(solver.net.blobs[name].data) for name in solver.net.outputs})
     for key in golden.files:
         if key.startswith("out/"):
-            np.testing.assert_array_equal(np.asarray([out[key[4:]] for out in outputs], np.float32), golden[key], key)
+            found = np.array([out[key[4:]] for out in outputs], np.float32)
+            np.testing.assert_array_equal(found, golden[key], key)
         if key.startswith("final/"):
             np.testing.assert_array_equal(sampled(solver, key, "data"), golden[key], key)
 
 
-def sampled(solver: Any, key: str, what: str) -> np.ndarray:
+def sampled(solver: Solver, key: str, what: str) -> np.ndarray:
     """Return ``data`` or ``diff`` of the parameter KIND/LAYER/INDEX, sampled as the examples' files are."""
     _, layer, index = key.split("/")
     values = getattr(solver.net.params[layer][int(index)], what)

@@ -203,7 +203,7 @@ def test_param_str(python_net: Callable[..., caffe.Net]) -> None:
     assert (net.blobs["data"].diff == 140).all()
 
 
-def test_the_script_reaches_the_layers_own_object(python_net: Callable[..., caffe.Net]) -> None:
+def test_the_script_reaches_the_layers_own_object(python_net: Callable[..., Any]) -> None:
     text = 'layer { type: "Python" name: "rows" top: "row" top: "label" python_param { module: "mine" layer: "Rows" } }'
     net = python_net(text)
     assert net.blobs["label"].data == [7]  # written in setup
