@@ -56,7 +56,7 @@ def blobprotovector_str_to_arraylist(str: bytes) -> list[Array]:
     return [blobproto_to_array(blob) for blob in caffe_pb2.BlobProtoVector.FromString(str).blobs]
 
 
-def array_to_datum(arr: Array, label: int | None = None) -> Any:
+def array_to_datum(arr: Array, label: int | np.integer | None = None) -> Any:
     """Return an array (C, H, W) as a Datum: uint8 as bytes, other numbers as floats.
 
     Raises ValueError where it does not have three axes.

@@ -3,6 +3,7 @@
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from google.protobuf import text_format
@@ -32,7 +33,7 @@ def net():
     return text_format.Parse(NET, caffe_pb2.NetParameter())
 
 
-def names(graph: pydot.Dot) -> set[str]:
+def names(graph: Any) -> set[str]:
     return {node.get_name().strip('"') for node in graph.get_nodes()}
 
 

@@ -67,7 +67,7 @@ def test_vgg() -> None:
         for c in itertools.product((False, True), repeat=5)
     ],
 )
-def test_every_vgg_is_a_net(choice: dict[str, bool]) -> None:
+def test_every_vgg_is_a_net(choice: dict[str, Any]) -> None:
     if choice["nopool"] and (choice["dilate_pool4"] or not choice["fully_conv"]):
         pytest.skip("SSD does not make it")
     layers = [layer.name for layer in VGGNetBody(image(64), "data", **choice).to_proto().layer]
