@@ -1,6 +1,5 @@
 """cv2.dnn's interface for Caffe's files, which OpenCV 5 no longer reads; all else of cv2.dnn is passed through.
 
-    import cv2
     from netspec import dnn  # in place of cv2.dnn
 
     net = dnn.readNetFromCaffe("deploy.prototxt", "x.caffemodel")
@@ -15,6 +14,7 @@ from __future__ import annotations
 from typing import Any
 
 import cv2
+from cv2 import dnn as _opencv  # held here, so that a program may say ``cv2.dnn = dnn``
 
 from netspec.dnn.errors import DnnError
 from netspec.dnn.models import ClassificationModel, DetectionModel, Model, SegmentationModel
@@ -58,11 +58,11 @@ DNN_TARGET_CPU_FP16 = 10
 
 def __getattr__(name: str) -> Any:
     try:
-        return getattr(cv2.dnn, name)
+        return getattr(_opencv, name)
     except AttributeError:
         message = f"module 'netspec.dnn' has no attribute {name!r}, nor has cv2.dnn of OpenCV {cv2.__version__}"
         raise AttributeError(message) from None
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *dir(cv2.dnn)})
+    return sorted({*globals(), *dir(_opencv)})

@@ -9,8 +9,8 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
+from cv2 import dnn as opencv
 
 from netspec.dnn.errors import BAD_ARGUMENT, DnnError
 from netspec.dnn.read import readNet
@@ -87,7 +87,7 @@ class Model:
 
     def predict(self, frame: Array, outs: Any = None) -> tuple[Array, ...]:
         """Return the outputs for an image (H, W, C) or (H, W)."""
-        blob = cv2.dnn.blobFromImage(frame, 1.0, self._size, self._mean, self._swap, self._crop)
+        blob = opencv.blobFromImage(frame, 1.0, self._size, self._mean, self._swap, self._crop)
         blob *= self._scale[: blob.shape[1], None, None].astype(np.float32)
         self._net.setInput(blob)
         if self._net.getLayer(0).outputNameToIndex("im_info") != -1:  # Faster R-CNN

@@ -291,6 +291,16 @@ class Net:
         assert self._files is not None
         return nodes_of(self._net.plan, self._files.net)
 
+    @cached_property
+    def _makers(self) -> dict[int, int]:
+        """The node that makes each value."""
+        return {v: i for i, node in enumerate(self._net.plan.nodes) for v in node.tops}
+
+    @cached_property
+    def _lasting(self) -> frozenset[int]:
+        """The values that no later one of the same name replaces."""
+        return frozenset({name: v for v, name in enumerate(self._net.plan.blobs)}.values())
+
     def _tops(self, net: CaffeNet, entry: Entry) -> int:
         return len(self._declared) if entry.name == INPUT else len(self._node(net, entry).tops)
 
@@ -333,10 +343,8 @@ class Net:
         """Return the values of these numbers: of the whole net, or layer by layer up to the last that is needed."""
         if not wanted:
             return {}
-        end = max(i for i, node in enumerate(net.plan.nodes) if set(node.tops) & set(wanted))
-        names = net.plan.blobs
-        lasting = {name: v for v, name in enumerate(names)}
-        if end == len(net.plan.nodes) - 1 and all(lasting[names[v]] == v for v in wanted):
+        end, names, lasting = max(self._makers[v] for v in wanted), net.plan.blobs, self._lasting
+        if end == len(net.plan.nodes) - 1 and all(v in lasting for v in wanted):
             net.keep = [names[v] for v in wanted]
             net(**self._values)
             return {v: net.blobs[names[v]] for v in wanted}

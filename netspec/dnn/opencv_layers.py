@@ -13,16 +13,29 @@ from netspec.proto.schema import value
 
 
 class PriorBox(ssd.PriorBox):
-    """SSD's, but sizes that are no whole pixels stay as they are.
+    """SSD's, but sizes that are no whole pixels stay as they are, and boxes are clipped unless ``clip`` is false.
 
+    With bottom[1] the image is always its size, whatever img_size, img_h and img_w say.
     OpenCV: modules/dnn/src/layers/prior_box_layer.cpp
     """
 
     type = "PriorBox"
 
+    def setup(self) -> None:
+        """Take the image's size from bottom[1]."""
+        super().setup()
+        self.image = None if len(self.bottom_shapes) > 1 else self.image
+
     def pixels(self, size: float) -> float:
         """Return the size itself."""
         return size
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Lay the boxes, and clip them where nothing is said."""
+        shapes = super().reshape(bottom_shapes)
+        if not value(self.param, "prior_box_param").HasField("clip"):
+            self.boxes[0, 0] = self.boxes[0, 0].clip(0, 1)
+        return shapes
 
 
 class DetectionOutput(ssd.DetectionOutput):

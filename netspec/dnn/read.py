@@ -6,7 +6,7 @@ import os
 from pathlib import PurePath
 from typing import Any
 
-import cv2
+from cv2 import dnn as opencv
 
 from netspec.dnn.caffe_files import FileOrBytes, read_files
 from netspec.dnn.errors import as_dnn_error
@@ -35,10 +35,10 @@ def readNet(model: Any, config: Any = "", framework: Any = "", **others: Any) ->
     if not isinstance(config, str | os.PathLike):  # readNet(framework, bufferModel, bufferConfig)
         if str(model).lower() == "caffe":
             return readNetFromCaffe(framework, config)
-        return cv2.dnn.readNet(model, config, framework, **others)
+        return opencv.readNet(model, config, framework, **others)
     names = [PurePath(name).name.lower() for name in (model, config)]
     if str(framework).lower() != "caffe" and not any(name.endswith(_CAFFE) for name in names):
-        return cv2.dnn.readNet(os.fspath(model), os.fspath(config), framework, **others)
+        return opencv.readNet(os.fspath(model), os.fspath(config), framework, **others)
     swapped = names[0].endswith(_CAFFE[0]) or names[1].endswith(_CAFFE[1:])
     prototxt, weights = (model, config) if swapped else (config, model)
     return readNetFromCaffe(prototxt, os.fspath(weights))

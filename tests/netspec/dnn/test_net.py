@@ -111,14 +111,6 @@ def test_an_input_is_kept_apart_from_the_callers_array():
     assert (net.forward() == 1).all()
 
 
-def test_a_scaled_input_stays_as_it_was_set():
-    net = read("classify")
-    net.setInput(DATA * 4, scalefactor=0.25)
-    first = net.forward("conv2")
-    assert not np.array_equal(first, net.forward("fc"))
-    np.testing.assert_array_equal(net.forward("conv2"), first)
-
-
 @pytest.mark.parametrize("declared", ['input: "x"', 'layer { name: "x" type: "Input" top: "x" }'])
 def test_an_input_without_a_shape_gets_the_arrays(declared):
     net = dnn.readNetFromCaffe(f'{declared} layer {{ name: "y" type: "Power" bottom: "x" top: "y" }}'.encode())
@@ -167,13 +159,6 @@ def test_parameters_are_read_and_written():
         net.setParam("conv2", 1, [1, 2, 3])
 
 
-def test_without_weights_a_net_does_not_run():
-    net = dnn.readNetFromCaffe(HERE / "classify.prototxt")
-    net.setInput(DATA)
-    with pytest.raises(dnn.DnnError, match="this net was read without weights"):
-        net.forward()
-
-
 def test_inputs_are_renamed():
     net = read("two_inputs")
     net.setInputsNames(["left", "right"])
@@ -181,16 +166,6 @@ def test_inputs_are_renamed():
         net.setInput(np.ones((1, 4, 6, 6)), name)
     assert net.forward().shape == (1, 4, 6, 6)
     assert net.getLayer(0).outputNameToIndex("right") == 1
-
-
-def test_the_profile_has_a_time_for_each_layer():
-    net = read("segment")
-    net.setInput(np.ones((1, 3, 16, 16)))
-    net.forward()
-    total, ticks = net.getPerfProfile()
-    assert ticks.shape == (len(net.getLayerNames()),)
-    assert (ticks > 0).all()
-    assert total == int(ticks.sum())
 
 
 def test_shapes_of_one_layer():
@@ -220,18 +195,6 @@ def test_all_else_is_cv2_dnns():
     assert {"NMSBoxes", "readNetFromCaffe"} <= set(dir(dnn))
     with pytest.raises(AttributeError, match=r"has no attribute 'readNetFromNowhere', nor has cv2.dnn of OpenCV"):
         dnn.readNetFromNowhere  # noqa: B018
-
-
-def test_an_axpy_is_two_layers_for_opencv():
-    net = made(
-        'layer { name: "pool" type: "Pooling" bottom: "data" top: "a" pooling_param { global_pooling: true pool: AVE }}'
-        'layer { name: "sum" type: "Axpy" bottom: "a" bottom: "data" bottom: "data" top: "sum" }'
-        'layer { name: "end" type: "ReLU" bottom: "sum" top: "end" }'
-    )
-    assert net.getLayerNames() == ("pool", "sum/scale", "sum", "end")
-    assert list(net.getUnconnectedOutLayers()) == [4]
-    net.setInput(np.full((1, 3, 8, 8), 2.0))
-    assert (net.forward() == 6).all()
 
 
 def test_a_path_object_and_a_text_path_are_the_same():
