@@ -55,10 +55,11 @@ import traceback
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
-from netspec.proto.dialect.files import DialectFile, find_file, read_dialect
-from netspec.proto.dialect.registry import activate, deactivate
+from netspec.proto.dialect.files import DialectFile, announce_known, find_file, read_dialect
+from netspec.proto.dialect.registry import activate, active, deactivate, known
+from netspec.proto.lexer import NAME, STRING, Lexer
 
-__all__ = ["use_dialect"]
+__all__ = ["use_dialect", "use_dialects_of"]
 
 
 def use_dialect(name: str | Path) -> None:
@@ -83,6 +84,41 @@ def use_dialect(name: str | Path) -> None:
     except SpecError:
         deactivate(dialect.name)
         raise
+
+
+def use_dialects_of(text: str, file: str) -> list[str]:
+    """Switch on the dialects whose fields or layer types a prototxt has; return their names.
+
+    The dialect that has most of them comes first; what it has is not looked for in others. ``file`` is what errors call
+    the text. Raises SpecError for text that is no prototxt at all.
+    """
+    words = _words(text, file)
+    announce_known()
+    own = {d.name: {field for _, field in d.fields()} | set(d.layer_types) for d in known()}
+    for name in active():
+        words -= own.pop(name, set())
+    used = []
+    while own:
+        name = max(own, key=lambda name: len(words & own[name]))
+        if not words & own[name]:
+            break
+        use_dialect(name)
+        used.append(name)
+        words -= own.pop(name)
+    return used
+
+
+def _words(text: str, file: str) -> set[str]:
+    """Return the field names and the layer types in a prototxt."""
+    lexer = Lexer(text, file)
+    words, before = set(), ["", ""]
+    for token in lexer:
+        if token.kind == NAME:
+            words.add(token.text)
+        elif token.kind == STRING and before == ["type", ":"]:
+            words.add(lexer.unquote(token).decode(errors="replace"))
+        before = [before[1], token.text]
+    return words
 
 
 def _run(file: DialectFile, name: str) -> None:

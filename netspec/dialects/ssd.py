@@ -382,12 +382,16 @@ class PriorBox(Layer):
             if all(abs(ratio - known) >= 1e-6 for known in ratios):
                 ratios += [ratio, 1 / ratio] if param.flip else [ratio]
         sizes = []
-        for i, small in enumerate(int(size) for size in param.min_size):
+        for i, small in enumerate(map(self.pixels, param.min_size)):
             sizes.append((small, small))
             if param.max_size:
-                sizes.append((math.sqrt(small * int(param.max_size[i])),) * 2)
+                sizes.append((math.sqrt(small * self.pixels(param.max_size[i])),) * 2)
             sizes += [(small * math.sqrt(ratio), small / math.sqrt(ratio)) for ratio in ratios[1:]]
         return np.array(sizes, np.float32)
+
+    def pixels(self, size: float) -> float:
+        """Return the size that a box gets for a given ``min_size`` or ``max_size``."""
+        return int(size)
 
     def _pair(self, param: Any, both: str, height: str, width: str) -> tuple[float, float] | None:
         """Return (vertical, horizontal) of a setting given as one number or as two; None where it is not given."""

@@ -21,11 +21,16 @@ def read_binary(path: str | Path, message_class: type[M]) -> M:
     Raises SpecError for a file that cannot be read, is empty, or has other contents. Protobuf's binary format has no
     signature: data that decodes without any known field counts as other contents.
     """
-    where = Where(str(path))
     try:
         data = Path(path).read_bytes()
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror or fault}", where) from None
+        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+    return parse_binary(data, str(path), message_class)
+
+
+def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
+    """Return the message that ``data`` holds; ``file`` is what errors call it. Raises as :func:`read_binary`."""
+    where = Where(file)
     name = message_class.DESCRIPTOR.name
     if not data:
         raise SpecError(f"the file is empty, expected a binary {name}", where)

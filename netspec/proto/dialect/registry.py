@@ -126,6 +126,11 @@ def deactivate(name: str) -> None:
         del added_fields[full_name][field]
 
 
+def known() -> list[Dialect]:
+    """Return the dialects that were announced, by name."""
+    return [_known[name] for name in sorted(_known)]
+
+
 def active() -> list[str]:
     """Return the names of the active dialects."""
     return sorted(_active)

@@ -12,7 +12,7 @@ import pytest
 import netspec
 import netspec.dialects
 from netspec.cli import main
-from netspec.dialects import use_dialect
+from netspec.dialects import use_dialect, use_dialects_of
 from netspec.errors import SpecError
 from netspec.layers import layer_class, layer_types
 from netspec.proto.dialect import files as dialect_files
@@ -261,3 +261,27 @@ def test_a_packages_entry_point_is_hinted_at_and_used(tmp_path: Path, capsys: py
     cls = layer_class("Thrice")
     assert cls is not None
     assert cls.__module__ == "forky.doubling"
+
+
+# ---- Found by themselves ----
+
+
+def test_a_prototxt_switches_on_what_it_needs(files_afresh: None) -> None:
+    text = 'layer { name: "n" type: "Normalize" bottom: "x" top: "n" norm_param { across_spatial: false } }'
+    assert use_dialects_of(text, "x.prototxt") == ["ssd"]
+    assert layer_class("Normalize") is not None
+    assert use_dialects_of(text, "x.prototxt") == []
+
+
+def test_a_prototxt_of_caffes_own_layers_switches_on_nothing(files_afresh: None) -> None:
+    text = 'layer { name: "Normalize" type: "ReLU" bottom: "Permute" top: "Swish" }'  # names, not types
+    assert use_dialects_of(text, "x.prototxt") == []
+
+
+def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None:
+    text = 'layer { type: "Permute" permute_param { order: 0 } } layer { type: "Axpy" } layer { type: "Normalize" }'
+    assert use_dialects_of(text, "x.prototxt") == ["ssd", "blocks"]
+
+
+def test_what_no_dialect_has_is_left_to_the_reader(files_afresh: None) -> None:
+    assert use_dialects_of('layer { type: "NoSuchType" no_such_param { } }', "x.prototxt") == []
