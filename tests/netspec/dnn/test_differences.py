@@ -1,5 +1,7 @@
 """What docs/coming-from-opencv.md says of the differences from OpenCV 4."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ def made(layers: str) -> dnn.Net:
     return dnn.readNetFromCaffe((INPUT + layers).encode())
 
 
-def test_one_line_replaces_the_module(monkeypatch):
+def test_one_line_replaces_the_module(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "dnn", dnn)
     net = cv2.dnn.readNetFromCaffe(str(HERE / "classify.prototxt"), str(HERE / "classify.caffemodel"))
     net.setInput(cv2.dnn.blobFromImage(np.zeros((20, 20, 3), np.uint8), 1.0, (20, 20)))
@@ -31,12 +33,12 @@ def test_one_line_replaces_the_module(monkeypatch):
         cv2.dnn.readNet("net.unknown")
 
 
-def test_bytes_are_content():
+def test_bytes_are_content() -> None:
     with pytest.raises(dnn.DnnError, match="<prototxt>"):
         dnn.readNetFromCaffe(str(HERE / "classify.prototxt").encode())
 
 
-def test_layers_for_training_are_left_out():
+def test_layers_for_training_are_left_out() -> None:
     net = made(
         'layer { name: "a" type: "Power" bottom: "data" top: "a" include { phase: TRAIN } }'
         'layer { name: "b" type: "Power" bottom: "data" top: "b" include { phase: TEST } }'
@@ -44,18 +46,18 @@ def test_layers_for_training_are_left_out():
     assert net.getLayerNames() == ("b",)
 
 
-def test_layers_that_opencv_lacks_run():
+def test_layers_that_opencv_lacks_run() -> None:
     net = made('layer { name: "r" type: "Reduction" bottom: "data" top: "r" reduction_param { axis: 2 } }')
     net.setInput(DATA)
     np.testing.assert_allclose(net.forward(), DATA.sum((2, 3)), rtol=1e-6)
 
 
-def test_an_unknown_field_is_refused():
+def test_an_unknown_field_is_refused() -> None:
     with pytest.raises(dnn.DnnError, match=r'^<prototxt>:2:\d+: .*"no_such_param"'):
         made('layer { name: "a" type: "Power" bottom: "data" top: "a" no_such_param { x: 1 } }')
 
 
-def test_an_axpy_multiplies_the_second_bottom():
+def test_an_axpy_multiplies_the_second_bottom() -> None:
     net = made(
         'layer { name: "pool" type: "Pooling" bottom: "data" top: "a" pooling_param { global_pooling: true pool: AVE }}'
         'layer { name: "minus" type: "Power" bottom: "data" top: "y" power_param { scale: -1 } }'
@@ -69,7 +71,7 @@ def test_an_axpy_multiplies_the_second_bottom():
     np.testing.assert_allclose(net.forward("sum"), DATA.mean((2, 3), keepdims=True) * DATA - DATA, rtol=0, atol=1e-6)
 
 
-def test_an_input_is_scaled_once():
+def test_an_input_is_scaled_once() -> None:
     net = read("classify")
     net.setInput(np.ones((1, 3, 20, 20)) * 4, scalefactor=0.25)
     first = net.forward("conv2")
@@ -77,7 +79,7 @@ def test_an_input_is_scaled_once():
     np.testing.assert_array_equal(net.forward("conv2"), first)
 
 
-def test_detections_without_keep_top_k():
+def test_detections_without_keep_top_k() -> None:
     text = (HERE / "detect.prototxt").read_text()
     net = dnn.readNetFromCaffe(text.replace("keep_top_k: 40", "").encode(), HERE / "detect.caffemodel")
     whole = read("detect")
@@ -89,7 +91,7 @@ def test_detections_without_keep_top_k():
     assert not expected[len(found) :].any()
 
 
-def test_detections_are_opencvs_not_the_forks():
+def test_detections_are_opencvs_not_the_forks() -> None:
     values = np.random.RandomState(3).rand(1, 3, 32, 32).astype(np.float32) * 2 - 1
     net = read("detect")
     net.setInput(values)
@@ -105,20 +107,20 @@ def test_detections_are_opencvs_not_the_forks():
     assert [prior.min() < 0 for prior in priors] == [False, True]
 
 
-def test_a_parameter_of_another_size_is_refused():
+def test_a_parameter_of_another_size_is_refused() -> None:
     net = read("classify")
     with pytest.raises(dnn.DnnError, match=r"found an array of shape \(3,\), expected \(12,\)"):
         net.setParam("conv2", 1, [1, 2, 3])
 
 
-def test_a_net_without_weights_says_so():
+def test_a_net_without_weights_says_so() -> None:
     net = dnn.readNetFromCaffe(str(HERE / "classify.prototxt"))
     net.setInput(np.zeros((1, 3, 20, 20)))
     with pytest.raises(dnn.DnnError, match=r"this net was read without weights; give the \.caffemodel"):
         net.forward()
 
 
-def test_weights_in_hdf5(tmp_path):
+def test_weights_in_hdf5(tmp_path: Path) -> None:
     plain = netspec.load_net(HERE / "classify.prototxt", weights=HERE / "classify.caffemodel")
     netspec.save_weights(plain, tmp_path / "x.caffemodel.h5")
     net = dnn.readNet(str(tmp_path / "x.caffemodel.h5"), str(HERE / "classify.prototxt"))
@@ -127,7 +129,7 @@ def test_weights_in_hdf5(tmp_path):
     np.testing.assert_allclose(net.forward(), plain(data=values)["prob"].detach().numpy(), rtol=0, atol=1e-5)
 
 
-def test_the_profile_is_of_a_run_of_its_own():
+def test_the_profile_is_of_a_run_of_its_own() -> None:
     net = read("segment")
     net.setInput(np.ones((1, 3, 16, 16)))
     total, ticks = net.getPerfProfile()
@@ -136,7 +138,7 @@ def test_the_profile_is_of_a_run_of_its_own():
     assert total == int(ticks.sum())
 
 
-def test_backends_and_targets_change_nothing():
+def test_backends_and_targets_change_nothing() -> None:
     net = read("classify")
     net.setInput(np.ones((1, 3, 20, 20)))
     expected = net.forward()
@@ -145,6 +147,12 @@ def test_backends_and_targets_change_nothing():
     np.testing.assert_array_equal(net.forward(), expected)
 
 
-def test_opencvs_other_models_do_not_take_these_nets():
+def test_opencvs_other_models_do_not_take_these_nets() -> None:
     with pytest.raises(cv2.error):
         dnn.KeypointsModel(read("segment"))
+
+
+@pytest.mark.parametrize("name", ["addLayer", "connect", "dump", "forwardAsync", "registerOutput"])
+def test_methods_that_change_or_print_a_net_are_not_there(name: str) -> None:
+    assert hasattr(cv2.dnn.Net, name)
+    assert not hasattr(dnn.Net, name)

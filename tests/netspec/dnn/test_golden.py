@@ -12,16 +12,16 @@ OPENCV = dict(np.load(dnn_program.HERE / "opencv.npz"))
 
 
 @pytest.fixture(scope="module")
-def ours():
+def ours() -> dict[str, np.ndarray]:
     return dnn_program.record(dnn)
 
 
-def test_as_much_is_found_out(ours):
+def test_as_much_is_found_out(ours: dict[str, np.ndarray]) -> None:
     assert sorted(ours) == sorted(OPENCV)
 
 
 @pytest.mark.parametrize("key", sorted(OPENCV))
-def test_equals_opencv(ours, key):
+def test_equals_opencv(ours: dict[str, np.ndarray], key: str) -> None:
     found, expected = ours[key], OPENCV[key]
     assert found.shape == expected.shape
     if expected.dtype.kind == "f":

@@ -1,6 +1,8 @@
 """Net of netspec.dnn where it goes beyond OpenCV's, or answers wrong use."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +24,7 @@ def made(layers: str) -> dnn.Net:
     return dnn.readNetFromCaffe((INPUT + layers).encode())
 
 
-def test_a_fault_is_a_cv2_error_and_a_spec_error():
+def test_a_fault_is_a_cv2_error_and_a_spec_error() -> None:
     with pytest.raises(cv2.error) as caught:
         made('layer { name: "x" type: "Powr" bottom: "data" top: "x" }')
     fault = caught.value
@@ -32,19 +34,19 @@ def test_a_fault_is_a_cv2_error_and_a_spec_error():
     assert (fault.file, fault.line, fault.func) == ("<prototxt>", 2, "readNetFromCaffe")
 
 
-def test_a_wrong_input_name_lists_the_names():
+def test_a_wrong_input_name_lists_the_names() -> None:
     with pytest.raises(dnn.DnnError, match=r'two_inputs.prototxt: no input "data" in this net; its inputs: a, b$'):
         read("two_inputs").setInput(DATA, "data")
 
 
-def test_a_missing_input_is_named():
+def test_a_missing_input_is_named() -> None:
     net = read("two_inputs")
     net.setInput(np.zeros((1, 4, 6, 6)), "a")
     with pytest.raises(dnn.DnnError, match=r'no value for input "b"; this net\'s inputs: a, b$'):
         net.forward()
 
 
-def test_a_wrong_shape_says_both_shapes():
+def test_a_wrong_shape_says_both_shapes() -> None:
     net = read("classify")
     net.setInput(DATA[:, :2])
     with pytest.raises(dnn.DnnError, match=r"bottom of shape \(1, 2, 20, 20\) .* made for 3 channels") as caught:
@@ -53,7 +55,7 @@ def test_a_wrong_shape_says_both_shapes():
     assert str(caught.value).endswith(ending)
 
 
-def test_a_net_goes_on_after_a_fault():
+def test_a_net_goes_on_after_a_fault() -> None:
     net = read("classify")
     net.setInput(DATA)
     expected = net.forward()
@@ -64,7 +66,7 @@ def test_a_net_goes_on_after_a_fault():
     np.testing.assert_array_equal(net.forward(), expected)
 
 
-def test_a_wrong_layer_name_lists_the_names():
+def test_a_wrong_layer_name_lists_the_names() -> None:
     with pytest.raises(
         dnn.DnnError, match=r'no layer "scoers" in this net; did you mean "scores"\? it has: conv, bend'
     ):
@@ -72,7 +74,7 @@ def test_a_wrong_layer_name_lists_the_names():
 
 
 @pytest.mark.parametrize("as_content", [bytes, bytearray, lambda data: np.frombuffer(data, np.uint8), memoryview])
-def test_files_are_given_as_content(as_content):
+def test_files_are_given_as_content(as_content: Callable[[bytes], Any]) -> None:
     given = [as_content((HERE / f"classify.{ending}").read_bytes()) for ending in ("prototxt", "caffemodel")]
     nets = [dnn.readNetFromCaffe(*given), read("classify"), dnn.readNet("caffe", given[1], given[0])]
     outputs = []
@@ -83,17 +85,17 @@ def test_files_are_given_as_content(as_content):
     np.testing.assert_array_equal(outputs[2], outputs[1])
 
 
-def test_weights_that_are_none_are_refused():
+def test_weights_that_are_none_are_refused() -> None:
     with pytest.raises(dnn.DnnError, match="<caffeModel>: expected a binary NetParameter, found text"):
         dnn.readNetFromCaffe(HERE / "classify.prototxt", b"these are words, not weights")
 
 
-def test_other_files_go_to_opencv():
+def test_other_files_go_to_opencv() -> None:
     with pytest.raises(cv2.error, match="Cannot determine an origin framework"):
         dnn.readNet("net.unknown")
 
 
-def test_inputs_of_any_kind_of_number():
+def test_inputs_of_any_kind_of_number() -> None:
     net = read("classify")
     images = (DATA * 255).astype(np.uint8)
     net.setInput(images.astype(np.float32))
@@ -103,7 +105,7 @@ def test_inputs_of_any_kind_of_number():
         np.testing.assert_array_equal(net.forward(), expected)
 
 
-def test_an_input_is_kept_apart_from_the_callers_array():
+def test_an_input_is_kept_apart_from_the_callers_array() -> None:
     net, values = made('layer { name: "x" type: "Split" bottom: "data" top: "x" }'), np.ones((1, 3, 8, 8), np.float32)
     net.setInput(values)
     values[:] = 7
@@ -112,13 +114,13 @@ def test_an_input_is_kept_apart_from_the_callers_array():
 
 
 @pytest.mark.parametrize("declared", ['input: "x"', 'layer { name: "x" type: "Input" top: "x" }'])
-def test_an_input_without_a_shape_gets_the_arrays(declared):
+def test_an_input_without_a_shape_gets_the_arrays(declared: str) -> None:
     net = dnn.readNetFromCaffe(f'{declared} layer {{ name: "y" type: "Power" bottom: "x" top: "y" }}'.encode())
     net.setInput(DATA)
     np.testing.assert_array_equal(net.forward(), DATA)
 
 
-def test_tops_of_layers_that_are_overwritten_in_place():
+def test_tops_of_layers_that_are_overwritten_in_place() -> None:
     net = made(
         'layer { name: "minus" type: "Power" bottom: "data" top: "x" power_param { scale: -1 } }'
         'layer { name: "cut" type: "ReLU" bottom: "x" top: "x" }'
@@ -129,7 +131,7 @@ def test_tops_of_layers_that_are_overwritten_in_place():
     assert (cut == 0).all()
 
 
-def test_all_tops_of_a_layer():
+def test_all_tops_of_a_layer() -> None:
     net = made('layer { name: "parts" type: "Slice" bottom: "data" top: "p" top: "q" slice_param { slice_point: 1 } }')
     net.setInput(DATA[:, :, :8, :8])
     (parts,) = net.forwardAndRetrieve(["parts"])
@@ -137,7 +139,7 @@ def test_all_tops_of_a_layer():
     np.testing.assert_array_equal(net.forward("parts"), parts[0])
 
 
-def test_the_other_forms_of_forward():
+def test_the_other_forms_of_forward() -> None:
     net = read("segment")
     net.setInput(np.ones((1, 3, 16, 16)))
     expected = net.forward("conv")
@@ -147,7 +149,7 @@ def test_the_other_forms_of_forward():
     np.testing.assert_array_equal(net.forward("_input"), np.ones((1, 3, 16, 16)))
 
 
-def test_parameters_are_read_and_written():
+def test_parameters_are_read_and_written() -> None:
     net = read("classify")
     net.setInput(DATA)
     before = net.forward("conv2")
@@ -159,7 +161,7 @@ def test_parameters_are_read_and_written():
         net.setParam("conv2", 1, [1, 2, 3])
 
 
-def test_inputs_are_renamed():
+def test_inputs_are_renamed() -> None:
     net = read("two_inputs")
     net.setInputsNames(["left", "right"])
     for name in ("left", "right"):
@@ -168,12 +170,12 @@ def test_inputs_are_renamed():
     assert net.getLayer(0).outputNameToIndex("right") == 1
 
 
-def test_shapes_of_one_layer():
+def test_shapes_of_one_layer() -> None:
     bottoms, tops = read("segment").getLayerShapes([1, 3, 20, 28], "conv")
     assert [tuple(shape) for shape in (*bottoms, *tops)] == [(1, 3, 20, 28), (1, 6, 10, 14)]
 
 
-def test_costs_leave_the_net_as_it_is():
+def test_costs_leave_the_net_as_it_is() -> None:
     net = read("detect")
     net.setInput(np.ones((1, 3, 32, 32)))
     before = net.forward()
@@ -181,7 +183,7 @@ def test_costs_leave_the_net_as_it_is():
     np.testing.assert_array_equal(net.forward(), before)
 
 
-def test_backends_and_targets_are_accepted():
+def test_backends_and_targets_are_accepted() -> None:
     net = read("classify")
     net.setPreferableBackend(dnn.DNN_BACKEND_HALIDE)
     net.setPreferableTarget(dnn.DNN_TARGET_CUDA_FP16)
@@ -189,7 +191,7 @@ def test_backends_and_targets_are_accepted():
     assert dnn.Net().empty()
 
 
-def test_all_else_is_cv2_dnns():
+def test_all_else_is_cv2_dnns() -> None:
     assert dnn.blobFromImage is cv2.dnn.blobFromImage
     assert dnn.NMSBoxes is cv2.dnn.NMSBoxes
     assert {"NMSBoxes", "readNetFromCaffe"} <= set(dir(dnn))
@@ -197,6 +199,6 @@ def test_all_else_is_cv2_dnns():
         dnn.readNetFromNowhere  # noqa: B018
 
 
-def test_a_path_object_and_a_text_path_are_the_same():
+def test_a_path_object_and_a_text_path_are_the_same() -> None:
     assert dnn.readNetFromCaffe(str(HERE / "classify.prototxt")).getLayerNames() == read("classify").getLayerNames()
     assert isinstance(HERE, Path)
