@@ -1,1 +1,1 @@
-"""The bridge: image sequences become labelled pairs, and pairs become databases for Data layers."""
+"""From image sequences to labeled pairs, and from pairs to databases for Data layers."""

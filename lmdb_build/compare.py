@@ -36,7 +36,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Entry:
-    """What the table needs to know of one solver's net.
+    """What the table needs to know about one solver's net.
 
     bottoms  of its ContrastiveLoss: two descriptors and the label
     loss     that layer's top
@@ -60,7 +60,7 @@ class Entry:
 
 
 def read_entry(path: str) -> Entry:
-    """Read what is needed of a solver and its net. Raises SpecError where it is no Siamese net."""
+    """Read a solver and its net. Raises SpecError if it is not a Siamese net."""
     solver = read_solver(path)
     if not solver.net:
         raise SpecError("no net: expected one net for both phases", Where(path))
@@ -81,7 +81,7 @@ def read_entry(path: str) -> Entry:
         }
     if len(sources["train"]) != len(sources["validation"]):
         found = " and ".join(f"{len(layers)} in {kind}" for kind, layers in sources.items())
-        raise SpecError(f"found data layers: {found}; expected as many in both phases", Where(solver.net))
+        raise SpecError(f"found data layers: {found}; expected the same number in both phases", Where(solver.net))
     return Entry(
         solver=path,
         net=solver.net,
@@ -95,15 +95,15 @@ def read_entry(path: str) -> Entry:
 
 
 def compare(solvers: Sequence[str], out: Path, train: bool, gpu: str, say: Say) -> tuple[str, list[Path]]:
-    """Train the nets of the solvers, judge each one's best snapshot; return the table and the files of the report.
+    """Train the nets of the solvers and evaluate the best snapshot of each; return the table and the report's files.
 
-    Without ``train`` the snapshots of earlier trainings are judged. ``gpu`` is netspec's ``--gpu``. ``say`` is told how
-    far it is. Raises SpecError or InputError for a fault of the files.
+    Without ``train`` the snapshots of earlier trainings are evaluated. ``gpu`` is netspec's ``--gpu``. ``say`` gets
+    progress messages. Raises SpecError or InputError for an error in the files.
     """
     entries = [read_entry(path) for path in solvers]
     for i, entry in enumerate(entries):
         if entry.stem in [other.stem for other in entries[:i]]:
-            raise SpecError(f'found a second net named "{entry.name}"; give each a name of its own', Where(entry.net))
+            raise SpecError(f'found a second net named "{entry.name}"; give each net its own name', Where(entry.net))
     out.mkdir(parents=True, exist_ok=True)
     runs = []
     for entry in entries:
@@ -148,22 +148,22 @@ def _judged(entry: Entry, out: Path, gpu: str, say: Say) -> dict[str, Any]:
 
 
 def best_snapshot(saved: Sequence[int], losses: dict[int, float]) -> int:
-    """Return the saved iteration of the smallest loss; of equal ones the first. A loss that is NaN is the largest."""
+    """Return the saved iteration of the smallest loss, the first of equal ones. NaN counts as the largest loss."""
     return min(saved, key=lambda k: (math.inf if math.isnan(losses[k]) else losses[k], k))
 
 
 def _snapshots(entry: Entry, out: Path) -> tuple[dict[int, Path], dict[int, float]]:
     """Return the snapshots by iteration, and the validation losses that are known.
 
-    They are those of the training whose scores are in the output folder, and of no other one that wrote to the same
-    prefix; without such a training, all that are there.
+    Only snapshots of the training whose scores are in the output folder are returned, none of other trainings with the
+    same prefix; without such scores, all existing snapshots.
     """
     file = out / f"{entry.stem}.scores.json"
     if file.is_file():
         scores = read_scores(file)
         saved = {s.iteration: Path(s.path) for s in scores.snapshots if Path(s.path).is_file()}
         if not saved:
-            raise SpecError(f"its training left no snapshot that is still there (see {file})", Where(entry.solver))
+            raise SpecError(f"none of the snapshots of its training was found (see {file})", Where(entry.solver))
         tested = [(score.iteration, score) for score in scores.tests if score.net == 0]
         return saved, {k: _loss(entry, score, file) for k, score in tested if k is not None}
     prefix = Path(entry.prefix)
@@ -186,11 +186,11 @@ def _on(gpu: str) -> list[str]:
 
 
 def _netspec(words: list[str], log: Path, say: Say) -> None:
-    """Run a command of netspec; keep its log in a file, and show what tells progress.
+    """Run a command of netspec; keep its log in a file, and show its progress.
 
-    Raises SpecError, which says what the command said last, where it fails.
+    Raises SpecError with the command's last line if it fails.
     """
-    beside = str(Path(__file__).parents[1])  # netspec is found where this package is
+    beside = str(Path(__file__).parents[1])  # netspec is in the same folder as this package
     path = os.pathsep.join(filter(None, (beside, os.environ.get("PYTHONPATH"))))
     command = [sys.executable, "-m", "netspec", *words]
     environment = {**os.environ, "PYTHONPATH": path}
@@ -209,7 +209,7 @@ def _netspec(words: list[str], log: Path, say: Say) -> None:
 
 
 def _relay(stream: IO[str], file: IO[str], say: Say) -> str:
-    """Copy the lines of a log to a file and show those that tell progress; return the last one."""
+    """Copy the lines of a log to a file and show those about progress; return the last one."""
     line = ""
     for line in stream:
         file.write(line)

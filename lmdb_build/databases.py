@@ -1,8 +1,8 @@
 """Lists of images, single or in pairs, to databases of Datums.
 
-A pair becomes one Datum, both images stacked along the channels: six for colour (blue, green, red of the first, then
-of the second), two for grey. An encoded Datum can hold but one image, so encoded pairs become two databases in the same
-order.
+A pair becomes one Datum, both images stacked along the channels: six for color (blue, green, red of the first, then
+of the second), two for gray. An encoded Datum can hold only one image, so encoded pairs become two databases in the
+same order.
 
 Caffe: tools/convert_imageset.cpp, examples/siamese/convert_mnist_siamese_data.cpp
 """
@@ -36,12 +36,12 @@ from netspec.errors import SpecError, Where
 
 S = TypeVar("S")
 T = TypeVar("T")
-_AHEAD = 8  # entries in hand for each worker
+_AHEAD = 8  # pending entries per worker
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One record to be: the image or the two images it is made of, its label, its line in the list."""
+    """A record to write: its image or its two images, its label, its line in the list."""
 
     images: tuple[str, ...]
     label: int
@@ -62,31 +62,31 @@ class Options:
 
 
 def read_pairs(path: str) -> list[Entry]:
-    """Return the entries of a list of pairs; see lmdb_build/pairs/list_file.py. Raises SpecError for a faulty line."""
+    """Return the entries of a list of pairs; see lmdb_build/pairs/list_file.py. Raises SpecError for a bad line."""
     try:
         pairs = read_pair_list(Path(path))
-    except InputError as fault:  # all else here raises SpecError
+    except InputError as fault:  # everything else here raises SpecError
         raise SpecError(fault.message, Where(fault.file, fault.line, fault.column)) from None
     return [Entry((pair.first, pair.second), pair.label, Where(path, pair.line, 1)) for pair in pairs]
 
 
 def read_single_list(path: str) -> list[Entry]:
-    """Read lines of ``name label``, split at the last blank. Raises SpecError for a faulty line."""
+    """Read lines of ``name label``, split at the last space. Raises SpecError for a bad line."""
     return [Entry((image.name,), image.label, image.where) for image in read_image_list(path)]
 
 
 def shuffled(entries: Sequence[Entry], seed: int) -> list[Entry]:
-    """Return the entries in a random order that follows from the seed alone."""
+    """Return the entries in a random order that depends only on the seed."""
     return [entries[i] for i in permutation(seed, "convert/shuffle", len(entries))]
 
 
 def pair_key(number: int, entry: Entry) -> str:
-    """Return the key of a pair, as convert_mnist_siamese_data writes it."""
+    """Return the key of a pair, as in convert_mnist_siamese_data."""
     return f"{number:08d}"
 
 
 def image_key(number: int, entry: Entry) -> str:
-    """Return the key of a single image, as convert_imageset writes it."""
+    """Return the key of a single image, as in convert_imageset."""
     return f"{number:08d}_{entry.images[0]}"
 
 
@@ -101,12 +101,12 @@ def write_databases(
     workers: int | None = None,
     progress: Progress = silent,
 ) -> None:
-    """Write entries, in order, into new databases, which appear once they are whole.
+    """Write entries, in order, into new databases, which appear when they are complete.
 
     ``paths`` names one database, or, with encoded images, one for each image of an entry. ``root`` is put in front of
-    image names, with a slash between. Images are read by ``workers`` processes (None: one a core). Raises SpecError,
-    with the line in the list, for an image that is missing, unreadable, or does not go with its partner (with
-    ``check_size``: with all others).
+    image names, with a slash between. Images are read by ``workers`` processes (None: one per core). Raises SpecError,
+    with the line in the list, for an image that is missing, unreadable, or differs in size from its partner (with
+    ``check_size``: from the first).
     """
     assert len(paths) == (1 if options.encoding is None else len(entries[0].images))
     work = partial(_records, root=root if root.endswith("/") or not root else root + "/", options=options)
@@ -118,20 +118,20 @@ def write_databases(
             entry = entries[number]
             first = first or shape
             if check_size and shape != first:
-                message = f"gives {times(shape)}, the first line {times(first)} (-check_size)"
+                message = f"gives {times(shape)}, but the first line gives {times(first)} (-check_size)"
                 raise SpecError(f'"{entry.images[0]}" {message}', entry.where)
             for writer, record in zip(writers, records, strict=True):
                 writer.put(key(number, entry).encode(), record)
             if (number + 1) % 1000 == 0:
                 log.info("convert_imageset.cpp:147", f"Processed {number + 1} files.")
-        for writer in writers:  # all before the first one appears
+        for writer in writers:  # all of them before the first one appears
             writer.commit()
     if len(entries) % 1000:
         log.info("convert_imageset.cpp:153", f"Processed {len(entries)} files.")
 
 
 def _records(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tuple[int, ...]]:
-    """Return an entry's serialised Datums, and the shape of what they hold."""
+    """Return an entry's serialized Datums, and the shape of their values."""
     paths = [root + name for name in entry.images]
     try:
         if options.encoding is not None:
@@ -142,21 +142,21 @@ def _records(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tu
         raise SpecError(str(fault), entry.where) from None
     shapes = [image.shape for image in images]
     if shapes[0] != shapes[-1]:
-        message = f'"{paths[0]}" is {times(shapes[0])}, its partner "{paths[1]}" {times(shapes[1])}'
-        raise SpecError(f"{message}; give -resize_width and -resize_height", entry.where)
+        message = f'"{paths[0]}" is {times(shapes[0])}, but its partner "{paths[1]}" is {times(shapes[1])}'
+        raise SpecError(f"{message}; set -resize_width and -resize_height", entry.where)
     stacked = np.concatenate(images)
     return [array_to_datum(stacked, entry.label).SerializeToString()], stacked.shape
 
 
 def _encode(path: str, label: int, options: Options) -> tuple[bytes, tuple[int, ...]]:
-    """Return one encoded Datum: the file as it is where it already holds what is asked for, as Caffe does.
+    """Return one encoded Datum: the file as it is if it already has the requested format, as in Caffe.
 
-    (Caffe stores a colour file as it is also under -gray, and so keeps its colours.)
+    (Caffe stores a color file as it is even with -gray, and so keeps its colors.)
     """
     suffix = Path(path).suffix[1:].lower().replace("jpeg", "jpg")
     encoding = (options.encoding or suffix).lower().replace("jpeg", "jpg")
     if not encoding:
-        raise ValueError(f'image "{path}" has no ending that tells its format; give -encode_type')
+        raise ValueError(f'image "{path}" has no extension that gives its format; set -encode_type')
     image = read_image(path, options.color, options.size)
     if encoding == suffix and not options.size:
         file = Path(path).read_bytes()
@@ -178,7 +178,7 @@ class _Workers:
 
     def __enter__(self) -> _Workers:
         if self._count > 1:
-            # Forked where the system can: a script read from standard input could not be imported by a fresh process.
+            # Forked if possible: a new process could not import a script that is read from standard input.
             method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
             context = multiprocessing.get_context(method)
             self._pool = ProcessPoolExecutor(self._count, context, initializer=_start_worker)
@@ -190,7 +190,7 @@ class _Workers:
             self._pool.shutdown(cancel_futures=True)
 
     def ordered(self, work: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
-        """Yield the results in the order of the items; only a few are in hand at a time, so that memory stays flat."""
+        """Yield the results in the order of the items; only a few are pending at a time, so that memory is bounded."""
         if self._pool is None:
             yield from map(work, items)
             return

@@ -1,4 +1,4 @@
-"""A picture as a camera nearby sees it, and a picture as a file."""
+"""Pictures in perspective, and pictures as files."""
 
 from __future__ import annotations
 

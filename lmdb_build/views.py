@@ -1,9 +1,9 @@
 """Two views of each place, in batches of different places: for nets that learn to tell a batch's places apart.
 
-Contrastive pairs show a net one negative for each positive. Where the loss compares every first image of a batch with
-every second one (Sohn, Improved Deep Metric Learning with Multi-class N-pair Loss, NIPS 2016), a batch of N pairs holds
-N (N - 1) negatives, and it matters which places stand in it together: those of one run look alike, so a batch takes
-several places of few runs.
+Contrastive pairs show a net one negative for each positive. If the loss compares every first image of a batch with
+every second one (Sohn, Improved Deep Metric Learning with Multi-class N-pair Loss, NIPS 2016), a batch of N pairs has
+N (N - 1) negatives, and the choice of its places matters: places of one run look alike, so a batch takes several
+places of few runs.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
 from loopclosure.progress import Progress, silent
 
-# What changes between two views, drawn anew for each.
+# What changes between two views, drawn for each view.
 ZOOM = 2.0  # the part that is seen has 1 to 1/2 of the image's height
-SHIFT = 0.2  # a pair's views are cut about one point, each shifted by up to this share of what it leaves out
-STRETCH = 0.15  # standing out by up to e^0.15 from the views' own proportions
+SHIFT = 0.2  # a pair's views have a common center; each is shifted by up to this share of its margin
+STRETCH = 0.15  # the proportions of the part change by a factor of up to e^0.15
 TURN_DEG = 4.0  # standard deviation
 CORNER = 0.08  # each corner is moved by up to this share of the part's size: perspective
 GAMMA = 0.3  # standard deviation of its logarithm
-CONTRAST, BRIGHTNESS, TINT, NOISE = 0.2, 20.0, 0.08, 4.0  # standard deviations; of grey levels, but for the logarithms
+CONTRAST, BRIGHTNESS, TINT, NOISE = 0.2, 20.0, 0.08, 4.0  # standard deviations; of gray levels, except for logarithms
 BLURRED, BLUR = 0.3, (0.4, 1.5)  # how many views, and by how many pixels
 
 
@@ -55,18 +55,18 @@ class Batches:
     negatives: float = 0.0
 
     def check(self) -> None:
-        """Raise InputError for numbers that make no batch."""
+        """Raise InputError for numbers that cannot make a batch."""
         for name in ("count", "size", "per_track"):
             if getattr(self, name) < 1:
-                raise InputError(f"--{name.replace('_', '-')} is at least 1, not {getattr(self, name)}")
+                raise InputError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
         for name in ("other", "negatives"):
             if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"--{name} is 0 to 1, not {getattr(self, name):g}")
+                raise InputError(f"--{name} must be 0 to 1, not {getattr(self, name):g}")
         if round(self.size * self.negatives) == 1:
             raise InputError(f"--negatives {self.negatives:g} of --size {self.size} is one pair; expected none or two")
         if self.apart < self.max_gap:
             raise InputError(
-                f"--apart {self.apart:g} is less than --max-gap {self.max_gap:g}: one place would be two of a batch"
+                f"--apart {self.apart:g} is less than --max-gap {self.max_gap:g}: a batch could have one place twice"
             )
 
 
@@ -101,7 +101,7 @@ def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tupl
 
 
 def _different_places(stamps: NDArray[np.float64], images: Indices, batches: Batches) -> list[int]:
-    """Return the first ``per_track`` of the images that are far enough from those before."""
+    """Return the first ``per_track`` images that are far enough from the earlier ones."""
     taken: list[int] = []
     for image in images.tolist():
         if np.all(np.abs(stamps[taken] - stamps[image]) > batches.apart):
@@ -123,10 +123,10 @@ def _partner(runs: Runs, image: int, batches: Batches, rng: np.random.Generator)
 def cut_view(
     image: NDArray, size: tuple[int, int], about: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Return what a camera nearby might see of the image (H, W, 3) uint8 in other light, as (height, width, 3).
+    """Return a view of the image (H, W, 3) uint8 as a nearby camera might see it in other light: (height, width, 3).
 
-    ``about`` (2,) is where the part that is seen lies: 0 at the left (the top), 1 at the right (the bottom). Views
-    about one point overlap, whatever their zoom.
+    ``about`` (2,) is the position of the visible part: 0 at the left (the top), 1 at the right (the bottom). Views
+    about one point overlap at any zoom.
     """
     width, height = size
     part_h = image.shape[0] * np.exp(rng.uniform(-np.log(ZOOM), 0))
@@ -156,11 +156,11 @@ def write_views(
 ) -> Path:
     """Write two views of ``size`` (width, height) for each pair below ``folder``, and the list ``folder``.txt.
 
-    Both views of a pair are mirrored, or neither. Raises InputError where batches cannot be made, or an image not be
+    Both views of a pair are mirrored, or neither is. Raises InputError if batches cannot be made, or an image cannot be
     read or written.
     """
     if seed < 0:
-        raise InputError(f"a seed is 0 or more, not {seed}")
+        raise InputError(f"a seed must be 0 or more, not {seed}")
     first, second, same = choose_views(runs, batches, np.random.default_rng([seed, 0]))
     folder.mkdir(parents=True, exist_ok=True)
     listed = []
@@ -178,7 +178,7 @@ def write_views(
         "source": f"{len(runs.names)} images of {len(np.unique(runs.tracks))} runs",
         "batches": f"{batches.count} of {batches.size} places, up to {batches.per_track} of one run, "
         f"more than {batches.apart:g} apart",
-        "second image": f"in {batches.other:g} of the pairs another one, up to {batches.max_gap:g} away",
+        "second image": f"a different one in {batches.other:g} of the pairs, up to {batches.max_gap:g} away",
         "negatives": f"{batches.negatives:g} of the pairs",
         "seed": str(seed),
     }

@@ -66,7 +66,7 @@ def unload_ipython_extension(ipython: object) -> None:
     finder.uninstall()
 
 
-FOLDERS.append((f"{__path__[0]}/dialects", "netspec.dialects"))  # told here: an error names them, whatever is imported
+FOLDERS.append((f"{__path__[0]}/dialects", "netspec.dialects"))  # here, so that errors can name them
 __path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the names they had before
 
 

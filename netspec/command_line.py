@@ -1,8 +1,9 @@
-"""How the commands of netspec and of lmdb_build read their words, log, and end.
+"""How the commands of netspec and of lmdb_build read their arguments, log, and exit.
 
-Words are read as gflags reads them: one dash or two, ``-flag value`` or ``-flag=value``; a Boolean flag is ``-flag``,
-``-noflag``, ``-flag=true`` or ``-flag=false``, and never takes the next word. The log goes to stderr in glog's form;
-glog's own flags ``-minloglevel``, ``-logtostderr`` and ``-alsologtostderr`` are known. Every fault is one line.
+Arguments are read as gflags reads them: one dash or two, ``-flag value`` or ``-flag=value``. A Boolean flag is
+``-flag``, ``-noflag``, ``-flag=true`` or ``-flag=false``; it never takes the next argument. The log goes to stderr in
+glog's format; glog's own flags ``-minloglevel``, ``-logtostderr`` and ``-alsologtostderr`` are known. Every error is
+one line.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 
 
 class WrongUsage(Exception):
-    """Arguments that do not go together."""
+    """Arguments that contradict each other."""
 
 
 class Commands:
-    """The commands of a parser, each with what all of them have."""
+    """The commands of a parser, each with the options that all of them share."""
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
         self._parsers = parser.add_subparsers(
@@ -42,7 +43,7 @@ class Commands:
     ) -> argparse.ArgumentParser:
         """Return the parser of a new command that runs ``function``, to add its own arguments to.
 
-        An argument with ``action="store_true"`` is a Boolean flag in all of gflags' spellings. A command that shows no
+        An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. A command that shows no
         log itself sets the default ``log_form`` to None.
         """
         added = self._parsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
@@ -56,12 +57,12 @@ class Commands:
 def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[type[Exception], ...] = ()) -> int:
     """Parse a command line, run the command, and return its exit status.
 
-    A SpecError, one of ``faults`` and an OSError become one line on stderr and status 1, wrong usage status 2, Ctrl-C
-    status 130.
+    A SpecError, an OSError or one of ``faults`` becomes one line on stderr and status 1. Wrong usage gives status 2,
+    Ctrl-C status 130.
     """
     try:
         arguments = parser.parse_args(words)
-    except SystemExit as end:  # argparse has said what is wrong, or printed its help
+    except SystemExit as end:  # argparse has printed the error, or its help
         return int(end.code or DONE)
     try:
         with _logging(_level(arguments), arguments.log_form) if arguments.log_form else nullcontext():
@@ -73,7 +74,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
         print(f"{parser.prog} {arguments.command}: error: {fault}", file=sys.stderr)
         return WRONG_USAGE
     except BrokenPipeError:
-        sys.stderr.close()  # or Python complains once more, at its end
+        sys.stderr.close()  # otherwise Python complains again at exit
         return FAULT
     except OSError as fault:
         print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
@@ -84,7 +85,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
 
 
 class _GflagsParser(argparse.ArgumentParser):
-    """A parser to which gflags' spellings are translated."""
+    """A parser that also accepts the spellings of gflags."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -126,19 +127,19 @@ class _Switch(argparse.Action):
 
 
 def _level(arguments: argparse.Namespace) -> int:
-    """Return the level of the log: the command's own, or a higher one that glog's flag or variable asks for."""
-    wished = arguments.minloglevel
-    if wished is None:
+    """Return the level of the log: the command's own, or a higher one set by glog's flag or variable."""
+    minimum = arguments.minloglevel
+    if minimum is None:
         variable = os.environ.get(VARIABLE, "")
-        wished = int(variable) if variable.isdigit() else 0
-    return max(arguments.log_level, SEVERITIES[min(wished, len(SEVERITIES) - 1)])
+        minimum = int(variable) if variable.isdigit() else 0
+    return max(arguments.log_level, SEVERITIES[min(minimum, len(SEVERITIES) - 1)])
 
 
 @contextmanager
 def _logging(level: int, form: logging.Formatter) -> Iterator[None]:
-    """Show Caffe's log on stderr, around the progress bar where there is one.
+    """Show Caffe's log on stderr, above the progress bar if there is one.
 
-    A warning is shown once, though a solver's nets may each have it.
+    A warning is shown once, even if several nets of a solver give it.
     """
     handler = logging.StreamHandler(_BarAware())
     handler.setFormatter(form)
@@ -156,7 +157,7 @@ def _logging(level: int, form: logging.Formatter) -> Iterator[None]:
 
 
 class _WarnOnce(logging.Filter):
-    """Lets each warning pass the first time only."""
+    """Lets each warning through only the first time."""
 
     def __init__(self) -> None:
         super().__init__()

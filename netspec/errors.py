@@ -1,4 +1,4 @@
-"""One kind of error for every fault of a user's file, printed the way compilers print theirs."""
+"""The one kind of error for all errors in a user's files, printed in the format of compilers."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Where:
 
 
 class SpecError(ValueError):
-    """A fault of a user's file: what was found, what was expected, what to do, and where.
+    """An error in a user's file: what was found, what was expected, what to do, and where.
 
-    ``str(error)`` is one line that begins ``file:line:column: `` (``file: `` where there is no line).
+    ``str(error)`` is one line that begins with ``file:line:column: `` (``file: `` if there is no line).
     """
 
     def __init__(self, message: str, where: Where | None = None) -> None:

@@ -1,8 +1,8 @@
-"""Caffe's log: glog's line form, so that the tools people have for Caffe's logs read ours.
+"""Caffe's log in glog's line format, so that tools for Caffe's logs can read ours.
 
-A line is ``I1121 00:36:27.939015 12135 solver.cpp:239] message``: severity and date, time, process, the place in
-Caffe's source that prints this sentence. The place is part of the format (log parsers match on it), so each call
-names it.
+A line is ``I1121 00:36:27.939015 12135 solver.cpp:239] message``: severity and date, time, process, and the place in
+Caffe's source that prints this message. The place is part of the format (log parsers match on it), so each call
+gives it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ logger = logging.getLogger("netspec")
 
 
 def info(site: str, message: str) -> None:
-    """Log one sentence of Caffe's, ``site`` being the file and line in Caffe that prints it."""
+    """Log one message of Caffe; ``site`` is the file and line in Caffe that prints it."""
     logger.info(message, extra={"site": site})
 
 
@@ -29,13 +29,13 @@ def warning(site: str, message: str) -> None:
 
 
 def error(site: str, message: str) -> None:
-    """Log at the level at which some of Caffe's tools tell their progress; see :func:`info`."""
+    """Log at level ERROR, at which some of Caffe's tools report progress; see :func:`info`."""
     logger.error(message, extra={"site": site})
 
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """Log nothing for a while."""
+    """Log nothing within the block."""
     before, logger.disabled = logger.disabled, True
     try:
         yield
@@ -44,7 +44,7 @@ def silent() -> Iterator[None]:
 
 
 class GlogFormatter(logging.Formatter):
-    """Format records as the glog of Caffe's time did: exactly four blank-separated fields before the message."""
+    """Format records like the glog of Caffe's time: exactly four space-separated fields before the message."""
 
     @override
     def format(self, record: logging.LogRecord) -> str:

@@ -1,10 +1,10 @@
-"""What a training's tests found and which snapshots it took, in a file for programs (JSON).
+"""The test scores and the snapshots of a training, as a file for programs (JSON).
 
     {"tests": [{"iteration": 0, "net": 0, "outputs": {"loss": [0.14]}}],
      "snapshots": [{"iteration": 100, "path": "x_iter_100.caffemodel"}]}
 
-The log tells the same to people. Values that are infinite or no number are written as Python's json module writes
-them: Infinity, NaN.
+The log has the same information for people. Infinite values and NaN are written as Python's json module writes them:
+Infinity, NaN.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from netspec.whole_file import whole_file
 class Score:
     """One run of test net ``net``: the mean of each element of each output blob.
 
-    ``iteration`` is that of the training; None for weights tested outside of one.
+    ``iteration`` is that of the training; None for weights tested without a training.
     """
 
     iteration: int | None
@@ -39,26 +39,26 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Scores:
-    """The tests and the snapshots of a training, in the order in which they came."""
+    """The tests and the snapshots of a training, in order."""
 
     tests: list[Score] = field(default_factory=list)
     snapshots: list[Snapshot] = field(default_factory=list)
 
     def before(self, iteration: int) -> Scores:
-        """Return what stays true for a training that goes on from the snapshot at ``iteration``."""
+        """Return what stays valid for a training that is resumed from the snapshot at ``iteration``."""
         return Scores(
             [test for test in self.tests if (test.iteration or 0) < iteration],
             [snapshot for snapshot in self.snapshots if snapshot.iteration <= iteration],
         )
 
     def write(self, path: str | Path) -> None:
-        """Write the file, whole or not at all. Raises SpecError where it cannot be written."""
+        """Write the file atomically. Raises SpecError if it cannot be written."""
         with whole_file(path) as unfinished:
             unfinished.write_text(json.dumps(asdict(self), indent=1) + "\n")
 
 
 def read_scores(path: str | Path) -> Scores:
-    """Read a file that ``Scores.write`` wrote. Raises SpecError for another one."""
+    """Read a file that ``Scores.write`` wrote. Raises SpecError for any other file."""
     where = Where(str(path))
     try:
         entries = json.loads(Path(path).read_text())
@@ -67,4 +67,4 @@ def read_scores(path: str | Path) -> Scores:
     except OSError as fault:
         raise SpecError(f"cannot be read: {fault.strerror}", where) from None
     except (ValueError, KeyError, TypeError) as fault:
-        raise SpecError(f"this is no file of scores (netspec train --scores): {fault}", where) from None
+        raise SpecError(f"this is not a scores file (of netspec train --scores): {fault}", where) from None

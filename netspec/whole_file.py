@@ -1,6 +1,6 @@
-"""Files that appear whole or not at all: a run that dies while it writes leaves what was there before.
+"""Files that are written atomically: if a run dies while it writes, the old file is still there.
 
-And whether one could be written at all, asked beforehand.
+Also a check, before a long run, whether a file can be written.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from netspec.errors import SpecError, Where
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """Yield a name beside ``path`` to write to; the file gets its own name once the block is done and all is on disk.
+    """Yield a temporary name beside ``path`` to write to; it is renamed once the block is done and all is on disk.
 
-    Raises SpecError where it cannot be written. If the block fails, nothing is left behind.
+    Raises SpecError if it cannot be written. If the block fails, the temporary file is removed.
     """
     path = Path(path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
@@ -35,9 +35,9 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 
 def why_unwritable(path: str | Path) -> str:
-    """Return why no file can be written at ``path``, in the words of the operating system; "" where one can.
+    """Return why no file can be written at ``path``, in the words of the operating system; "" if one can.
 
-    The file system is asked, nothing is written: a full disk, say, shows only when one tries.
+    Nothing is written; only the path and its permissions are checked: a full disk, for example, is not detected.
     """
     path = Path(path)
     folder = path.parent

@@ -11,5 +11,5 @@ def _one_thread() -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _pretended_gpu() -> None:
-    import pretend_gpu  # noqa: F401  autograd counts the devices at its first backward pass
+def _fake_gpu() -> None:
+    import fake_gpu  # noqa: F401  autograd counts the devices at its first backward pass

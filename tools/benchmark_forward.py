@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Time a net's forward pass, and compare it with OpenCV's importer: ``tools/benchmark_forward.py MODEL --opencv``.
 
-The two run in turns, so that what else the machine does meets both alike; the ratio is that of neighbouring runs.
+The two run in turns, so that other load on the machine affects both equally; ratios are of consecutive runs.
 OpenCV reads Caffe's files up to version 4 (opencv-python-headless<5).
 """
 
@@ -28,12 +28,12 @@ Run = Callable[[], dict[str, np.ndarray]]
 
 
 def main() -> int:
-    """Print milliseconds a pass and, with ``--opencv``, the ratio of times and the difference of outputs."""
+    """Print milliseconds per pass and, with ``--opencv``, the ratio of times and the difference of outputs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", help="the prototxt of a net that starts from inputs")
-    parser.add_argument("--weights", help="its weights; without, random ones, BatchNorm's statistics too")
+    parser.add_argument("model", help="the prototxt of a net with inputs")
+    parser.add_argument("--weights", help="its weights (default: random weights and BatchNorm statistics)")
     parser.add_argument("--runs", type=int, default=20, help="passes to time (default: 20)")
-    parser.add_argument("--threads", type=int, default=1, help="threads a pass may use (default: 1)")
+    parser.add_argument("--threads", type=int, default=1, help="threads per pass (default: 1)")
     parser.add_argument("--opencv", action="store_true", help="compare with OpenCV's importer (version 4)")
     parser.add_argument("--blob", nargs="+", help="the blobs to compare (default: the outputs)")
     arguments = parser.parse_args()
@@ -63,7 +63,7 @@ def main() -> int:
     outputs = [run() for run in runs.values()]  # the first pass, which also allocates
     seconds = [[measure(run) for run in runs.values()] for _ in range(arguments.runs)]
     for k, name in enumerate(runs):
-        print(f"{name}: {1e3 * statistics.median(row[k] for row in seconds):.2f} ms a pass")
+        print(f"{name}: {1e3 * statistics.median(row[k] for row in seconds):.2f} ms per pass")
     if importer is not None and arguments.opencv:
         print(f"ratio of times: {statistics.median(row[0] / row[1] for row in seconds):.2f}")
         for name, value in outputs[0].items():
@@ -74,7 +74,7 @@ def main() -> int:
 
 
 def randomize(net: netspec.Net) -> None:
-    """Give BatchNorm statistics as after some training, and normal weights where no filler gave any."""
+    """Set BatchNorm statistics as after some training, and normally distributed weights where there is no filler."""
     for layer in net.layers:
         if layer.type == "BatchNorm":
             means, variances, weight = (blob.data for blob in layer.blobs)

@@ -1,4 +1,4 @@
-"""What each door of this folder does: it runs a command of the packages beside it."""
+"""Used by each script in this folder: runs a command of the packages in this project."""
 
 import os
 import sys
@@ -6,14 +6,14 @@ from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-VENV = ROOT / ".venv"  # tools/setup.sh makes it
+VENV = ROOT / ".venv"  # made by tools/setup.sh
 
 
 def run(module: str, *words: str) -> int:
     """Call a module's ``main`` with ``words`` and those of the command line; return its exit status.
 
-    Where this Python lacks a package that is needed, the Python of ``.venv`` starts anew; without one, a line on stderr
-    says what to run.
+    If this Python lacks a required package, the script restarts with the Python of ``.venv``; without one, a line on
+    stderr says what to run.
     """
     sys.path[0] = str(ROOT)  # in place of this folder
     try:
@@ -22,6 +22,6 @@ def run(module: str, *words: str) -> int:
         python = VENV / "bin" / "python"
         if python.is_file() and Path(sys.prefix).resolve() != VENV.resolve():
             os.execv(python, [str(python), *sys.argv])
-        needed = f"to install what is needed: bash {ROOT / 'tools' / 'setup.sh'}"
+        needed = f"to install the required packages: bash {ROOT / 'tools' / 'setup.sh'}"
         print(f"{sys.argv[0]}: {fault.msg} for {sys.executable}; {needed}", file=sys.stderr)
         return 1

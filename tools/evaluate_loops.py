@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Judge loop closure on a data set: ``tools/evaluate_loops.py``, with the options of ``loopclosure evaluate``."""
+"""Evaluate loop closure on a data set: ``tools/evaluate_loops.py``, with the options of ``loopclosure evaluate``."""
 
 import sys
 

@@ -1,4 +1,4 @@
-# Sourced by the doors that a new user opens first: makes .venv beside this project and installs into it, once.
+# Sourced by tools/quickstart and tools/run_tests: makes .venv in this project and installs into it, once.
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="${VENV:-$ROOT/.venv}"
 if [ ! -x "$VENV/bin/netspec" ] || [ "$ROOT/pyproject.toml" -nt "$VENV/installed" ]; then

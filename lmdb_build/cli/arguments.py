@@ -1,4 +1,4 @@
-"""What words of several commands mean."""
+"""Arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ def size(text: str) -> tuple[int, int]:
 
 
 def next_command(*words: str | Path) -> str:
-    """Return the command of this program that comes next, as one would type it."""
+    """Return the next command of this program, as a user would type it."""
     return shlex.join(["lmdb-build", *map(str, words)])

@@ -17,14 +17,14 @@ def add_to(commands: Commands) -> None:
         "--train",
         action="store_true",
         default=True,
-        help="the default; --no-train judges the snapshots of an earlier training",
+        help="the default; --no-train evaluates the snapshots of an earlier training",
     )
     p.add_argument("--out", type=Path, default=Path("out/compare"), help="folder for all files (default: out/compare)")
-    p.add_argument("--gpu", default="", help="the GPU to run on")
+    p.add_argument("--gpu", default="", help="the number of the GPU to use (default: the CPU)")
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    from lmdb_build.compare import compare  # which loads what draws pictures
+    from lmdb_build.compare import compare  # which loads the plotting library
 
     table, files = compare(arguments.solvers, arguments.out, arguments.train, arguments.gpu, _say)
     print(table)

@@ -42,26 +42,26 @@ def add_to(commands: Commands) -> None:
     _add_flags(p)
 
     p = commands.add("mean", _mean, "compute the mean image of a database (compute_image_mean)")
-    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="of the database (default: lmdb)")
+    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: lmdb)")
     p.add_argument("INPUT_DB")
     p.add_argument("OUTPUT_FILE", nargs="?", help="where to write the mean, as .binaryproto")
 
 
 def _add_flags(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--gray", action="store_true", help="read images as gray")
+    p.add_argument("--gray", action="store_true", help="read images as grayscale")
     p.add_argument("--shuffle", action="store_true", help="write in random order")
-    p.add_argument("--seed", type=int, default=1, help="of the random order (default: 1)")
-    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="of the database (default: lmdb)")
-    p.add_argument("--resize_width", type=int, default=0, help="width images are resized to")
-    p.add_argument("--resize_height", type=int, default=0, help="height images are resized to")
+    p.add_argument("--seed", type=int, default=1, help="seed of the random order (default: 1)")
+    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: lmdb)")
+    p.add_argument("--resize_width", type=int, default=0, help="resize images to this width")
+    p.add_argument("--resize_height", type=int, default=0, help="resize images to this height")
     p.add_argument("--check_size", action="store_true", help="refuse images of different sizes")
     p.add_argument("--encoded", action="store_true", help="store encoded images")
     p.add_argument(
         "--encode_type", default="", help="format to encode images in (png, jpg, ...); by default each file's own"
     )
     p.add_argument("--workers", type=int, default=0, help="processes that read images; 0: one per core (default: 0)")
-    p.add_argument("ROOTFOLDER", help="folder in front of the names in the list")
-    p.add_argument("LISTFILE", help="blank lines and those that begin with # are passed over")
+    p.add_argument("ROOTFOLDER", help="folder that the names in the list are relative to")
+    p.add_argument("LISTFILE", help="the list; blank lines and lines that begin with # are ignored")
     p.add_argument("DB_NAME", help="the database to write; it must not exist")
 
 
@@ -84,7 +84,7 @@ def _convert(
 ) -> None:
     width, height = arguments.resize_width, arguments.resize_height
     if (width > 0) != (height > 0) or min(width, height) < 0:
-        raise WrongUsage("-resize_width and -resize_height go together, both above 0")
+        raise WrongUsage("-resize_width and -resize_height must both be given, and be above 0")
     entries = read(arguments.LISTFILE)
     if arguments.shuffle:
         log.info("convert_imageset.cpp:86", "Shuffling data")

@@ -40,49 +40,64 @@ def add_to(commands: Commands) -> None:
     )
     source.add_argument("--images", type=Path, metavar="FOLDER", help="the images of --mask, in natural order")
     source.add_argument(
-        "--camera", choices=CAMERAS, default="all", help="FAB-MAP's sets alternate left and right (all)"
+        "--camera",
+        choices=CAMERAS,
+        default="all",
+        help="which images to use: FAB-MAP's data alternates left and right (all)",
     )
     source.add_argument("--folders", type=Path, nargs=2, metavar="FOLDER", help="equal names are the same place")
     source.add_argument("--table", type=Path, metavar="CSV", help="positives: two columns of image names")
     source.add_argument("--index", type=Path, metavar="CSV", help="a table of frames; with --table, of their groups")
     source.add_argument(
-        "--group", metavar="COLUMN", help="different values are other places: negatives come from there"
+        "--group", metavar="COLUMN", help="column that names the place: images of different places are negatives"
     )
-    source.add_argument("--track", metavar="COLUMN", help="of --index: frames of one clip")
-    source.add_argument("--time", metavar="COLUMN", help="of --index: where in the clip; neighbours are positives")
-    source.add_argument("--max-gap", type=float, default=1.0, help="how far apart such neighbours may be (1)")
+    source.add_argument("--track", metavar="COLUMN", help="column of --index that names the clip")
     source.add_argument(
-        "--singles", type=Path, metavar="FOLDER", help="each image is a place of its own: all is warped"
+        "--time", metavar="COLUMN", help="column of --index with the position in the clip: neighbors are positives"
+    )
+    source.add_argument("--max-gap", type=float, default=1.0, help="largest distance of such neighbors (1)")
+    source.add_argument(
+        "--singles", type=Path, metavar="FOLDER", help="each image is a different place; positives are warped copies"
     )
 
     rule = parser.add_argument_group("what is the same place")
-    rule.add_argument("--max-distance", type=float, default=MAX_DISTANCE_M, help="metres; nearer is a positive (2)")
-    rule.add_argument("--max-angle", type=float, default=MAX_ANGLE_DEG, help="degrees; less turned is a positive (15)")
-    rule.add_argument("--min-gap", type=float, help="pairs nearer in time are left out: seconds, of a mask images (0)")
+    rule.add_argument("--max-distance", type=float, default=MAX_DISTANCE_M, help="meters; less is a positive (2)")
+    rule.add_argument("--max-angle", type=float, default=MAX_ANGLE_DEG, help="degrees; less is a positive (15)")
+    rule.add_argument("--min-gap", type=float, help="leave out pairs nearer in time: seconds (--mask: images) (0)")
     rule.add_argument("--negatives", choices=NEGATIVES, default="both", help="where negatives come from (both)")
-    rule.add_argument("--clear-distance", type=float, metavar="M", help="negatives by pose only from so far apart")
-    rule.add_argument("--clear-view-angle", type=float, metavar="DEG", help="or from viewing axes so far turned")
+    rule.add_argument("--clear-distance", type=float, metavar="M", help="negatives by pose are at least this far apart")
+    rule.add_argument("--clear-view-angle", type=float, metavar="DEG", help="or their viewing axes are")
     sets = {"type": _names, "action": "append", "default": [], "metavar": "A,B"}
     rule.add_argument("--same-scene", **sets, help="sequences of one room: no pair is made across them")
-    rule.add_argument("--same-frame", **sets, help="sequences whose poses share a frame: judged by pose across them")
-    rule.add_argument("--different-scenes", action="store_true", help="all sequences else show different rooms")
-    rule.add_argument("--max-difference", type=float, default=MAX_DIFFERENCE_S, help="image to pose, seconds (0.03)")
+    rule.add_argument("--same-frame", **sets, help="sequences whose poses share a frame: labeled by pose across them")
+    rule.add_argument("--different-scenes", action="store_true", help="all other sequences show different rooms")
+    rule.add_argument(
+        "--max-difference", type=float, default=MAX_DIFFERENCE_S, help="longest time from image to pose, seconds (0.03)"
+    )
 
     choice = parser.add_argument_group("the choice")
     for split, number in zip(SPLITS, (30000, 6000, 6000), strict=True):
         choice.add_argument(
             f"--{split}", type=int, default=number, metavar="N", help=f"pairs, half positive ({number})"
         )
-    choice.add_argument("--at-most", action="store_true", help="fewer pairs where there are not enough")
-    choice.add_argument("--split", choices=("time", "sequence"), help="whole sequences (places, groups) or stretches")
-    choice.add_argument("--shares", type=_shares, default=(0.6, 0.2, 0.2), help="of the images (0.6,0.2,0.2)")
+    choice.add_argument("--at-most", action="store_true", help="take fewer pairs if there are not enough")
+    choice.add_argument(
+        "--split", choices=("time", "sequence"), help="by stretches of time, or by whole sequences (places, groups)"
+    )
+    choice.add_argument(
+        "--shares", type=_shares, default=(0.6, 0.2, 0.2), help="shares of the images per split (0.6,0.2,0.2)"
+    )
     choice.add_argument("--split-gap", type=float, default=0.0, help="seconds left out between two splits (0)")
     for split in SPLITS:
         choice.add_argument(f"--{split}-sequences", type=_names, metavar="A,B", help=f"sequences (groups) of {split}")
-    choice.add_argument("--hard-negatives", type=Path, metavar="NPZ", help="nearest negatives by a net's features")
-    choice.add_argument("--hard-share", type=float, default=0.5, help="of the negatives (0.5)")
-    choice.add_argument("--warp-share", type=float, default=0.0, help="of the pairs: one image is a warped copy (0)")
-    choice.add_argument("--seed", type=int, default=1, help="another seed, other pairs (1)")
+    choice.add_argument(
+        "--hard-negatives", type=Path, metavar="NPZ", help="choose negatives that are near by these features"
+    )
+    choice.add_argument("--hard-share", type=float, default=0.5, help="share of such negatives (0.5)")
+    choice.add_argument(
+        "--warp-share", type=float, default=0.0, help="share of pairs in which one image is a warped copy (0)"
+    )
+    choice.add_argument("--seed", type=int, default=1, help="seed of the random choice (1)")
 
 
 def _pairs(arguments: argparse.Namespace) -> None:

@@ -15,12 +15,12 @@ def add_to(commands: Commands) -> None:
     """Add the command."""
     p = commands.add("walk", _walk, "render a synthetic walk through textured rooms, as TUM RGB-D sequences")
     p.add_argument("out", type=Path, metavar="OUT", help="folder for the sequences walk_1, walk_2, ...")
-    p.add_argument("--sequences", type=int, default=1, help="how many, each in a house of its own (1)")
+    p.add_argument("--sequences", type=int, default=1, help="number of sequences, each in its own house (1)")
     p.add_argument("--frames", type=int, default=400, help="images per sequence (400)")
-    p.add_argument("--size", type=size, default=(320, 240), help="of an image (320x240)")
-    p.add_argument("--laps", type=int, default=3, help="rounds of the house (3)")
-    p.add_argument("--rooms", type=int, default=4, help="of a house; an even number (4)")
-    p.add_argument("--seed", type=int, default=1, help="another seed, other houses (1)")
+    p.add_argument("--size", type=size, default=(320, 240), help="size of an image (320x240)")
+    p.add_argument("--laps", type=int, default=3, help="laps through the house (3)")
+    p.add_argument("--rooms", type=int, default=4, help="rooms per house, an even number (4)")
+    p.add_argument("--seed", type=int, default=1, help="random seed (1)")
 
 
 def _walk(arguments: argparse.Namespace) -> None:

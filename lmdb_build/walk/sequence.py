@@ -174,7 +174,7 @@ class _Carrier:
 
 
 def _look(yaw: Array, pitch: Array, roll: Array) -> Array:
-    """Camera-to-world rotations (N, 3, 3): ``yaw`` from +x towards +y, ``pitch`` down, ``roll`` clockwise."""
+    """Camera-to-world rotations (N, 3, 3): ``yaw`` from +x toward +y, ``pitch`` down, ``roll`` clockwise."""
     cos, sin, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
     ahead = np.stack([cos * np.cos(pitch), sin * np.cos(pitch), -np.sin(pitch)], axis=-1)
     right = np.stack([sin, -cos, zero], axis=-1)

@@ -42,7 +42,7 @@ def list_images(source: str | Path) -> ImageList:
     for folder in (source, *(source / name for name in SUBFOLDERS)):
         if images := _images_in(folder):
             return ImageList(tuple(images), tuple(path.relative_to(source).as_posix() for path in images))
-    raise InputError(f"holds no image; expected files that end in {', '.join(IMAGE_ENDINGS)}", source)
+    raise InputError(f"contains no images; expected files that end in {', '.join(IMAGE_ENDINGS)}", source)
 
 
 def natural_order(name: str) -> tuple[list[str | int], str]:
@@ -90,7 +90,7 @@ def _read_list(path: Path) -> ImageList:
             name = readings[-1][0]
             raise InputError(f'no such image "{name}" in {path.parent}', path, number, line.index(name) + 1)
     if not names:
-        raise InputError("lists no image", path)
+        raise InputError("lists no images", path)
     known = np.array(stamps, np.float64) if None not in stamps else None
     return ImageList(tuple(path.parent / name for name in names), tuple(names), known)
 

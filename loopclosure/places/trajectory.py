@@ -118,7 +118,7 @@ def read_rgb_list(path: str | os.PathLike[str]) -> list[Frame]:
             )
         frames.append(Frame(_number(fields[0], "the timestamp in seconds", path, number), fields[1].group()))
     if not frames:
-        raise InputError("lists no image", path)
+        raise InputError("lists no images", path)
     return sorted(frames, key=lambda frame: frame.stamp)
 
 

@@ -1,1 +1,1 @@
-"""What a net or a solver builds and measures, and what is likely wrong with it."""
+"""Checks and measurements of a net or a solver: shapes, costs, errors, likely mistakes."""

@@ -1,4 +1,4 @@
-"""What a file builds: shapes, parameters, memory, multiply-adds; and all that is wrong with it, at once.
+"""What a file builds: shapes, parameters, memory, multiply-adds; and all errors in it at once.
 
 Whatever a training would refuse before its first iteration is found here, without writing anything and, unless asked,
 without opening data. Unknown fields of a text file are reported all at once, and the file then is not built; of other
@@ -35,9 +35,9 @@ from netspec.solver.solver import choose_device
 
 @dataclass
 class Checked:
-    """One net of the file: ``label`` says which; ``advice`` is about what is legal but likely wrong.
+    """One net of the file, named by ``label``; ``advice`` lists what is legal but likely wrong.
 
-    A solver comes first, under its own path and without a net.
+    A solver comes first: its label is its path, and it has no net.
     """
 
     label: str
@@ -65,7 +65,7 @@ def check_file(
     allow_python: bool = False,
     strict: bool = False,
 ) -> list[Checked]:
-    """Check a net for a phase, level and stages, or a solver, whose training net gets these, and all its nets.
+    """Check a net for a phase, level and stages; or a solver and all its nets, where the training net gets these.
 
     Of a .caffemodel, the net inside it is checked (:func:`netspec.net.recovered.recover_net`).
 
@@ -119,7 +119,7 @@ def _check_weights(path: str | Path, manner: _Manner) -> Checked:
 def _check_net(
     net: NetParameter, source: SourceMap, label: str, weights: Iterable[str], manner: _Manner, seed: int = 0
 ) -> Checked:
-    """Build a net (its ``state`` set) on no device, hold weights against it, and collect the faults."""
+    """Build a net (its ``state`` set) without memory, check weights against it, and collect the errors."""
     faults: list[SpecError] = []
     options = BuildOptions(
         torch.device("meta"),

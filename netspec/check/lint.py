@@ -1,4 +1,4 @@
-"""What is legal and yet likely a mistake: the warnings of ``netspec check``."""
+"""What is legal but likely a mistake: the warnings of ``netspec check``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from netspec.net.net import Net
 from netspec.proto.schema import TRAIN
 from netspec.proto.source_map import Place
 
-FAR = 0.1  # of the records may be missed, or met twice, by a test
-#: What of the settings of a rate policy, and of an update rule, each reads.
+FAR = 0.1  # share of the records that a test may skip, or read twice
+#: The settings that each rate policy, and each update rule, reads.
 POLICY_SETTINGS = {
     "step": ("gamma", "stepsize"),
     "exp": ("gamma",),
@@ -40,9 +40,9 @@ def net_advice(net: Net) -> Iterator[str]:
 def solver_advice(solver: Any, node: Place, nets: list[Net]) -> Iterator[str]:
     """Yield a line for each thing in a solver, with its built nets (training net first), that is likely wrong."""
     if solver.snapshot > solver.max_iter:
-        yield f"{node.find('snapshot')}: snapshot {solver.snapshot} never fires in max_iter {solver.max_iter}"
+        yield f"{node.find('snapshot')}: snapshot {solver.snapshot} is more than max_iter {solver.max_iter}: no effect"
     elif not solver.snapshot and not solver.snapshot_after_train:
-        yield f"{node.where}: no snapshot is ever taken; set snapshot, or snapshot_after_train: true"
+        yield f"{node.where}: no snapshot is taken; set snapshot, or snapshot_after_train: true"
     for name in _settings_without_effect(solver):
         yield f"{node.find(name)}: {name} has no effect with type {solver.type} and lr_policy {solver.lr_policy}"
     for k, net in enumerate(nets[1:]):
@@ -59,7 +59,7 @@ def _settings_without_effect(solver: Any) -> Iterator[str]:
 
 
 def missing_data(net: Any, kept: Any, source: Any) -> Iterator[str]:
-    """Yield a line where every data layer of ``net`` was filtered away and nothing feeds what is ``kept``."""
+    """Yield a line if every data layer of ``net`` was filtered out, so that nothing feeds the ``kept`` layers."""
     readers = [i for i, layer in enumerate(net.layer) if not layer.bottom and layer.type != "Input"]
     fed = any(not layer.bottom for layer in kept.layer)
     if readers and kept.layer and not fed:
@@ -69,7 +69,7 @@ def missing_data(net: Any, kept: Any, source: Any) -> Iterator[str]:
 
 
 def _towers(net: Net) -> Iterator[str]:
-    """A ContrastiveLoss compares two towers: whatever one of them learns, the other should share."""
+    """A ContrastiveLoss compares two towers: they should share all their parameters."""
     producer = {v: i for i, node in enumerate(net.plan.nodes) for v in node.tops}
 
     def upstream(v: int) -> set[int]:
@@ -102,18 +102,18 @@ def _losses(net: Net) -> Iterator[str]:
         return
     for i, weights in enumerate(net.loss_weights):
         if any(weights) and not net.backward_plan.layers[i]:
-            yield f"{_place(net, i)}: nothing that learns reaches this loss"
+            yield f"{_place(net, i)}: this loss depends on no learnable parameter"
 
 
 def _unused(net: Net) -> Iterator[str]:
     if not any(any(weights) for weights in net.loss_weights):
-        return  # a deploy net: its outputs are what it is for
+        return  # a deploy net: its outputs are its purpose
     weighted = net.output_loss_weights
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
         for v in node.tops:
             name = net.plan.blobs[v]
             if net.plan.outputs.get(name) == v and not weighted[name] and not layer.label_bottoms and not layer.is_loss:
-                yield f'{_place(net, i)}: blob "{name}" is used by nothing'
+                yield f'{_place(net, i)}: no layer uses blob "{name}"'
 
 
 def _bare_batch_norms(net: Net) -> Iterator[str]:
@@ -123,20 +123,20 @@ def _bare_batch_norms(net: Net) -> Iterator[str]:
             readers.setdefault(v, set()).add(node.type)
     for i, node in enumerate(net.plan.nodes):
         if node.type == "BatchNorm" and "Scale" not in readers.get(node.tops[0], set()):
-            yield f"{_place(net, i)}: no Scale layer follows; Caffe's BatchNorm has no scale and shift of its own"
+            yield f"{_place(net, i)}: no Scale layer follows; Caffe's BatchNorm itself does not scale and shift"
 
 
 def _namesakes(net: Net) -> Iterator[str]:
-    """Saved weights find their layer by its name."""
+    """Saved weights are assigned to layers by name."""
     names: set[str] = set()
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
         if node.name in names and layer.blob_shapes:
-            yield f"{_place(net, i)}: an earlier layer has this name, and gets the weights that are loaded by it"
+            yield f"{_place(net, i)}: an earlier layer has the same name; loaded weights go to that layer only"
         names.add(node.name)
 
 
 def _test_size(iterations: int, where: Where, net: Net) -> Iterator[str]:
-    """Compare the records that a test reads with those there are, where the data is open."""
+    """Compare the number of records that a test reads with the number that exists, if the data is open."""
     for layer in net.layers:
         records = getattr(layer, "num_records", 0)
         if records:

@@ -55,9 +55,9 @@ def time_net(net: Net, iterations: int) -> None:
 
 
 def _pass(net: Net, forward: list[float], backward: list[float]) -> float:
-    """Run each layer forward, then each backward on its own graph; add the seconds; return the loss.
+    """Run each layer forward, then each layer backward on its own graph; add the seconds; return the loss.
 
-    Inputs that the caller would give are zeros.
+    The inputs of the net are zeros.
     """
     inputs = {name: torch.zeros(net.shapes[name], device=net.device) for name in net.inputs}
     values: dict[int, torch.Tensor] = {}

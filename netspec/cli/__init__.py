@@ -14,7 +14,7 @@ _FAMILIES = (train, measure, check, extract, export, run_script, caffe_tools)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage."""
+    """Run one command; return 0 when done, 1 for an error in the user's files, 2 for wrong usage."""
     words, program = list(sys.argv[1:] if argv is None else argv), []
     if words[:1] == [run_script.NAME]:
         words, program = run_script.split(words)

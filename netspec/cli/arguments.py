@@ -1,4 +1,4 @@
-"""Options that several commands have, and what their words mean."""
+"""Options that several commands share, and how their values are read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from netspec.exact import CHOICES, SMALL
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add ``--gpu``."""
     parser.add_argument(
-        "--gpu", default="", help="the GPU; for training also several: 0,1 or all (default: as the solver says)"
+        "--gpu",
+        default="",
+        help="the GPU's number; for training also several: 0,1 or all (default: the solver's choice)",
     )
 
 
@@ -31,7 +33,7 @@ def add_exact(parser: argparse.ArgumentParser) -> None:
         "--exact",
         choices=CHOICES,
         default=SMALL,
-        help=f"whose sums are Caffe's to the last bit, on the CPU; all is slower (default: {SMALL})",
+        help=f"which sums equal Caffe's in every bit, on the CPU; all is slower (default: {SMALL})",
     )
 
 
@@ -48,7 +50,7 @@ def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
 def add_python(parser: argparse.ArgumentParser) -> None:
     """Add ``--allow-python-layers``."""
     parser.add_argument(
-        "--allow-python-layers", action="store_true", help="let Python layers of the net run their code"
+        "--allow-python-layers", action="store_true", help="allow the net's Python layers to run their code"
     )
 
 
@@ -74,7 +76,7 @@ def stages(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 
 def devices(gpu: str) -> list[Any]:
-    """Return the torch devices of ``--gpu``: the CPU where it is empty, every GPU for ``all``, else those numbered."""
+    """Return the torch devices of ``--gpu``: the CPU where it is empty, every GPU for ``all``, else the listed ones."""
     import torch
 
     if not gpu:
@@ -83,10 +85,10 @@ def devices(gpu: str) -> list[Any]:
     numbers = [str(k) for k in range(count)] or ["0"] if gpu == "all" else gpu.split(",")
     for number in numbers:
         if not number.isdigit():
-            raise SpecError(f"--gpu {gpu}: expected the number of a GPU, several separated by commas, or all")
+            raise SpecError(f"--gpu {gpu}: expected the number of a GPU, several numbers separated by commas, or all")
         if int(number) >= count:
             raise SpecError(
-                f"--gpu {gpu}: this machine has {count or 'no'} GPU(s) that torch can use; leave --gpu out for the CPU"
+                f"--gpu {gpu}: torch finds {count or 'no'} GPU(s) on this machine; omit --gpu to use the CPU"
             )
     return [torch.device("cuda", int(number)) for number in numbers]
 
@@ -95,7 +97,7 @@ def device(gpu: str) -> Any:
     """Return the one torch device of ``--gpu``."""
     first, *others = devices(gpu)
     if others:
-        raise SpecError(f"--gpu {gpu}: several GPUs are for training; give one number")
+        raise SpecError(f"--gpu {gpu}: only training runs on several GPUs; give one number")
     return first
 
 
@@ -107,7 +109,7 @@ def bar(description: str, unit: str) -> Callable[[Any], Any]:
 
 
 def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str) -> Any:
-    """Return the net of ``--model``, on the device of ``--gpu``; the sites are where Caffe logs which device."""
+    """Return the net of ``--model``, on the device of ``--gpu``; the sites are where Caffe logs the device."""
     from netspec.net.build import load_net
 
     chosen = device(arguments.gpu)

@@ -18,11 +18,11 @@ def add_to(commands: Commands) -> None:
     p = commands.add(
         "extract_features", _extract_features, "write blobs to databases of float Datums (extract_features)"
     )
-    p.set_defaults(log_level=logging.WARNING)  # Caffe's tool does not tell how it builds the net
+    p.set_defaults(log_level=logging.WARNING)  # Caffe's tool does not log how it builds the net
     p.add_argument("weights", help="the trained weights")
     p.add_argument("model", help="the net's prototxt, with a data layer")
     p.add_argument("blobs", help="blob names, separated by commas")
-    p.add_argument("databases", help="as many databases to write, separated by commas")
+    p.add_argument("databases", help="the databases to write, one per blob, separated by commas")
     p.add_argument("batches", type=positive, help="mini-batches to run")
     p.add_argument("db_type", choices=("lmdb", "leveldb"))
     p.add_argument("mode", nargs="?", choices=("CPU", "GPU"), default="CPU")
@@ -49,7 +49,7 @@ def add_to(commands: Commands) -> None:
                 help="of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input",
             )
 
-    commands.add("layers", _layers, "print the layers it knows, from their own descriptions", quiet=True)
+    commands.add("layers", _layers, "list the layer types, each with its description", quiet=True)
 
 
 def _extract_features(arguments: argparse.Namespace) -> None:

@@ -14,7 +14,7 @@ from netspec.proto.schema import PHASES
 def add_to(commands: Commands) -> None:
     """Add the command."""
     p = commands.add(
-        "check", _check, "build a net, or a solver's nets, and report every fault; nothing is written", True
+        "check", _check, "build a net, or a solver's nets, and report every error; nothing is written", True
     )
     p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt, or a .caffemodel")
     add_state(p, phase="TEST")
@@ -24,10 +24,10 @@ def add_to(commands: Commands) -> None:
         default=[],
         type=shape,
         metavar="BLOB=N,C,H,W",
-        help="the shape of a data layer's top, whose data then is not opened",
+        help="the shape of a data layer's top; its data is then not opened",
     )
     p.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
-    p.add_argument("--weights", help="weights that must fit, several separated by commas")
+    p.add_argument("--weights", help="weights that must fit the net, several separated by commas")
     p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")
     add_strict(p)
     add_python(p)

@@ -31,17 +31,15 @@ def add_to(commands: Commands) -> None:
     p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
     p.add_argument("file", metavar="FILE", help="the net's prototxt")
     p.add_argument("--to", required=True, choices=("onnx", "torch", "pt2", "safetensors"), help="the form")
-    p.add_argument("--weights", help="the trained weights; without, random ones")
+    p.add_argument("--weights", help="the trained weights (default: random weights)")
     p.add_argument("--out", required=True, type=Path, help="the file to write")
     _add_source(p)
     p.add_argument(
         "--no-labels", action="store_true", help="leave out labels, and the losses and accuracies that need them"
     )
-    p.add_argument(
-        "--input", default="data", metavar="BLOB", help="the input that the options below are about (default: data)"
-    )
+    p.add_argument("--input", default="data", metavar="BLOB", help="the input for the options below (default: data)")
     p.add_argument("--crop", action="store_true", help="ONNX: take the middle of larger images")
-    p.add_argument("--swap", action="store_true", help="ONNX: images come with their channels reversed (RGB for BGR)")
+    p.add_argument("--swap", action="store_true", help="ONNX: images come with reversed channels (RGB for BGR)")
     p.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="ONNX: multiply images by this first")
     p.add_argument(
         "--mean", metavar="A,B,C|FILE", help="ONNX: then subtract this, numbers or a .binaryproto or .npy file"
@@ -52,16 +50,14 @@ def add_to(commands: Commands) -> None:
         "fold", _fold, "write the deploy net with BatchNorm and Scale folded in: OUT.prototxt, OUT.caffemodel"
     )
     p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
-    p.add_argument(
-        "file", metavar="MODEL", help="the net's prototxt; of a training net, labels and losses are left out"
-    )
+    p.add_argument("file", metavar="MODEL", help="the net's prototxt; of a training net, labels and losses are removed")
     p.add_argument("--weights", required=True, help="the trained weights")
     p.add_argument("--out", required=True, type=Path, metavar="PREFIX", help="write PREFIX.prototxt and .caffemodel")
     _add_source(p)
 
 
 def _add_source(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--blob", nargs="+", action="extend", default=[], help="only what computes these blobs")
+    p.add_argument("--blob", nargs="+", action="extend", default=[], help="only the layers that compute these blobs")
     p.add_argument(
         "--shape",
         action="append",
@@ -79,7 +75,7 @@ def _source(arguments: argparse.Namespace, labels: bool) -> Any:
 
     weights = [Path(path.strip()) for path in arguments.weights.split(",")] if arguments.weights else []
     if not weights:
-        log.warning("export", "no --weights: the net has random ones")
+        log.warning("export", "no --weights given: the weights are random")
     return Source(
         Path(arguments.file),
         weights,
@@ -108,7 +104,7 @@ def _export(arguments: argparse.Namespace) -> None:
         arguments.uint8,
     )
     if steps.changes_images and arguments.to != "onnx":
-        raise WrongUsage("--crop, --swap, --raw-scale, --mean, --scale and --uint8 go with --to onnx")
+        raise WrongUsage("--crop, --swap, --raw-scale, --mean, --scale and --uint8 need --to onnx")
     source = _source(arguments, not arguments.no_labels)
     for line in export_net(source, arguments.to, arguments.out, steps if steps.changes_images else None):
         print(f"note: {line}", file=sys.stderr)

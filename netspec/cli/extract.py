@@ -32,24 +32,26 @@ from netspec.whole_file import whole_file, why_unwritable
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    summary = "write blobs, over the records of a data layer or over images, to an .npz"
+    summary = "write blobs to an .npz file, for the records of a data layer or for images"
     p = commands.add("extract", _extract, summary, quiet=True)
     p.add_argument("--model", required=True, help="the net's prototxt")
-    p.add_argument("--weights", help="the trained weights; without, random ones")
+    p.add_argument("--weights", help="the trained weights (default: random weights)")
     p.add_argument("--blob", required=True, nargs="+", action="extend", help="the blobs to write")
     p.add_argument("--out", required=True, help="the .npz to write")
-    p.add_argument("--source", action="append", default=[], type=_source, metavar="LAYER=DB", help="another database")
+    p.add_argument(
+        "--source", action="append", default=[], type=_source, metavar="LAYER=DB", help="use another database"
+    )
     p.add_argument("--iterations", type=positive, help="batches to run (default: every record once)")
-    p.add_argument("--images", metavar="FOLDER|LIST", help="image files instead of records")
+    p.add_argument("--images", metavar="FOLDER|LIST", help="use image files instead of records")
     p.add_argument("--input", default="data", help="the blob that images go into (default: data)")
     p.add_argument(
         "--zooms",
         type=_zooms,
         metavar="1,0.7",
-        help="of each image the whole and its middle 0.7, one descriptor each",
+        help="describe several views of each image: the whole (1) and its middle (0.7)",
     )
     p.add_argument(
-        "--shape", type=shape, metavar="BLOB=N,C,H,W", help="that blob's shape, where the data is not at hand"
+        "--shape", type=shape, metavar="BLOB=N,C,H,W", help="the input blob's shape, if its data is not available"
     )
     p.add_argument("--swap", action="store_true", help="with --images: reverse the channels, to RGB")
     p.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="then multiply pixels, 0 to 255, by this")
@@ -79,7 +81,7 @@ def _extract(arguments: argparse.Namespace) -> None:
     if reason := why_unwritable(out):
         raise SpecError(f"--out {out}: cannot be written: {reason}")
     if not arguments.weights:
-        log.logger.warning("no --weights: the net has random ones")
+        log.logger.warning("no --weights given: the weights are random")
     arrays = _over_images(arguments) if arguments.images else _over_records(arguments)
     with whole_file(out) as unfinished, unfinished.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
@@ -92,7 +94,7 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.features.scaling import Steps
 
     if len(arguments.blob) != 1:
-        raise WrongUsage(f"--images takes one --blob, found {len(arguments.blob)}")
+        raise WrongUsage(f"--images needs exactly one --blob, found {len(arguments.blob)}")
     if arguments.shape and arguments.shape[0] != arguments.input:
         raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
     steps = Steps.of(arguments.mean, arguments.scale, arguments.raw_scale, arguments.swap)
@@ -120,7 +122,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.swap or arguments.mean is not None or (arguments.scale, arguments.raw_scale) != (1, 1):
         raise WrongUsage("--swap, --raw-scale, --mean and --scale are of --images; records have a transform_param")
     if arguments.zooms:
-        raise WrongUsage("--zooms are of --images; a data layer's records have their own transform_param")
+        raise WrongUsage("--zooms needs --images; the records of a data layer are transformed by its transform_param")
     message, source = parse_net(arguments.model)
     stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
     stated = with_sources(stated, source, dict(arguments.source))

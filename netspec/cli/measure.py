@@ -22,7 +22,7 @@ def add_to(commands: Commands) -> None:
     add_exact(p)
     add_strict(p)
 
-    p = commands.add("time", _time, "measure a model's forward and backward milliseconds a layer (caffe time)")
+    p = commands.add("time", _time, "measure the forward and backward time of each layer (caffe time)")
     p.add_argument("--model", required=True, help="the net's prototxt")
     p.add_argument("--iterations", type=positive, default=50, help="passes to time (default: 50)")
     add_device(p)

@@ -1,4 +1,4 @@
-"""What the commands of netspec share beside netspec.command_line: dialects, and what a signal does to a training."""
+"""What the commands of netspec share besides netspec.command_line: dialects, and effects of signals on a training."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from netspec.dialects import use_dialect
 
 
 class Commands(command_line.Commands):
-    """Commands that know the dialects of ``--plugin`` when they run."""
+    """Commands that run with the dialects of ``--plugin``."""
 
     def add(
         self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str, quiet: bool = False
     ) -> argparse.ArgumentParser:
         """Return the parser of a new command that runs ``function``, to add its own arguments to.
 
-        A command of Caffe's has Caffe's log. A ``quiet`` one shows warnings only, and with ``-v`` the log.
+        A command of Caffe shows Caffe's log. A ``quiet`` command shows only warnings, and the log with ``-v``.
         """
 
         def with_dialects(arguments: argparse.Namespace) -> int | None:
@@ -33,13 +33,13 @@ class Commands(command_line.Commands):
         if quiet:
             added.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
             added.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
-        plugin = "a dialect: a fork's layers, by the name they come under or by a file of one's own; may be repeated"
+        plugin = "a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated"
         added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=plugin)
         return added
 
 
 class _Verbose(argparse.Action):
-    """Show the whole log, as the commands that Caffe has do."""
+    """Show the whole log, like the commands that Caffe has."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
         namespace.log_level, namespace.log_form = logging.INFO, log.GlogFormatter()
@@ -47,7 +47,7 @@ class _Verbose(argparse.Action):
 
 @contextmanager
 def signals(effects: Mapping[signal.Signals, str]) -> Iterator[Callable[[], str | None]]:
-    """Give what a training is to be asked between iterations: the effect of a signal that came, or None."""
+    """Yield a function to call between iterations: it returns the effect of a received signal, or None."""
     came: list[str] = []
     before = {}
     for number, effect in effects.items():

@@ -33,7 +33,7 @@ def add_to(commands: Commands) -> None:
     add_device(p)
     add_state(p, phase=None)
     p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
-    p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="default: snapshot")
+    p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="what SIGHUP does (default: snapshot)")
     add_python(p)
     add_exact(p)
     add_strict(p)
@@ -75,7 +75,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:
-    """Have the solver write its scores; a training that goes on keeps those that it found before."""
+    """Make the solver write its scores; a resumed training keeps the earlier ones."""
     scores = read_scores(path).before(solver.iteration) if resumed and Path(path).exists() else Scores()
     scores.write(path)
 

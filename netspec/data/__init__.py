@@ -1,1 +1,1 @@
-"""Caffe's data: databases of Datums, lists of images, what happens to an image on its way. No torch in here."""
+"""Caffe's data: databases of Datums, lists of images, transformations of images. This package does not use torch."""

@@ -25,21 +25,21 @@ _RAW_DTYPES = ("<f8", "<f4", "<f2", "<i4", "<u4")  # DOUBLE, FLOAT, FLOAT16, INT
 
 
 def shape_of(proto: Any) -> Shape:
-    """Return the shape: ``shape``, or the four old fields num, channels, height, width where any of them is given."""
+    """Return the shape: ``shape``, or the four old fields num, channels, height, width if any of them is given."""
     if is_legacy(proto):
         return tuple(getattr(proto, axis) for axis in LEGACY_AXES)
     return tuple(proto.shape.dim)
 
 
 def is_legacy(proto: Any) -> bool:
-    """Say whether the shape is given by the four old fields."""
+    """Return whether the shape is given by the four old fields."""
     return any(proto.HasField(axis) for axis in LEGACY_AXES)
 
 
 def fits(proto: Any, shape: Sequence[int]) -> bool:
-    """Say whether the blob may be copied into an array of ``shape`` (Caffe: Blob::ShapeEquals).
+    """Return whether the blob may be copied into an array of ``shape`` (Caffe: Blob::ShapeEquals).
 
-    An old 4-D shape fits one of fewer axes that is equal once filled up with ones in front: (1, 1, 1, 500) fits (500,).
+    An old 4-D shape fits a shape of fewer axes if they are equal with ones put in front: (1, 1, 1, 500) fits (500,).
     """
     if is_legacy(proto):
         return len(shape) <= 4 and shape_of(proto) == (1,) * (4 - len(shape)) + tuple(shape)
@@ -47,7 +47,7 @@ def fits(proto: Any, shape: Sequence[int]) -> bool:
 
 
 def to_array(proto: Any) -> np.ndarray:
-    """Return the values in the blob's shape: float32, or float64 where the blob holds doubles. The array is read-only.
+    """Return the values in the blob's shape: float32, or float64 if the blob holds doubles. The array is read-only.
 
     Where the blob has neither data nor double_data, the numbers in its raw_data are returned: half precision and
     integers as float32. Raises ValueError where there are not as many values as the shape says.
@@ -56,7 +56,7 @@ def to_array(proto: Any) -> np.ndarray:
 
 
 def diff_to_array(proto: Any) -> np.ndarray | None:
-    """Return the gradient in the blob's shape, or None where the blob holds none; see :func:`to_array`."""
+    """Return the gradient in the blob's shape, or None if the blob has no gradient; see :func:`to_array`."""
     return _values(proto, _DIFF) if any(len(getattr(proto, name)) for name in _DIFF) else None
 
 
@@ -104,7 +104,7 @@ def _raw_values(runs: Any, count: int) -> np.ndarray:
 def _runs_message() -> Any:
     """Return a message of BlobProto's wire format whose packed numbers are ``bytes``.
 
-    protobuf hands out and takes repeated floats one Python object at a time (10 s for the 70 million of a net of the
+    protobuf reads and writes repeated floats one Python object at a time (10 s for the 70 million of a net of the
     paper); as bytes, numpy reads and writes them in place.
     """
     file = descriptor_pb2.FileDescriptorProto(name="netspec/blob_runs.proto", package="netspec")

@@ -23,14 +23,14 @@ from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault_at
 
 BACKENDS = ("lmdb", "leveldb")
-_SCAN = 4096  # keys listed ahead of the one that is asked for
+_SCAN = 4096  # keys listed ahead of the requested one
 _PATIENCE = 1.0  # seconds
 _FIRST_MAP_SIZE = 1 << 20  # Caffe's
 _COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a batch stays in memory until it is committed
 
 
 class Reader(ABC):
-    """Read access to a database, by record number; safe in threads."""
+    """Read access to a database, by record number; thread-safe."""
 
     @abstractmethod
     def __len__(self) -> int:
@@ -45,15 +45,15 @@ class Reader(ABC):
         """Return the value of record ``i``."""
 
 
-# A database cannot be opened twice in a process; the training and the test net, say, may name the same one.
+# A database cannot be opened twice in a process, but two nets (training and test, for example) may use the same one.
 _open_readers: weakref.WeakValueDictionary[tuple[int, int], Reader] = weakref.WeakValueDictionary()
 _open_lock = threading.Lock()
 
 
 def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) -> Reader:
-    """Open a database for reading; it is closed when nobody refers to the reader any more.
+    """Open a database for reading; it is closed when the last reference to the reader is gone.
 
-    ``where`` is the place that names the source. Raises SpecError for a database that is missing, empty, damaged or of
+    ``where`` is the place that names the source. Raises SpecError for a database that is missing, empty, damaged or has
     the other backend.
     """
     try:
@@ -61,14 +61,14 @@ def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) 
         if found != backend.lower():
             default = " (LEVELDB is Caffe's default)" if found == "lmdb" else ""
             named = found.upper()
-            raise ValueError(f"is of backend {named}, not {backend.upper()}{default}; say backend: {named}")
+            raise ValueError(f"has backend {named}, not {backend.upper()}{default}; set backend: {named}")
         identity = os.stat(os.path.join(source, "data.mdb") if found == "lmdb" else source)
         with _open_lock:
             reader = _open_readers.get((identity.st_dev, identity.st_ino))
             if reader is None:
                 reader = _LmdbReader(source) if found == "lmdb" else _LevelDbReader(source)
                 if not len(reader):
-                    raise ValueError("is empty: it holds no record")
+                    raise ValueError("is empty: it contains no records")
                 _open_readers[identity.st_dev, identity.st_ino] = reader
     except (ValueError, OSError) as fault:
         raise SpecError(f'database "{source}" {fault}', where or Where(source)) from None
@@ -84,18 +84,18 @@ def _kind(source: str) -> str:
     """Return the backend of the database in a folder."""
     folder = Path(source)
     if not folder.exists():
-        raise ValueError(f"is not there (relative paths start from {os.getcwd()})")
+        raise ValueError(f"does not exist (relative paths start from {os.getcwd()})")
     if not folder.is_dir():
-        raise ValueError("is a file; expected a folder with data.mdb (LMDB) or CURRENT (LevelDB) in it")
+        raise ValueError("is a file; expected a folder that contains data.mdb (LMDB) or CURRENT (LevelDB)")
     if (folder / "data.mdb").is_file():
         return "lmdb"
     if (folder / "CURRENT").is_file():
         return "leveldb"
-    raise ValueError("is a folder without data.mdb (LMDB) or CURRENT (LevelDB) in it, so it is no database")
+    raise ValueError("is a folder without data.mdb (LMDB) or CURRENT (LevelDB), so it is not a database")
 
 
 class _LmdbReader(Reader):
-    """An LMDB, opened without locks, so that read-only media and forked workers are fine."""
+    """An LMDB, opened without locks, so that it works on read-only media and in forked workers."""
 
     def __init__(self, source: str) -> None:
         size = os.path.getsize(os.path.join(source, "data.mdb"))
@@ -107,7 +107,7 @@ class _LmdbReader(Reader):
         stat = self._env.stat()
         pages = 2 + stat["branch_pages"] + stat["leaf_pages"] + stat["overflow_pages"]
         if size < pages * stat["psize"]:  # a read beyond the end of a mapped file kills the process
-            raise ValueError(f"is cut short: data.mdb has {size} bytes of at least {pages * stat['psize']}")
+            raise ValueError(f"is truncated: data.mdb has {size} bytes, expected at least {pages * stat['psize']}")
         self._length: int = stat["entries"]
         self._keys: list[bytes] = []
         self._lock = threading.Lock()
@@ -127,7 +127,7 @@ class _LmdbReader(Reader):
         return value
 
     def _list_keys(self, upto: int) -> None:
-        """Walk on from the last key known: on a slow disk a walk over all keys of a large database takes minutes."""
+        """Continue from the last known key: on a slow disk, listing all keys of a large database takes minutes."""
         with self._lock, self._env.begin() as transaction, transaction.cursor() as cursor:
             more = cursor.set_key(self._keys[-1]) and cursor.next() if self._keys else cursor.first()
             while more and len(self._keys) < upto:
@@ -136,7 +136,7 @@ class _LmdbReader(Reader):
 
 
 def _open_lmdb(source: str) -> lmdb.Environment:
-    """Open an environment, with patience: a reader that another thread has just let go of may still be closing."""
+    """Open an environment, with retries: a reader that another thread has just released may still be closing."""
     patience = time.monotonic() + _PATIENCE
     while True:
         try:
@@ -171,16 +171,16 @@ def _plyvel() -> ModuleType:
     try:
         import plyvel
     except ImportError:
-        raise ValueError("is a LevelDB, which needs a package more: pip install plyvel") from None
+        raise ValueError("is a LevelDB, which needs an extra package: pip install plyvel") from None
     return plyvel
 
 
 class Writer:
-    """Writes a new database that appears at its path only when it is whole.
+    """Writes a new database that appears at its path only when it is complete.
 
-    A context manager: records are put into a hidden folder beside, which takes the path's name at the end, and is
-    removed if anything went wrong. Missing folders above it are made. Memory stays flat, and real Caffe reads the
-    result. Raises SpecError where the path exists already (as Caffe does) or cannot be written to.
+    A context manager: records are put into a hidden folder beside the path, which is renamed at the end, or removed
+    after an error. Missing parent folders are made. Memory use is constant, and real Caffe reads the result. Raises
+    SpecError if the path already exists (as Caffe does) or cannot be written to.
     """
 
     def __init__(self, path: str, backend: str = "lmdb") -> None:
@@ -194,7 +194,7 @@ class Writer:
 
     def __enter__(self) -> Writer:
         if os.path.lexists(self.path):
-            raise SpecError("exists already; remove it or choose another name for the database", Where(self.path))
+            raise SpecError("already exists; remove it or choose another name for the database", Where(self.path))
         try:
             os.makedirs(self._partial)
             self._store = (_LmdbStore if self._backend == "lmdb" else _LevelDbStore)(self._partial)
@@ -205,7 +205,7 @@ class Writer:
         return self
 
     def put(self, key: bytes, value: bytes) -> None:
-        """Add a record; a second one of the same key takes the place of the first."""
+        """Add a record; a second one with the same key replaces the first."""
         assert self._store is not None, "put() outside of the with block"
         try:
             self._store.put(key, value)
@@ -214,7 +214,7 @@ class Writer:
             raise SpecError(f'cannot write record "{name}" ({fault})', Where(self.path)) from None
 
     def commit(self) -> None:
-        """Hand what was put so far to the file system."""
+        """Write the records put so far to the file system."""
         assert self._store is not None, "commit() outside of the with block"
         try:
             self._store.commit()
@@ -232,16 +232,16 @@ class Writer:
             if kind is None:
                 os.rename(self._partial, self.path)
         except (lmdb.Error, OSError) as fault:
-            raise SpecError(f"cannot put the finished database in its place ({fault})", Where(self.path)) from None
+            raise SpecError(f"cannot rename the finished database to its path ({fault})", Where(self.path)) from None
         finally:
             self._store = None
             shutil.rmtree(self._partial, ignore_errors=True)
 
 
 class _LmdbStore:
-    """A growing LMDB: a batch that finds the map full is written once more, into a map twice as large.
+    """A growing LMDB: if the map is full, the batch is written again into a map twice as large.
 
-    Caffe: LMDBTransaction (src/caffe/util/db_lmdb.cpp), whose files these are byte for byte as long as 1000 records are
+    Caffe: LMDBTransaction (src/caffe/util/db_lmdb.cpp); the files are equal byte for byte as long as 1000 records are
     no more than ``_COMMIT_BYTES``.
     """
 
@@ -253,7 +253,7 @@ class _LmdbStore:
 
     def put(self, key: bytes, value: bytes) -> None:
         if not 0 < len(key) <= self._longest:
-            raise lmdb.BadValsizeError(f"a key has 1 to {self._longest} bytes, not {len(key)}")
+            raise lmdb.BadValsizeError(f"found a key of {len(key)} bytes, expected 1 to {self._longest}")
         self._batch.append((key, value))
         self._bytes += len(key) + len(value)
         if len(self._batch) >= _COMMIT_RECORDS or self._bytes >= _COMMIT_BYTES:

@@ -20,10 +20,10 @@ from netspec.proto.schema import Datum
 def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
     """Return a Datum of an array (C, H, W): uint8 goes into ``data``, any other type as floats into ``float_data``.
 
-    Raises ValueError where the array has not three axes.
+    Raises ValueError if the array does not have three axes.
     """
     if array.ndim != 3:
-        raise ValueError(f"a Datum holds channels x height x width, found an array of shape {array.shape}")
+        raise ValueError(f"a Datum contains channels x height x width, found an array of shape {array.shape}")
     channels, height, width = array.shape
     datum = Datum(channels=channels, height=height, width=width)
     if array.dtype == np.uint8:
@@ -39,8 +39,8 @@ def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
 def encoded_datum(image: bytes, label: int | None = None, shape: tuple[int, int, int] | None = None) -> Datum:
     """Return a Datum of an image file's bytes (PNG, JPEG, ...).
 
-    ``shape`` (C, H, W) is written for an image that was encoded here, and left out for a file stored as it is, which is
-    how Caffe has it (EncodeCVMatToDatum, ReadFileToDatum).
+    ``shape`` (C, H, W) is written for an image that was encoded here, and omitted for a file stored as it is, as in
+    Caffe (EncodeCVMatToDatum, ReadFileToDatum).
     """
     datum = Datum(data=image, encoded=True)
     if shape is not None:
@@ -51,18 +51,18 @@ def encoded_datum(image: bytes, label: int | None = None, shape: tuple[int, int,
 
 
 def parse_datum(record: bytes) -> Datum:
-    """Return the Datum that a record holds; raises ValueError where it holds none."""
+    """Return the Datum of a record; raises ValueError if the record is not a Datum."""
     try:
         return Datum.FromString(record)
     except DecodeError:
-        raise ValueError(f"is no Datum ({len(record)} bytes)") from None
+        raise ValueError(f"is not a Datum ({len(record)} bytes)") from None
 
 
 def datum_to_array(datum: Any, color: bool | None = None) -> np.ndarray:
-    """Return the values (C, H, W): uint8 from ``data``, float32 from ``float_data``; ``data`` where both are given.
+    """Return the values (C, H, W): uint8 from ``data``, float32 from ``float_data``; ``data`` if both are given.
 
-    An encoded image is decoded, to three channels where ``color`` is true, to one where it is false, and to what the
-    file has where it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that
+    An encoded image is decoded: to three channels if ``color`` is true, to one if it is false, to the file's channels
+    if it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that
     contradicts itself or cannot be decoded.
     """
     if datum.encoded:
@@ -72,7 +72,7 @@ def datum_to_array(datum: Any, color: bool | None = None) -> np.ndarray:
     values = np.frombuffer(data, np.uint8) if data else np.array(datum.float_data, np.float32)
     if len(values) != np.prod(shape) or len(values) == 0:
         field = "data" if data else "float_data"
-        raise ValueError(f"holds {len(values)} values in {field}, but says channels x height x width = {times(shape)}")
+        raise ValueError(f"contains {len(values)} values in {field}, but channels x height x width is {times(shape)}")
     return values.reshape(shape)
 
 
@@ -91,7 +91,7 @@ def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
     if pixels is None:
         raise ValueError(pointer_fault(image) or "cannot be decoded as an image")
     if pixels.dtype != np.uint8:
-        raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits a channel can be read")
+        raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits per channel can be read")
     return pixels
 
 

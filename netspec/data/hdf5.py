@@ -19,14 +19,14 @@ from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault_at
 
-_FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may straddle two
+_FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may span two
 
 
 class Hdf5Source:
-    """The datasets named like the tops, row by row, from the files that ``list_file`` names (blank-separated).
+    """The datasets with the names of the tops, row by row, from the files listed in ``list_file`` (space-separated).
 
-    A batch may straddle files. With ``shuffle`` each epoch has its own order of files, and of the rows within each.
-    Raises SpecError for a missing file or dataset, and where rows differ in shape between files.
+    A batch may span files. With ``shuffle`` each epoch has its own order of files, and of the rows within each file.
+    Raises SpecError for a missing file or dataset, and if rows differ in shape between files.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Hdf5Source:
     def _rows_of(self, name: str, place: Where) -> int:
         count, shapes = _row_shapes(name, place, self._tops)
         if shapes != self._row_shapes:
-            message = f'rows of "{name}" have the shapes {shapes}, those of "{self._files[0]}" {self._row_shapes}'
+            message = f'rows of "{name}" have shapes {shapes}, those of "{self._files[0]}" have {self._row_shapes}'
             raise SpecError(f"{message}; all files must agree", place)
         return count
 
@@ -118,14 +118,14 @@ def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list
                 dataset = file.get(top)
                 if not isinstance(dataset, h5py.Dataset):
                     found = ", ".join(f'"{key}"' for key in file) or "nothing"
-                    message = f'HDF5 file "{name}" has no dataset named like top "{top}"; it has {found}'
+                    message = f'HDF5 file "{name}" has no dataset "{top}", the name of a top; it has {found}'
                     raise SpecError(message, place)
                 datasets.append(dataset)
                 if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
-                    raise SpecError(f'dataset "{top}" of "{name}" holds no rows of numbers', place)
+                    raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', place)
             counts = [len(dataset) for dataset in datasets]
             if min(counts) != max(counts) or not counts[0]:
-                raise SpecError(f'datasets of "{name}" have {counts} rows; expected one number of rows, above 0', place)
+                raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', place)
             return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
     except OSError as fault:
         raise SpecError(f'HDF5 file "{name}" {pointer_fault_at(name) or f"cannot be read: {fault}"}', place) from None
@@ -134,8 +134,8 @@ def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list
 class Hdf5Sink:
     """A new HDF5 file with the growing datasets ``data`` and ``label``, both 4-D as Caffe writes them.
 
-    Caffe stops at the second batch, since its datasets exist by then; here batches are appended, and each call leaves
-    the file readable. Raises SpecError where the file cannot be written or a batch does not go with those before it.
+    Caffe stops at the second batch, because its datasets then exist; here batches are appended. The file is readable
+    after each call. Raises SpecError if the file cannot be written or a batch has another shape than those before it.
     """
 
     NAMES = ("data", "label")
@@ -158,7 +158,7 @@ class Hdf5Sink:
             dataset = self._file[name]
             assert isinstance(dataset, h5py.Dataset)
             if dataset.shape[1:] != rows.shape[1:]:
-                message = f'rows of "{name}" had the shape {dataset.shape[1:]} so far, now {rows.shape[1:]}'
+                message = f'rows of "{name}" had shape {dataset.shape[1:]} in earlier batches, found {rows.shape[1:]}'
                 raise SpecError(message, self._where)
             dataset.resize(len(dataset) + len(rows), axis=0)
             dataset[-len(rows) :] = rows

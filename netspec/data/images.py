@@ -1,4 +1,4 @@
-"""Image files and lists of them, read as Caffe's ImageData layer and convert_imageset read them.
+"""Image files and lists of them, read as in Caffe's ImageData layer and convert_imageset.
 
 Caffe: src/caffe/util/io.cpp (ReadImageToCVMat), src/caffe/layers/image_data_layer.cpp
 """
@@ -28,8 +28,8 @@ class ListedImage:
 def read_image(path: str, color: bool = True, size: tuple[int, int] | None = None) -> np.ndarray:
     """Return an image file as uint8 (C, H, W): 3 channels (blue, green, red), or 1 where ``color`` is false.
 
-    ``size`` is (height, width), reached bilinearly and without low-pass filtering, as cv::resize does.
-    Raises ValueError, which names the file, where it is missing or no image.
+    ``size`` is (height, width); images are resized bilinearly without low-pass filtering, as by cv::resize.
+    Raises ValueError, which names the file, if the file is missing or is not an image.
     """
     try:
         pixels = decode_pixels(Path(path).read_bytes(), color)
@@ -44,9 +44,9 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
 
 
 def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Where]]:
-    """Yield the lines of a list file with their places, without blank lines and those that begin with ``#``.
+    """Yield the lines of a list file with their places, without blank lines and lines that begin with ``#``.
 
-    ``where`` is the place that names the file. Raises SpecError where it cannot be read.
+    ``where`` is the place that names the file. Raises SpecError if it cannot be read.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
@@ -60,10 +60,10 @@ def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Whe
 
 
 def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:
-    """Read lines of ``name label``, split at the last blank, so that names may hold blanks.
+    """Read lines of ``name label``, split at the last space, so that names may contain spaces.
 
-    Raises SpecError for a line without a whole-number label, and for a list without lines. (Caffe takes a label that is
-    no number as 0.)
+    Raises SpecError for a line without an integer label, and for a list without lines. (Caffe reads a label that is not
+    a number as 0.)
     """
     images = []
     for line, place in list_lines(path, where):
@@ -73,7 +73,7 @@ def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:
         except ValueError:
             name = ""
         if not name:
-            raise SpecError(f'found "{line}", expected an image name, a blank and a whole-number label', place)
+            raise SpecError(f'found "{line}", expected an image name, a space and an integer label', place)
     if not images:
         raise SpecError(f'the image list "{path}" is empty', where or Where(path))
     return images

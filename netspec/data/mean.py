@@ -23,7 +23,7 @@ from netspec.whole_file import whole_file
 def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     """Return the mean image of a .binaryproto file: float32 (C, H, W).
 
-    ``where`` is the place that names the file. Raises SpecError where it cannot be read or holds no image.
+    ``where`` is the place that names the file. Raises SpecError if it cannot be read or is not an image.
     """
     log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
     try:
@@ -35,9 +35,9 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     try:
         mean = blobs.to_array(BlobProto.FromString(data))
     except (DecodeError, ValueError) as fault:
-        raise SpecError(f'mean file "{path}" is no BlobProto of a mean image ({fault})', where) from None
+        raise SpecError(f'mean file "{path}" is not a BlobProto with a mean image ({fault})', where) from None
     if mean.ndim != 3 and not (mean.ndim == 4 and mean.shape[0] == 1):
-        raise SpecError(f'mean file "{path}" holds a blob of shape {mean.shape}, expected one image', where)
+        raise SpecError(f'mean file "{path}" contains a blob of shape {mean.shape}, expected one image', where)
     return mean.reshape(mean.shape[-3:]).astype(np.float32)
 
 
@@ -59,8 +59,8 @@ def read_mean_option(text: str) -> np.ndarray:
 def compute_mean(reader: Reader, where: Where) -> np.ndarray:
     """Return the mean of all records of a database, encoded or not: float32 (C, H, W).
 
-    Sums are exact, where Caffe's floats begin to round at some 65,000 images. Raises SpecError for a record that is no
-    image, or of another size than the first.
+    Sums are exact; Caffe's floats begin to round at about 65,000 images. Raises SpecError for a record that is not an
+    image, or has another size than the first.
     """
     first, total = "", np.zeros(0)
     for i in range(len(reader)):
@@ -76,8 +76,8 @@ def compute_mean(reader: Reader, where: Where) -> np.ndarray:
             log.info("compute_image_mean.cpp:70", "Starting iteration")
             first, total = name, np.zeros(image.shape)
         if image.shape != total.shape:
-            message = f'record "{name}" is {times(image.shape)}, but the first one, "{first}", {times(total.shape)}'
-            raise SpecError(f"{message}; a mean needs images of one size", where)
+            message = f'record "{name}" is {times(image.shape)}, but the first, "{first}", is {times(total.shape)}'
+            raise SpecError(f"{message}; all images must have the same size", where)
         total += image
         if (i + 1) % 10000 == 0:
             log.info("compute_image_mean.cpp:95", f"Processed {i + 1} files.")
@@ -96,7 +96,7 @@ def write_mean(path: str, mean: np.ndarray) -> None:
 
 
 def channel_means(mean: np.ndarray) -> list[float]:
-    """Return the mean of each channel, summed one by one in float32 as compute_image_mean does."""
+    """Return the mean of each channel, summed one by one in float32 like compute_image_mean."""
     log.info("compute_image_mean.cpp:114", f"Number of channels: {len(mean)}")
     means = [float(np.cumsum(channel, dtype=np.float32)[-1] / np.float32(channel.size)) for channel in mean]
     for c, value in enumerate(means):

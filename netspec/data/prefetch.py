@@ -1,4 +1,4 @@
-"""Batches, made ahead of the net by threads."""
+"""Batches that threads make ahead of the net."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ T = TypeVar("T")
 
 
 class Feed(Generic[T]):
-    """Hands out ``make(0)``, ``make(1)``, ... in order, up to ``ahead`` of them made ahead by ``workers`` threads.
+    """Returns ``make(0)``, ``make(1)``, ... in order; ``workers`` threads make up to ``ahead`` of them in advance.
 
-    ``make`` is a function of the iteration alone, so neither the number of threads nor the moment changes a batch. No
-    thread runs before the first ``next()``; with ``ahead`` 0 none ever does. What ``make`` raises, ``next()`` raises.
+    ``make`` is a function of the iteration alone, so batches depend neither on the number of threads nor on timing. No
+    thread runs before the first ``next()``; with ``ahead`` 0 none ever does. ``next()`` raises what ``make`` raises.
     """
 
     def __init__(self, make: Callable[[int], T], ahead: int, workers: int) -> None:
@@ -26,7 +26,7 @@ class Feed(Generic[T]):
         self.position = 0  #: the iteration whose batch comes next
 
     def next(self) -> T:
-        """Return the batch at ``position``, and step on."""
+        """Return the batch at ``position``, and go to the next."""
         position = self.position
         self.position += 1
         if not self._ahead:
@@ -38,7 +38,7 @@ class Feed(Generic[T]):
         return self._pending.popleft().result()
 
     def restart(self, position: int = 0) -> None:
-        """Go on at iteration ``position``; what was made ahead is dropped."""
+        """Continue at iteration ``position``; batches made in advance are dropped."""
         while self._pending:
             self._pending.popleft().cancel()
         self.position = position

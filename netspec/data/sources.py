@@ -1,4 +1,4 @@
-"""Where batches come from: each source makes the batch of iteration i as a function of i alone.
+"""Sources of batches: each source makes the batch of iteration i as a function of i alone.
 
 Caffe: src/caffe/layers/data_layer.cpp, src/caffe/layers/image_data_layer.cpp
 """
@@ -23,11 +23,11 @@ Arrays = tuple[np.ndarray, ...]
 
 
 class Cursor:
-    """Which records each iteration reads: batch after batch, from the start again after the last record.
+    """Which records each iteration reads: batch after batch; after the last record it starts again.
 
-    ``skip`` records are passed over at the very start. With ``shuffle`` each epoch has an order of its own, which
-    follows from ``seed``, ``stream`` and the epoch's number. Of the ``ranks`` nets that read the same data side by
-    side, this one, ``rank``, takes each ``ranks``-th record (Caffe: DataLayer::Skip); all must have one ``seed``.
+    The first ``skip`` records are skipped once, at the start. With ``shuffle`` each epoch has its own order, which
+    depends on ``seed``, ``stream`` and the epoch's number. If ``ranks`` nets read the same data in parallel, net
+    ``rank`` takes every ``ranks``-th record (Caffe: DataLayer::Skip); all must have the same ``seed``.
     """
 
     def __init__(
@@ -52,29 +52,29 @@ class Cursor:
         return [int(self._order(epoch)[i]) if self._shuffle else i for epoch, i in places]
 
     def positions(self, iteration: int) -> range:
-        """Return the places of an iteration's records in the endless sequence that all ranks read."""
+        """Return the positions of an iteration's records in the endless sequence that all ranks read."""
         start, end = self._span(iteration)
         return range(start + self._rank, end, self._ranks)
 
     def wraps(self, iteration: int) -> int:
-        """Return how often the last record is passed in an iteration."""
+        """Return how often an iteration passes the last record."""
         start, end = self._span(iteration)
         return end // self.count - start // self.count
 
     def _span(self, iteration: int) -> tuple[int, int]:
-        """Return where the records that all ranks read in an iteration begin and end."""
+        """Return the first and the end position of the records that all ranks read in an iteration."""
         width = self.batch_size * self._ranks
         start = self.skip + iteration * width
         return start, start + width
 
 
 def draw_skip(rand_skip: int, seed: int, stream: str) -> int:
-    """Return how many records to pass over at the start: less than ``rand_skip``, or 0 where that is 0."""
+    """Return how many records to skip at the start: less than ``rand_skip``, or 0 if that is 0."""
     return int(words(seed, f"{stream}/rand_skip", 0, 1)[0, 0]) % rand_skip if rand_skip else 0
 
 
 class Source(Protocol):
-    """What a reading layer needs to know of its data."""
+    """What a data layer needs to know about its data."""
 
     cursor: Cursor
 
@@ -103,8 +103,8 @@ class _Item:
 class _ImageSource:
     """Images with labels, one at a time by number, made into batches by a Transformer.
 
-    With a batch size of 1 each image may have its own size. Otherwise all must come out of the transform in the first
-    one's shape; raises SpecError, which names the record, where one does not.
+    With a batch size of 1 each image may have its own size. Otherwise all transformed images must have the shape of the
+    first; raises SpecError, which names the record, if one does not.
     """
 
     def __init__(self, cursor: Cursor, transformer: Transformer) -> None:
@@ -134,13 +134,13 @@ class _ImageSource:
     def _check_shape(self, item: _Item) -> None:
         shape = self._transform.output_shape(item.image.shape)
         if shape != self._shape:
-            first = f'the first one, "{self._first_name}", {times(self._shape)}'
-            advice = "all records must be of one size (or batch_size 1)"
+            first = f'the first record, "{self._first_name}", gives {times(self._shape)}'
+            advice = "all records must have the same size (or set batch_size: 1)"
             raise SpecError(f'record "{item.name}" gives {times(shape)}, but {first}; {advice}', item.where)
 
 
 class DatabaseSource(_ImageSource):
-    """The Datums of a database; Caffe's Data layer. Records are named by their keys."""
+    """The Datums of a database, as in Caffe's Data layer. Records are named by their keys."""
 
     def __init__(self, reader: Reader, cursor: Cursor, transformer: Transformer, where: Where | None = None) -> None:
         self._reader, self._where = reader, where
@@ -162,9 +162,9 @@ class DatabaseSource(_ImageSource):
 
 
 class ImageListSource(_ImageSource):
-    """Image files by a list; Caffe's ImageData layer. Records are named as in the list.
+    """Image files of a list, as in Caffe's ImageData layer. Records are named as in the list.
 
-    ``size`` (height, width) is what images are resized to, if anything; ``root`` is put in front of each name.
+    Images are resized to ``size`` (height, width), unless it is None; ``root`` is put in front of each name.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What happens to an image between the database and the net: crop, mirror, mean, scale.
+"""The transformation of an image between the database and the net: crop, mirror, mean, scale.
 
 Caffe: src/caffe/data_transformer.cpp
 """
@@ -20,24 +20,24 @@ from netspec.proto.schema import TRAIN
 
 
 def contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
-    """Yield a SpecError for each two settings of a transform_param that exclude each other."""
+    """Yield a SpecError for each pair of settings of a transform_param that exclude each other."""
     if param.force_color and param.force_gray:
-        yield SpecError("force_color and force_gray exclude each other", at("transform_param", "force_gray"))
+        yield SpecError("force_color and force_gray cannot both be set", at("transform_param", "force_gray"))
     yield from mean_contradictions(param, at)
 
 
 def mean_contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
-    """Yield a SpecError where a transform_param has two kinds of mean."""
+    """Yield a SpecError if a transform_param has two kinds of mean."""
     if param.HasField("mean_file") and param.mean_value:
-        yield SpecError("mean_file and mean_value exclude each other", at("transform_param", "mean_value"))
+        yield SpecError("mean_file and mean_value cannot both be set", at("transform_param", "mean_value"))
 
 
 class Transformer:
-    """A ``transform_param`` at work: (x - mean) * scale of a window of each image, mirrored or not.
+    """Applies a ``transform_param``: (x - mean) * scale of a window of each image, mirrored or not.
 
-    The window is drawn in TRAIN and central in TEST. Record k's draws follow from ``seed``, ``stream`` and k alone, its
-    words being for mirror, h_off and w_off, the order in which Caffe draws. ``at(*path)`` is the place of a field of
-    the layer. Raises SpecError for settings that contradict each other and for a mean file that cannot be read.
+    The window is random in TRAIN and central in TEST. The random numbers of record k, for mirror, h_off and w_off in
+    Caffe's order, depend only on ``seed``, ``stream`` and k. ``at(*path)`` is the place of a field of the layer. Raises
+    SpecError for settings that contradict each other and for a mean file that cannot be read.
     """
 
     def __init__(self, param: Any, phase: int, at: Callable[..., Where], seed: int = 0, stream: str = "") -> None:
@@ -56,23 +56,23 @@ class Transformer:
         self._warned = False
 
     def decode(self, datum: Any) -> np.ndarray:
-        """Return a Datum's image (C, H, W), in colour or grey where the transform forces it; raises ValueError."""
+        """Return a Datum's image (C, H, W), in color or gray if the transform forces it; raises ValueError."""
         if self.color is not None and not datum.encoded and not self._warned:
             self._warned = True
             log.warning("data_transformer.cpp:152", "force_color and force_gray only for encoded datum")
         return datum_to_array(datum, self.color)
 
     def output_shape(self, shape: Shape) -> Shape:
-        """Return what becomes of an image of ``shape`` (C, H, W).
+        """Return the shape of a transformed image of ``shape`` (C, H, W).
 
-        Raises SpecError where the image does not fit the crop or the mean.
+        Raises SpecError if the image does not fit the crop or the mean.
         """
         channels, height, width = shape
         if self.crop_size > min(height, width):
             raise self._error(f"crop_size {self.crop_size} is larger than the image, {times(shape)}", "crop_size")
         if self._mean is not None and self._mean.shape != shape:
-            mean = f'the mean of "{self._mean_file}" is {times(self._mean.shape)}'
-            raise self._error(f"{mean}, the image (uncropped) {times(shape)}; they must be equal", "mean_file")
+            mean = f'the mean of "{self._mean_file}" has shape {times(self._mean.shape)}'
+            raise self._error(f"{mean}, the image before cropping {times(shape)}; they must be equal", "mean_file")
         if len(self.mean_values) not in (0, 1, channels):
             message = f"found {len(self.mean_values)} mean_value for {channels} channels, expected 1 or {channels}"
             raise self._error(message, "mean_value")
@@ -81,7 +81,7 @@ class Transformer:
     def __call__(self, images: Sequence[np.ndarray], positions: range) -> np.ndarray:
         """Return the images, uint8 or float32 (C, H, W), as one batch: float32 (N, C, H', W').
 
-        ``positions`` are the images' numbers in the sequence of all records read, which the draws follow.
+        ``positions`` are the images' numbers in the sequence of all records read; they determine the random numbers.
         """
         batch = np.empty((len(images), *self.output_shape(images[0].shape)), np.float32)
         draws = words_at(self._seed, self._stream, positions).tolist()

@@ -1,4 +1,4 @@
-"""Windows of images, object and background, drawn at random: R-CNN's data.
+"""Random windows of images, object and background: the data of R-CNN.
 
 Caffe: src/caffe/layers/window_data_layer.cpp
 """
@@ -23,7 +23,7 @@ from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.data.transformer import mean_contradictions
 from netspec.errors import SpecError, Where
 
-CHANNELS = 3  # images are always read in colour
+CHANNELS = 3  # images are always read in color
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Window:
 
 @dataclass(frozen=True)
 class WindowFile:
-    """What a window file lists: images, windows that show an object, windows that show none."""
+    """The contents of a window file: images, windows with an object (foreground), windows without (background)."""
 
     images: list[str]
     foreground: list[Window]
@@ -48,10 +48,11 @@ class WindowFile:
 
 
 def read_window_file(param: Any, where: Where | None) -> WindowFile:
-    """Read the list of images, each with its windows, that a window_data_param names, a line for each item.
+    """Read the window file of a window_data_param: images, each with its windows, one item per line.
 
     For each image: ``# index``, path, channels, height, width, number of windows; then ``label overlap x1 y1 x2 y2``.
-    A window is foreground from ``fg_threshold`` overlap on, background below ``bg_threshold``, else left out.
+    A window is foreground if its overlap is at least ``fg_threshold``, background if it is below ``bg_threshold``, and
+    otherwise ignored.
     """
     path: str = param.source
     try:
@@ -87,7 +88,7 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
             x1, y1, x2, y2 = map(int, corners)
             if overlap >= param.fg_threshold:
                 if label <= 0:
-                    raise SpecError(f"found label {label:g} for a foreground window, expected one above 0", place)
+                    raise SpecError(f"found label {label:g} for a foreground window, expected a label above 0", place)
                 found.foreground.append(Window(image, int(label), x1, y1, x2, y2))
             elif overlap < param.bg_threshold:
                 found.background.append(Window(image, 0, x1, y1, x2, y2))
@@ -100,8 +101,8 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
 class WindowSource:
     """Batches of windows, background first, each warped to ``crop_size`` x ``crop_size`` with some context around.
 
-    ``file`` is what :func:`read_window_file` returns, ``mean`` what :func:`window_mean` does. As in Caffe,
-    ``transform_param.scale`` plays no part, and what lies outside of the image is 0 after the mean.
+    ``file`` comes from :func:`read_window_file`, ``mean`` from :func:`window_mean`. As in Caffe,
+    ``transform_param.scale`` is not used, and pixels outside of the image are 0 after the mean is subtracted.
     """
 
     def __init__(
@@ -127,7 +128,7 @@ class WindowSource:
         self._kinds = [self._file.background] * (param.batch_size - foreground) + [self._file.foreground] * foreground
         for kind, name in ((self._file.background, "background"), (self._file.foreground, "foreground")):
             if not kind and any(wanted is kind for wanted in self._kinds):
-                raise SpecError(f'"{param.source}" has no {name} windows, of which each batch needs some', where)
+                raise SpecError(f'"{param.source}" has no {name} windows, but each batch needs some', where)
         self._seed, self._stream, self._where = seed, stream, where
         count = len(self._file.foreground) + len(self._file.background)
         self.cursor = Cursor(count, param.batch_size, rank=rank, ranks=ranks)
@@ -167,7 +168,7 @@ class WindowSource:
         box, (top, left), (height, width) = self._fit(window, pixels.shape[0], pixels.shape[1], mirror)
         x1, y1, x2, y2 = box
         if not (0 <= x1 <= x2 < pixels.shape[1] and 0 <= y1 <= y2 < pixels.shape[0]):
-            raise SpecError(f'the window {window} does not lie within image "{path}"', self._where)
+            raise SpecError(f'the window {window} is not inside image "{path}"', self._where)
         if not (height and width):
             return
         patch = cv2.resize(pixels[y1 : y2 + 1, x1 : x2 + 1], (width, height), interpolation=cv2.INTER_LINEAR)
@@ -179,19 +180,19 @@ class WindowSource:
     def _fit(
         self, window: Window, rows: int, columns: int, mirror: bool
     ) -> tuple[tuple[int, int, int, int], tuple[int, int], tuple[int, int]]:
-        """Return the box to cut out of the image, and where in the output (top, left) and how large (height, width)."""
+        """Return the box to cut out of the image, and its place (top, left) and size (height, width) in the output."""
         x1, y1, x2, y2 = window.x1, window.y1, window.x2, window.y2
         crop = self._crop
         if not (self._pad or self._square):
             return (x1, y1, x2, y2), (0, 0), (crop, crop)
-        # The box is widened such that, once it is warped to the crop, `pad` pixels of context are on each side.
+        # The box is widened so that, after it is warped to the crop, `pad` pixels of context are on each side.
         context = crop / (crop - 2 * self._pad)
         half_h, half_w = (y2 - y1 + 1) / 2, (x2 - x1 + 1) / 2
-        centre_x, centre_y = x1 + half_w, y1 + half_h
+        center_x, center_y = x1 + half_w, y1 + half_h
         if self._square:
             half_h = half_w = max(half_h, half_w)
-        x1, x2 = _round(centre_x - half_w * context), _round(centre_x + half_w * context)
-        y1, y2 = _round(centre_y - half_h * context), _round(centre_y + half_h * context)
+        x1, x2 = _round(center_x - half_w * context), _round(center_x + half_w * context)
+        y1, y2 = _round(center_y - half_h * context), _round(center_y + half_h * context)
         scale_x, scale_y = crop / (x2 - x1 + 1), crop / (y2 - y1 + 1)
         beyond_left, beyond_right = max(0, -x1), max(0, x2 - columns + 1)
         beyond_top, beyond_bottom = max(0, -y1), max(0, y2 - rows + 1)
@@ -204,7 +205,7 @@ class WindowSource:
 
 
 def wrong_means(transform: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
-    """Yield what is wrong with the mean of a transform_param, its file aside."""
+    """Yield the errors in the mean of a transform_param, apart from its file."""
     yield from mean_contradictions(transform, at)
     if len(transform.mean_value) not in (0, 1, CHANNELS):
         message = f"found {len(transform.mean_value)} mean_value, expected 1 or {CHANNELS}"
@@ -212,7 +213,7 @@ def wrong_means(transform: Any, at: Callable[..., Where]) -> Iterator[SpecError]
 
 
 def window_mean(transform: Any, at: Callable[..., Where]) -> np.ndarray:
-    """Return the mean to subtract, float32 (3, crop, crop) or, from mean_value, (3, 1, 1) spread to it."""
+    """Return the mean to subtract, float32 (3, crop, crop) or, from mean_value, (3, 1, 1) broadcast to it."""
     crop: int = transform.crop_size
     if transform.mean_file:
         where = at("transform_param", "mean_file")

@@ -2,8 +2,8 @@
 
 ``--plugin NAME`` on the command line, or ``netspec.use_dialect(NAME)``, switches one on for the whole process. NAME is
 one of netspec's own (the files in this folder), one that an installed package offers (an entry point of the group
-``netspec.dialects``), or the path of a .py file. A dialect that is not on still helps: an unknown field or layer type
-names the dialects that have it.
+``netspec.dialects``), or the path of a .py file. Errors about an unknown field or layer type also
+name the dialects that have it, even if they are not active.
 
 To write one, put this into a file, say ``doubling.py``, and pass ``--plugin doubling.py``::
 
@@ -38,8 +38,8 @@ To write one, put this into a file, say ``doubling.py``, and pass ``--plugin dou
 ``DECLARATIONS`` is in the language of caffe.proto (netspec/proto/dialect/registry.py): messages as they stand in the
 fork, new fields of Caffe's messages in ``extend``; one plain string. A layer is as Caffe's own are
 (netspec/layers/base.py);
-``@register`` has its type and the fields of LayerParameter that it reads: a net warns of those that nobody reads.
-``@register("Dropout", ..., replaces=Dropout)`` puts a subclass in the place of one of Caffe's layers, to honour a
+``@register`` has its type and the fields of LayerParameter that it reads: a net warns of fields that no layer reads.
+``@register("Dropout", ..., replaces=Dropout)`` puts a subclass in the place of one of Caffe's layers, to honor a
 field that the fork added to it. To offer a dialect with a package, name its module in that package's pyproject.toml::
 
     [project.entry-points."netspec.dialects"]
@@ -55,10 +55,11 @@ import traceback
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
-from netspec.proto.dialect.files import DialectFile, find_file, read_dialect
-from netspec.proto.dialect.registry import activate, deactivate
+from netspec.proto.dialect.files import DialectFile, announce_known, find_file, read_dialect
+from netspec.proto.dialect.registry import activate, active, deactivate, known
+from netspec.proto.lexer import NAME, STRING, Lexer
 
-__all__ = ["use_dialect"]
+__all__ = ["use_dialect", "use_dialects_of"]
 
 
 def use_dialect(name: str | Path) -> None:
@@ -75,7 +76,7 @@ def use_dialect(name: str | Path) -> None:
     for layer_type in () if module in sys.modules else dialect.layer_types:
         cls = layer_class(layer_type)
         if cls is not None:
-            message = f'layer type "{layer_type}" is there already, from {cls.__module__}'
+            message = f'layer type "{layer_type}" already exists, from {cls.__module__}'
             raise SpecError(message, Where(str(file.path)))
     activate(dialect)
     try:
@@ -83,6 +84,41 @@ def use_dialect(name: str | Path) -> None:
     except SpecError:
         deactivate(dialect.name)
         raise
+
+
+def use_dialects_of(text: str, file: str) -> list[str]:
+    """Switch on the dialects whose fields or layer types a prototxt has; return their names.
+
+    The dialect that has most of them comes first; what it has is not looked for in others. ``file`` is what errors call
+    the text. Raises SpecError for text that is no prototxt at all.
+    """
+    words = _words(text, file)
+    announce_known()
+    own = {d.name: {field for _, field in d.fields()} | set(d.layer_types) for d in known()}
+    for name in active():
+        words -= own.pop(name, set())
+    used = []
+    while own:
+        name = max(own, key=lambda name: len(words & own[name]))
+        if not words & own[name]:
+            break
+        use_dialect(name)
+        used.append(name)
+        words -= own.pop(name)
+    return used
+
+
+def _words(text: str, file: str) -> set[str]:
+    """Return the field names and the layer types in a prototxt."""
+    lexer = Lexer(text, file)
+    words, before = set(), ["", ""]
+    for token in lexer:
+        if token.kind == NAME:
+            words.add(token.text)
+        elif token.kind == STRING and before == ["type", ":"]:
+            words.add(lexer.unquote(token).decode(errors="replace"))
+        before = [before[1], token.text]
+    return words
 
 
 def _run(file: DialectFile, name: str) -> None:

@@ -1,6 +1,6 @@
 """SSD's MultiBoxLoss: which prior boxes are trained, the matched ones and the hardest background, and on what.
 
-n images have p priors each; boxes are predicted in k kinds, one for all classes or one a class.
+n images have p priors each; boxes are predicted in k kinds, one for all classes or one per class.
 Fork: weiliu89/caffe (ssd), src/caffe/util/bbox_util.cpp: FindMatches, MineHardExamples, EncodeLocPrediction
 """
 
@@ -151,7 +151,7 @@ class MultiBoxLoss(Layer):
         if p.num_classes < 1:
             raise self.error("num_classes must be given", field, "num_classes")
         if p.background_label_id >= p.num_classes:
-            message = f"background_label_id {p.background_label_id} is none of the {p.num_classes} classes"
+            message = f"background_label_id {p.background_label_id} is not one of the {p.num_classes} classes"
             raise self.error(message, field, "background_label_id")
         if p.map_object_to_agnostic and p.num_classes != 2:
             message = f"map_object_to_agnostic needs num_classes: 2, background and object; found {p.num_classes}"

@@ -75,7 +75,7 @@ SEGNET_EPS = 1e-9  # added to the variance by SegNet's BN
 
 @register("Axpy")
 class Axpy(Layer):
-    """a x + y with one a a channel of each image: a squeeze-and-excitation block's end.
+    """a x + y with one factor a per channel of each image: the end of a squeeze-and-excitation block.
 
     bottom[0]  a (N, C) or (N, C, 1, 1)
     bottom[1]  x (N, C, ...)
@@ -154,7 +154,7 @@ class ReLU6(Activation):
 
 @register("DepthwiseConvolution", "convolution_param")
 class DepthwiseConvolution(Convolution):
-    """A convolution of each channel for itself: group must be the number of channels.
+    """A separate convolution of each channel: group must be the number of channels.
 
     bottom[i]  (N, C, H, W)
     top[i]     (N, num_output, H', W') as Convolution's
@@ -174,7 +174,7 @@ class DepthwiseConvolution(Convolution):
 
 @register("ConvolutionDepthwise", "convolution_param")
 class ConvolutionDepthwise(Convolution):
-    """A convolution of each channel for itself; num_output and group are not needed and not read.
+    """A separate convolution of each channel; num_output and group are not needed and not read.
 
     bottom[0]  (N, C, H, W)
     top[0]     (N, C, H', W') as Convolution's
@@ -366,7 +366,7 @@ class Upsample(Layer):
         masked = len(self.bottom_shapes) == 2
         if not masked and given - {"scale"}:
             extra = min(given - {"scale"})
-            raise self.error("without a mask as second bottom there is only scale", "upsample_param", extra)
+            raise self.error("without a mask as second bottom only scale can be set", "upsample_param", extra)
         for pair in ("upsample_h", "upsample_w"), ("scale_h", "scale_w"):
             alone = [name for name in pair if name in given]
             if len(alone) == 1:
@@ -438,10 +438,10 @@ class Upsample(Layer):
 
 @register("BN", "bn_param")
 class BN(Layer):
-    """Batch normalisation and a learned slope and bias in one; PSPNet's, or SegNet's where its fields are given.
+    """Batch normalization and a learned slope and bias in one; PSPNet's, or SegNet's where its fields are given.
 
     PSPNet's subtracts the batch's mean and divides by sqrt(variance + eps) in training, and by moving averages in
-    testing or where ``frozen``; these move by 1 - momentum towards the batch's mean and biased variance. SegNet's
+    testing or where ``frozen``; these move by 1 - momentum toward the batch's mean and biased variance. SegNet's
     (scale_filler, shift_filler, bn_mode) does so by the batch in both phases; with bn_mode INFERENCE, for which its
     weights were changed, it has only slope and bias.
 
@@ -463,9 +463,7 @@ class BN(Layer):
         segnet = given & {"scale_filler", "shift_filler", "bn_mode"}
         if segnet and given - segnet - {"engine"}:
             other = min(given - segnet - {"engine"})
-            raise self.error(
-                f"{other} is PSPNet's and {min(segnet)} SegNet's; they do not go together", "bn_param", other
-            )
+            raise self.error(f"{other} is PSPNet's and {min(segnet)} is SegNet's; use one kind only", "bn_param", other)
         self.channels = shape[1]
         size = (1, self.channels, 1, 1)
         self.add_blob(size, param.scale_filler if segnet else param.slope_filler)
@@ -483,12 +481,12 @@ class BN(Layer):
         """Return the bottom's shape; its channels must stay as many."""
         shape = bottom_shapes[0]
         if len(shape) < 2 or shape[1] != self.channels:
-            raise self.error(f"bottom of shape {shape} has not the {self.channels} channels seen first", "bottom")
+            raise self.error(f"found a bottom of shape {shape}, expected {self.channels} channels as before", "bottom")
         return [shape]
 
     @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the normalised values; in training also move the averages."""
+        """Return the normalized values; in training also move the averages."""
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (0, 1))
         if not self.by_batch and not self.moving:
             return data * slope + bias

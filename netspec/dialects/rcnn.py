@@ -387,7 +387,7 @@ class SmoothL1Loss(Loss):
         full = [(*shape, 1, 1, 1)[: max(4, len(shape))] for shape in bottom_shapes]
         for i, shape in enumerate(full):
             if shape != full[0]:
-                message = f"found bottoms of shapes {bottom_shapes[0]} and {bottom_shapes[i]}, expected one shape"
+                message = f"found bottoms of shapes {bottom_shapes[0]} and {bottom_shapes[i]}, expected equal shapes"
                 raise self.error(message, "bottom", i)
         return super().reshape(bottom_shapes)
 

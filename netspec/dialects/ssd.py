@@ -336,10 +336,10 @@ class Normalize(Layer):
 
 @register("PriorBox", "prior_box_param")
 class PriorBox(Layer):
-    """Lay boxes of some sizes and aspect ratios around the centre of every pixel of a map.
+    """Lay boxes of some sizes and aspect ratios around the center of every pixel of a map.
 
     For each min_size: a square of it; with max_sizes a square of sqrt(min_size max_size); then for each aspect_ratio
-    r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centres are at
+    r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centers are at
     (index + offset) step; where they are not given, the step is image / map and the image is bottom[1].
 
     bottom[0]  the map (N, C, H, W)
@@ -357,7 +357,7 @@ class PriorBox(Layer):
         if not param.min_size or min(param.min_size) < 1:
             raise self.error("min_size must be given and be at least 1", "prior_box_param", "min_size")
         if param.max_size and len(param.max_size) != len(param.min_size):
-            message = f"found {len(param.max_size)} max_size, expected none or {len(param.min_size)}, one a min_size"
+            message = f"found {len(param.max_size)} max_size, expected none or {len(param.min_size)}, one per min_size"
             raise self.error(message, "prior_box_param", "max_size")
         for i, (small, large) in enumerate(zip(param.min_size, param.max_size, strict=False)):
             if large <= small:
@@ -382,12 +382,16 @@ class PriorBox(Layer):
             if all(abs(ratio - known) >= 1e-6 for known in ratios):
                 ratios += [ratio, 1 / ratio] if param.flip else [ratio]
         sizes = []
-        for i, small in enumerate(int(size) for size in param.min_size):
+        for i, small in enumerate(map(self.pixels, param.min_size)):
             sizes.append((small, small))
             if param.max_size:
-                sizes.append((math.sqrt(small * int(param.max_size[i])),) * 2)
+                sizes.append((math.sqrt(small * self.pixels(param.max_size[i])),) * 2)
             sizes += [(small * math.sqrt(ratio), small / math.sqrt(ratio)) for ratio in ratios[1:]]
         return np.array(sizes, np.float32)
+
+    def pixels(self, size: float) -> float:
+        """Return the size that a box gets for a given ``min_size`` or ``max_size``."""
+        return int(size)
 
     def _pair(self, param: Any, both: str, height: str, width: str) -> tuple[float, float] | None:
         """Return (vertical, horizontal) of a setting given as one number or as two; None where it is not given."""

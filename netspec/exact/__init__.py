@@ -1,10 +1,10 @@
-"""Caffe's arithmetic to the last bit: one room, and one switch.
+"""Caffe's arithmetic, equal in every bit; switched by one option.
 
-Float32 sums differ by their order in the last bits. Those decide between two nearly equal pixels in a max pooling, and
-after that two trainings go different ways. So a run of Caffe can be followed only by computing as it did: its products
-and sums in the order of its BLAS and of its loops, its functions as the C library rounds them.
+The last bits of float32 sums depend on the order of addition. They decide between two nearly equal pixels in a max
+pooling, and from then on two trainings differ. So a run of Caffe can be repeated only by computing like Caffe: products
+and sums in the order of its BLAS and of its loops, functions rounded like those of the C library.
 
-The build option ``exact`` says what is computed so, on the CPU:
+The build option ``exact`` sets what is computed in this way, on the CPU:
 
 ``none``   nothing: torch's kernels.
 ``small``  (the default) what costs next to nothing: Convolution and InnerProduct of up to 500,000 multiply-adds an

@@ -1,10 +1,10 @@
-"""Where the gradients of parameters are summed up.
+"""The summation of gradients of parameters.
 
-Autograd computes the gradient of each use of a parameter by itself, and then adds up those of all uses and passes.
-Caffe adds each product to the parameter's ``diff`` as it goes, image by image, layer after layer, pass after pass. A
-net built with ``accumulate_in_place`` does as Caffe does: its layers add to ``grad`` themselves and hand nothing to
-autograd. The solver builds its nets so. Hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP see the
-gradients of nets built without it.
+Autograd computes the gradient of each use of a parameter separately, and then adds those of all uses and passes.
+Caffe adds each product to the parameter's ``diff`` at once: image by image, layer by layer, pass by pass. A net built
+with ``accumulate_in_place`` works like Caffe: its layers add to ``grad`` themselves and return no gradient to
+autograd. The solver builds its nets in this way. Hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP
+see the gradients of nets built without it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ParameterSums(torch.autograd.Function):
 
     @staticmethod
     def sums(ctx: Any) -> list[torch.Tensor | None]:
-        """Return where to add the gradient of each parameter; None where it is not asked for."""
+        """Return where to add the gradient of each parameter; None if it is not needed."""
         first, last = 1, 1 + len(ctx.adds)
         found: list[torch.Tensor | None] = []
         for parameter, asked, adds in zip(
@@ -49,5 +49,5 @@ class ParameterSums(torch.autograd.Function):
 
     @staticmethod
     def for_autograd(ctx: Any, sums: Sequence[torch.Tensor | None]) -> list[torch.Tensor | None]:
-        """Return what autograd is to add: nothing where it was added already."""
+        """Return what autograd must add: nothing if it was already added."""
         return [None if added else total for added, total in zip(ctx.adds, sums, strict=True)]

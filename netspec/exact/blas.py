@@ -1,4 +1,4 @@
-"""Caffe's calls of BLAS, by the OpenBLAS that comes with SciPy: on a CPU of one kind, equal calls give equal bits.
+"""Caffe's calls of BLAS, with the OpenBLAS of SciPy: on the same kind of CPU, equal calls give equal bits.
 
 Caffe: src/caffe/util/math_functions.cpp
 """
@@ -21,7 +21,7 @@ _IN_DOUBLE = 32  # OpenBLAS' dot sums up fewer products than this in double, one
 
 
 def suits_blas(tensor: torch.Tensor) -> bool:
-    """Return whether the functions of this module take it: values on the CPU, of single or double precision."""
+    """Return whether the functions of this module accept it: values on the CPU, of single or double precision."""
     return tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64) and tensor.numel() > 0
 
 
@@ -91,7 +91,7 @@ def sum_in_order(values: torch.Tensor, axis: int = 0) -> torch.Tensor:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Within, BLAS uses one thread: others, like torch's waiting awake for more work, would hinder these."""
+    """Within the block BLAS uses one thread: more threads would busy-wait, like torch's, and slow each other down."""
     with _pools().limit(limits=1):
         yield
 

@@ -22,7 +22,7 @@ from netspec.exact.sums import Product
 def within_channel(maps: torch.Tensor, size: int, alpha: float, beta: float) -> torch.Tensor:
     """Divide each value by a power of the squares around it in its map: (1 + alpha * their mean) ** beta.
 
-    To Caffe this is a net of its own: Power, average Pooling, Power and a product.
+    Caffe computes this with an internal net: Power, average Pooling, Power and a product.
     """
     squares = Pointwise.apply(maps, lambda x: libm.power(x, 2), lambda x, _, diff: diff * (2 * x))
     means = F.avg_pool2d(squares, size, stride=1, padding=size // 2)

@@ -1,4 +1,4 @@
-"""Whether a value is one to compute in Caffe's order."""
+"""Whether a value is computed in Caffe's order."""
 
 # pyright: reportPrivateImportUsage=false
 

@@ -78,7 +78,7 @@ class Source:
 def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | None = None) -> list[str]:
     """Write a net as ``onnx``, ``torch``, ``pt2`` or ``safetensors``; return notes for its user, in lines.
 
-    Raises SpecError for every fault of the files, and for a layer that cannot be exported.
+    Raises SpecError for any error in the files, and for a layer that cannot be exported.
     """
     if not out.parent.is_dir():
         raise SpecError(f"there is no folder {out.parent}; make it first", Where(str(out)))

@@ -175,7 +175,7 @@ class _Writer:
         model.producer_name = "netspec"
         described = {**metadata, **({"blobs": json.dumps(renamed)} if renamed else {})}
         if self.shapes.fixed:
-            file = net.plan.source.file  # its folder is nobody else's business
+            file = net.plan.source.file  # without its folder, which is private
             described["fixed"] = "\n".join(self.shapes.fixed).replace(file, Path(file).name)
         if self.preprocess:
             described["input"] = self.preprocess.description

@@ -1,4 +1,4 @@
-"""Features as Caffe's own tool writes them: one float Datum a record, in a database a blob.
+"""Features as Caffe's own tool writes them: one float Datum per record, one database per blob.
 
 Caffe: tools/extract_features.cpp
 """
@@ -17,18 +17,19 @@ from netspec.errors import SpecError, Where
 from netspec.graph import check_blobs
 from netspec.net.net import Net
 
-COMMITTED = 1000  # records between two commits, each of which is told
+COMMITTED = 1000  # records between two commits; each commit is logged
 
 
 def extract_features(net: Net, blobs: Sequence[str], databases: Sequence[str], batches: int, backend: str) -> None:
     """Run ``batches`` mini-batches and write each blob's rows to its database, under keys ``%010d``.
 
-    A row (C, H, W) stays so; a row of fewer axes is filled up with ones at the end. Raises SpecError where the
-    counts of names differ or the net lacks a blob.
+    A row (C, H, W) keeps its shape; a row of fewer axes gets axes of size 1 at the end. Raises SpecError if there are
+    not as many databases as blobs, or if the net lacks a blob.
     """
     where = Where(net.plan.source.file)
     if len(blobs) != len(databases):
-        raise SpecError(f"found {len(blobs)} blob names and {len(databases)} databases, expected as many", where)
+        message = f"found {len(blobs)} blob names and {len(databases)} databases, expected one database per blob"
+        raise SpecError(message, where)
     check_blobs(blobs, net.shapes, net.plan.source.file)
     for name in blobs:
         if not 1 <= len(net.shapes[name]) <= 4:

@@ -14,7 +14,7 @@ from netspec.features.views import read_zooms
 
 
 class Describer:
-    """A callable that gives blob ``blob`` of a net for an image that goes into its blob ``input``.
+    """A callable that returns blob ``blob`` of a net for an image given as its blob ``input``.
 
     The net is the prototxt ``model`` in phase TEST, cut down to what computes the blob; the pixels are scaled as its
     data layer's transform_param says or, where any of these is given, by ``swap``, ``raw_scale``, ``mean`` and

@@ -1,6 +1,6 @@
-"""Which images a folder or a list names, in which order, and when they were taken: the rule of docs/images.md.
+"""The images of a folder or a list, their order and their time stamps: the rule of docs/images.md.
 
-loopclosure/places/image_list.py follows the same rule; tests/laws/test_image_lists.py holds both to it.
+loopclosure/places/image_list.py follows the same rule; tests/laws/test_image_lists.py tests both.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _COMMENT = re.compile(r"\s+#")
 
 @dataclass(frozen=True)
 class ImageList:
-    """Image files in order: ``paths``, the ``names`` they are known by, ``stamps`` (N,) [s] where all have one."""
+    """Image files in order: ``paths``, their ``names``, and ``stamps`` (N,) [s] if all have one."""
 
     paths: tuple[Path, ...]
     names: tuple[str, ...]
@@ -33,7 +33,7 @@ class ImageList:
 
 
 def list_images(source: str | Path) -> ImageList:
-    """Return the images of a folder or of a list. Raises SpecError where there are none."""
+    """Return the images of a folder or of a list. Raises SpecError if it has no images."""
     source = Path(source)
     if not source.is_dir():
         return _read_list(source)
@@ -42,11 +42,11 @@ def list_images(source: str | Path) -> ImageList:
     for folder in (source, *(source / name for name in SUBFOLDERS)):
         if images := _images_in(folder):
             return ImageList(tuple(images), tuple(path.relative_to(source).as_posix() for path in images))
-    raise SpecError(f"holds no image; expected files that end in {', '.join(IMAGE_ENDINGS)}", Where(str(source)))
+    raise SpecError(f"contains no images; expected files that end in {', '.join(IMAGE_ENDINGS)}", Where(str(source)))
 
 
 def natural_order(name: str) -> tuple[list[str | int], str]:
-    """Return a key by which 2.png comes before 10.png, and a before B."""
+    """Return a sort key: 2.png comes before 10.png, and a before B."""
     return [int(part) if k % 2 else part.lower() for k, part in enumerate(re.split(r"(\d+)", name))], name
 
 
@@ -82,7 +82,7 @@ def _read_list(path: Path) -> ImageList:
             continue
         readings = list(_readings(text))
         for name, stamp in readings:
-            if os.path.isfile(path.parent / name):  # unlike Path.is_file, also for names that no file can have
+            if os.path.isfile(path.parent / name):  # unlike Path.is_file, it accepts names that no file can have
                 names.append(name)
                 stamps.append(stamp)
                 break
@@ -90,13 +90,13 @@ def _read_list(path: Path) -> ImageList:
             name = readings[-1][0]
             raise SpecError(f'no such image "{name}" in {path.parent}', Where(str(path), number, line.index(name) + 1))
     if not names:
-        raise SpecError("lists no image", Where(str(path)))
+        raise SpecError("lists no images", Where(str(path)))
     known = np.array(stamps, np.float64) if None not in stamps else None
     return ImageList(tuple(path.parent / name for name in names), tuple(names), known)
 
 
 def _readings(text: str) -> Iterator[tuple[str, float | None]]:
-    """Yield what a line may mean, name and stamp, in the order in which the readings are tried."""
+    """Yield the possible meanings of a line, (name, stamp), in the order in which they are tried."""
     ends = [match.start() for match in _COMMENT.finditer(text)]
     for line in (text, *(text[:end] for end in reversed(ends))):
         match = _LINE.fullmatch(line)

@@ -1,4 +1,4 @@
-"""A blob of a net over image files: what Caffe's users wrote around pycaffe. The file it makes: docs/features.md."""
+"""A blob of a net for image files, as users of Caffe compute it with pycaffe. The file format: docs/features.md."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 
-BATCH = 16  # images at once
+BATCH = 16  # images per forward pass
 
 
 class ImageNet:
@@ -82,7 +82,7 @@ class ImageNet:
                 _warn_of_other_pixels(path, model, readers)
 
     def __call__(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the blob (N, V D) float32, view after view, of images (H, W, 3) or (H, W), uint8, BGR, any sizes."""
+        """Return the blob (N, V D) float32, views in order, of images (H, W, 3) or (H, W), uint8, BGR, of any size."""
         views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
         with torch.no_grad():
             self.net(**{self.input: self.scaling(np.stack(views))})
@@ -90,9 +90,9 @@ class ImageNet:
 
 
 def extract_images(describe: ImageNet, images: ImageList, progress: Progress = iter) -> dict[str, np.ndarray]:
-    """Return the arrays of a features.npz: features, names, seconds_per_image; stamps and zooms where there are any.
+    """Return the arrays of a features.npz: features, names, seconds_per_image; also stamps and zooms, if any.
 
-    The seconds are the whole way from file to feature: reading, resizing, the net.
+    The seconds include everything from file to feature: reading, resizing, the net.
     """
     parts = []
     begin = time.perf_counter()
@@ -112,17 +112,17 @@ def extract_images(describe: ImageNet, images: ImageList, progress: Progress = i
 
 
 def _shape_of(blob: str, net: NetParameter, source: SourceMap) -> Shape:
-    """Return the shape of a blob that the whole of a net computes; data is opened, memory is not used."""
+    """Return the shape of a blob of a net; data is opened, but no memory for blobs is used."""
     built = build_filtered(net, source, BuildOptions(torch.device("meta"), seed=0))
     built.close()
     return built.shapes[blob]
 
 
 def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Sequence[str]) -> None:
-    """Warn where a .caffemodel tells of a transform_param, and the net that gets its weights scales no pixels.
+    """Warn if a .caffemodel contains a transform_param, but the net that gets its weights does not scale pixels.
 
-    ``readers`` are the layers of that net that read the input. One that the trained net lacks is taken to do what the
-    transform_param did: a Power layer in a deploy file. An HDF5 file holds no settings.
+    ``readers`` are the layers of that net that read the input. If the trained net lacks one of them (a Power layer in a
+    deploy file, say), it is assumed to replace the transform_param. An HDF5 file contains no settings.
     """
     if h5py.is_hdf5(weights):
         return
@@ -134,8 +134,8 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
         if p.scale != 1 or p.mean_value or p.mean_file:
             settings = " ".join(write_text(p).split())
             log.logger.warning(
-                f"{weights} was trained with transform_param {{ {settings} }}, which {model} lacks: its images go in "
-                "as they are, 0 to 255; give the prototxt of the training as the model"
+                f"{weights} was trained with transform_param {{ {settings} }}, but {model} has no transform_param: its "
+                "pixels stay 0 to 255; use the training prototxt as the model"
             )
             return
 
@@ -143,7 +143,7 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
 def _read(path: Path, channels: int) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR if channels == 3 else cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise SpecError(pointer_fault_at(path) or "cannot read this image", Where(str(path)))
+        raise SpecError(pointer_fault_at(path) or "cannot be read as an image", Where(str(path)))
     return image
 
 

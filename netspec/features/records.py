@@ -1,4 +1,4 @@
-"""Blobs of a net over the records of its data layer (Caffe: tools/extract_features.cpp)."""
+"""Blobs of a net for the records of its data layer (Caffe: tools/extract_features.cpp)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from netspec.errors import SpecError, Where
 from netspec.graph import check_blobs
 from netspec.net.net import Net
 
-Progress = Callable[[Iterable[int]], Iterable[int]]  # tqdm's form: wraps what is counted
+Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
 
 
 def with_sources(net: Any, source: Any, sources: dict[str, str]) -> Any:
@@ -25,7 +25,7 @@ def with_sources(net: Any, source: Any, sources: dict[str, str]) -> Any:
         if not layers:
             readers = [layer.name for layer in net.layer if layer.HasField("data_param")]
             known = ", ".join(dict.fromkeys(readers)) or "none"
-            raise SpecError(f'no data layer "{name}" to give a source to; this net\'s: {known}', Where(source.file))
+            raise SpecError(f'no data layer "{name}" in this net; its data layers: {known}', Where(source.file))
         for layer in layers:
             layer.data_param.source = path
     return changed
@@ -34,12 +34,12 @@ def with_sources(net: Any, source: Any, sources: dict[str, str]) -> Any:
 def extract_records(
     net: Net, blobs: Sequence[str], iterations: int | None = None, progress: Progress = iter
 ) -> dict[str, np.ndarray]:
-    """Return each blob over the records of the net's data layer, flattened to (N, D) float32.
+    """Return each blob for the records of the net's data layer, flattened to (N, D) float32.
 
-    Beside them ``keys`` (N,), ``seconds_per_record`` (reading and the net) and ``parameters``, how many the net learns.
+    Also returns ``keys`` (N,), ``seconds_per_record`` (reading and the net) and ``parameters`` (how many are learned).
 
-    ``iterations`` batches are run, by default as many as cover every record once (those read twice are dropped).
-    Raises SpecError where the net reads no records or lacks a blob.
+    ``iterations`` batches are run; by default as many as needed to read every record once (repeated ones are dropped).
+    Raises SpecError if the net reads no records or lacks a blob.
     """
     readers = [layer for layer in net.layers if getattr(layer, "num_records", 0)]
     if not readers:
@@ -60,7 +60,7 @@ def extract_records(
                 value = net.blobs[name]
                 if value.dim() == 0 or value.shape[0] != batch:
                     message = (
-                        f'blob "{name}" has shape {tuple(value.shape)}, expected one row a record ({batch} a batch)'
+                        f'blob "{name}" has shape {tuple(value.shape)}, expected one row per record ({batch} per batch)'
                     )
                     raise SpecError(message, Where(net.plan.source.file))
                 parts[name].append(value.reshape(batch, -1).cpu().numpy())

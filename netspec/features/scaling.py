@@ -57,7 +57,7 @@ class Steps:
 class Scaling:
     """(raw_scale x - mean) * scale of images (N, C, H, W), their channels reversed before that with ``swap``.
 
-    ``mean`` broadcasts against (C, H, W). ``source`` says who wants it so.
+    ``mean`` broadcasts against (C, H, W). ``source`` says where it comes from.
     """
 
     mean: np.ndarray
@@ -78,7 +78,7 @@ class Scaling:
         told = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
         mean = f", minus {told}" if np.any(values) else ""
         raw_scale, scale = (f", times {factor:g}" if factor != 1 else "" for factor in (self.raw_scale, self.scale))
-        return f"0 to 255{raw_scale}{mean}{scale}, {self.source}"
+        return f"0 to 255{raw_scale}{mean}{scale} ({self.source})"
 
 
 def scaling_of(steps: Steps, layer: LayerParameter | None, shape: Shape, file: str) -> Scaling:
@@ -88,11 +88,11 @@ def scaling_of(steps: Steps, layer: LayerParameter | None, shape: Shape, file: s
     """
     if steps:
         mean = np.zeros(1) if steps.mean is None else _fitted(steps.mean, shape, "--mean", Where("--mean"))
-        return Scaling(mean, steps.scale, "as the options say", steps.raw_scale, steps.swap)
+        return Scaling(mean, steps.scale, "from the options", steps.raw_scale, steps.swap)
     if layer is None:
-        return Scaling(np.zeros(1), 1.0, "since no transform_param says otherwise")
+        return Scaling(np.zeros(1), 1.0, "no transform_param")
     param: Any = layer.transform_param
-    source = f'as the transform_param of layer "{layer.name}" says'
+    source = f'transform_param of layer "{layer.name}"'
     if param.mean_file:
         mean = read_mean(param.mean_file, Where(file))[: shape[0]]  # a pair's mean: that of its first image
         return Scaling(_fitted(mean, shape, param.mean_file, Where(file)), param.scale, source)

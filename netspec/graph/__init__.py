@@ -1,7 +1,7 @@
-"""The passes between a parsed net and a runnable one: NetParameter in, NetParameter or Plan out; nothing is mutated.
+"""The passes between a parsed net and a runnable net: NetParameter in, NetParameter or Plan out; nothing is mutated.
 
-Each pass takes ``report``, which is called with every fault. By default the first one is raised; a caller that passes
-a collecting function gets them all, and a result in which the faulty parts are left as they are.
+Each pass takes ``report``, a function that gets every error. The default raises the first one. A caller that passes a
+collecting function gets all errors, and a result in which the wrong parts are unchanged.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ Report = Callable[[SpecError], None]
 
 
 def raise_fault(fault: SpecError) -> None:
-    """Raise the fault: the default of every pass."""
+    """Raise the error: the default of every pass."""
     raise fault
 
 
 def check_blobs(wanted: Iterable[str], known: Iterable[str], file: str) -> None:
-    """Raise SpecError for the first wanted blob that a net, read from ``file``, does not have."""
+    """Raise SpecError for the first of the blobs that a net, read from ``file``, does not have."""
     blobs = list(dict.fromkeys(known))
     for name in wanted:
         if name not in blobs:

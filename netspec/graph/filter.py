@@ -1,4 +1,4 @@
-"""Which layers of a net belong to a phase, level and set of stages (Caffe: Net::FilterNet, src/caffe/net.cpp)."""
+"""The layers of a net in a phase, level and set of stages (Caffe: Net::FilterNet, src/caffe/net.cpp)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from netspec.proto.source_map import SourceMap
 
 
 def in_state(net: NetParameter, *states: NetState) -> NetParameter:
-    """Return a copy of the net in the state that ``states`` give: each overrides those before it, stages add up."""
+    """Return a copy of the net in the state given by ``states``: later ones override earlier ones, stages are added."""
     stated = NetParameter()
     stated.CopyFrom(net)
     stated.ClearField("state")
@@ -29,7 +29,7 @@ def with_state(
 
 
 def with_train_state(solver: SolverParameter, level: int | None, stages: Iterable[str]) -> SolverParameter:
-    """Return a copy of the solver whose training net has this level (unless None) and these stages besides its own."""
+    """Return a copy of the solver; its training net gets this level (unless None) and these stages in addition."""
     stated = SolverParameter()
     stated.CopyFrom(solver)
     stated.train_state.MergeFrom(NetState(level=level, stage=stages))
@@ -45,7 +45,7 @@ def filter_net(net: NetParameter, source: SourceMap, report: Report = raise_faul
     for index, layer in enumerate(net.layer):
         if layer.include and layer.exclude:
             where = source.at(index, "exclude", layer=layer.name, type=layer.type)
-            report(SpecError("found both include and exclude rules, expected either one; remove one kind", where))
+            report(SpecError("found both include and exclude rules, expected only one kind; remove the other", where))
         if _included(net.state, layer):
             filtered.layer.add().CopyFrom(layer)
             kept.append(source.layers[index])

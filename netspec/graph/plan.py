@@ -1,7 +1,7 @@
-"""The last value without torch: which layer reads and writes which value, who owns each parameter, what is put out.
+"""The execution plan of a net: which layer reads and writes which value, who owns each parameter, which are outputs.
 
-Blob *names* are Caffe's; *values* are numbered, one for each time a layer writes. An in-place layer writes a new value
-under an old name, so a Plan has no in-place operation and each value is written once.
+Blob *names* are Caffe's; *values* are numbered, one for each write of a layer. An in-place layer writes a new value
+under an old name, so a Plan has no in-place operations and each value is written once.
 Caffe: Net::Init, AppendTop, AppendBottom, AppendParam (src/caffe/net.cpp).
 """
 
@@ -20,7 +20,7 @@ PERMISSIVE = 1  # caffe.proto: ParamSpec.DimCheckMode
 
 @dataclass(frozen=True)
 class Param:
-    """One ``param { }`` of a layer. ``owner``: (layer, index) of the parameter that it shares by name, if any."""
+    """One ``param { }`` of a layer. ``owner``: (layer, index) of the parameter that it shares, if any."""
 
     name: str
     lr_mult: float
@@ -31,7 +31,7 @@ class Param:
 
 @dataclass(frozen=True)
 class Node:
-    """One layer: ``bottoms`` and ``tops`` are value numbers (a bottom nobody writes: -1)."""
+    """One layer: ``bottoms`` and ``tops`` are value numbers (-1 for a bottom that no layer writes)."""
 
     name: str
     type: str
@@ -44,10 +44,10 @@ class Node:
 
 @dataclass(frozen=True)
 class Plan:
-    """A net in running order.
+    """A net in execution order.
 
     ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values;
-    ``final[v]`` is the value that Caffe's memory holds in the end where it held ``v``: the last in-place layer's.
+    ``final[v]`` is the value that finally replaces ``v`` in Caffe's memory: that of the last in-place layer.
     """
 
     net: NetParameter
@@ -119,7 +119,7 @@ def _final(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
 
 
 def _shared_multipliers(net: NetParameter, source: SourceMap, report: Report) -> dict[str, tuple[float, float]]:
-    """Return lr_mult and decay_mult of each parameter name: given once, or by several alike."""
+    """Return lr_mult and decay_mult of each parameter name: given once, or several times with the same values."""
     found: dict[str, dict[str, float]] = {}
     for i, layer in enumerate(net.layer):
         for j, spec in enumerate(layer.param):
@@ -139,7 +139,7 @@ def _shared_multipliers(net: NetParameter, source: SourceMap, report: Report) ->
 
 @dataclass(frozen=True)
 class Backward:
-    """What Caffe would propagate: by layer, and by layer and bottom."""
+    """What Caffe propagates backward: by layer, and by layer and bottom."""
 
     layers: tuple[bool, ...]
     bottoms: tuple[tuple[bool, ...], ...]
@@ -151,10 +151,10 @@ def plan_backward(
     has_loss: Sequence[Sequence[bool]],
     label_bottoms: Sequence[frozenset[int]],
 ) -> Backward:
-    """Decide what needs backward computation, as Net::Init does and logs.
+    """Decide what needs backward computation, like Net::Init.
 
-    ``learns[i]``: layer i has a parameter with a rate; ``has_loss[i][j]``: its top j has a loss weight (anonymous tops
-    included); ``label_bottoms[i]``: its bottoms that never receive a gradient.
+    ``learns[i]``: layer i has a parameter with a nonzero rate; ``has_loss[i][j]``: its top j has a loss weight (also
+    anonymous tops); ``label_bottoms[i]``: its bottoms that never receive a gradient.
     """
     value_needs = [False] * len(plan.blobs)
     layer_needs: list[bool] = []

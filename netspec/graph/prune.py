@@ -1,4 +1,4 @@
-"""The part of a net that computes some blobs from others: how a training net gives the features of images."""
+"""The part of a net that computes some blobs from others: with it a training net gives features of images."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from netspec.proto.source_map import SourceMap
 def prune(
     net: NetParameter, source: SourceMap, wanted: Sequence[str], given: Mapping[str, Sequence[int]]
 ) -> tuple[NetParameter, SourceMap]:
-    """Return the filtered net with only the layers that ``wanted`` blobs need.
+    """Return the filtered net with only the layers that are needed for the ``wanted`` blobs.
 
     The layer that first writes a blob of ``given`` (name -> shape) is replaced by an Input layer of that shape; layers
-    that change it in place stay. Raises SpecError for a blob that the net does not have.
+    that change it in place are kept. Raises SpecError for a blob that the net does not have.
     """
     check_blobs((*wanted, *given), (top for layer in net.layer for top in layer.top), source.file)
     needed = set(wanted)
@@ -27,7 +27,7 @@ def prune(
             continue
         fresh = {top for j, top in enumerate(layer.top) if j >= len(layer.bottom) or layer.bottom[j] != top}
         if made & fresh and made <= set(given):
-            continue  # an Input layer stands for it
+            continue  # an Input layer replaces it
         kept.append(i)
         needed -= fresh - set(given)
         needed.update(layer.bottom)

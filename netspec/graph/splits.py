@@ -1,7 +1,7 @@
-"""A Split layer behind every blob that is used more than once (Caffe: src/caffe/util/insert_splits.cpp).
+"""Insert a Split layer after every blob that is used more than once (Caffe: src/caffe/util/insert_splits.cpp).
 
-Autograd would add the gradients by itself; the layers are Caffe's blob names, its log and its caffemodel's layer list.
-A blob with an explicit loss_weight counts that as one use, and the first of its copies carries the weight.
+Autograd adds gradients without these layers, but Caffe's blob names, log and caffemodel files contain them.
+An explicit loss_weight of a blob counts as one use; the first of its copies then has the weight.
 """
 
 from __future__ import annotations

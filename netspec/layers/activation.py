@@ -94,7 +94,7 @@ class ReLU(Activation):
 
 @register("PReLU", "prelu_param")
 class PReLU(Activation):
-    """max(x, 0) + slope min(x, 0), with one learned slope a channel, or one for all (channel_shared).
+    """max(x, 0) + slope min(x, 0), with one learned slope per channel, or one for all (channel_shared).
 
     bottom[0]  (N, C, ...)
     top[0]     the same shape

@@ -116,7 +116,7 @@ class Layer(torch.nn.Module):
 
     ``setup()`` reads ``self.param``, refuses what is wrong (``raise self.error(...)``) and adds the learnable blobs;
     ``self.bottom_shapes`` is known. ``reshape(bottom_shapes)`` returns the tops' shapes; it runs in the constructor and
-    again whenever bottoms of other shapes arrive. ``forward(*bottoms)`` returns one tensor, or a tuple of one a top.
+    again whenever bottoms of other shapes arrive. ``forward(*bottoms)`` returns a tensor, or a tuple, one per top.
 
     Caffe: include/caffe/layer.hpp
     """
@@ -187,7 +187,7 @@ class Layer(torch.nn.Module):
         """Return to the first record, where the layer reads any."""
 
     def close(self) -> None:
-        """Let go of files and threads, where the layer holds any."""
+        """Close files and stop threads, if the layer has any."""
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one forward pass at the present shapes (0 where they are not counted)."""
@@ -277,13 +277,13 @@ class Layer(torch.nn.Module):
     def possible(self, shape: Sequence[int]) -> Shape:
         """Return a shape as a tuple; refuse one with a negative size, or of more numbers than Caffe can count."""
         if min(shape, default=0) < 0:
-            raise self.error(f"found shape {tuple(shape)}, expected no size below 0")
+            raise self.error(f"found shape {tuple(shape)}, expected no negative size")
         if math.prod(shape) > MOST:
             raise self.error(f"found shape {tuple(shape)}, {math.prod(shape):,} numbers, expected at most {MOST:,}")
         return tuple(shape)
 
     def refuse(self, faults: Iterable[SpecError]) -> None:
-        """Report all of these faults; where there is any, the layer is not built."""
+        """Report all of these errors; if there are any, the layer is not built."""
         found = list(faults)
         for fault in found[:-1]:
             self.context.report(fault)
@@ -301,7 +301,7 @@ class Layer(torch.nn.Module):
         return axis % len(shape)
 
     def missing_input(self) -> SpecError | None:
-        """Return what keeps a solver from running the layer, where it has data that a program must give it first."""
+        """Return an error if a solver cannot run the layer, because a program must first give it data."""
         return None
 
     def _path_to(self, message: Any) -> tuple[str, ...]:

@@ -49,7 +49,7 @@ class InnerProduct(Layer):
         self.axis = self._axis(shape)
         found = math.prod(shape[self.axis :])
         if found != self.inputs:
-            message = f"bottom of shape {shape} has {found} values from axis {self.axis} on, the weights {self.inputs}"
+            message = f"bottom of shape {shape} has {found} values from axis {self.axis} on, expected {self.inputs}"
             raise self.error(message, "bottom")
         return [(*shape[: self.axis], self.param.inner_product_param.num_output)]
 
@@ -178,11 +178,11 @@ class Embed(Layer):
 
     @override
     def forward(self, indices: torch.Tensor) -> torch.Tensor:
-        """Return the rows; raise SpecError for an index that is none."""
+        """Return the rows; raise SpecError for an invalid index."""
         rows, index = self.param.embed_param.input_dim, indices.long()
         wrong = indices[(index < 0) | (index >= rows) | (index != indices)]
         if len(wrong):
-            message = f"found the index {wrong[0]:g}, expected whole numbers from 0 to {rows - 1} (input_dim - 1)"
+            message = f"found index {wrong[0]:g}, expected integers from 0 to {rows - 1} (input_dim - 1)"
             raise self.error(message, "bottom")
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         if self.is_exact(weight):

@@ -1,4 +1,4 @@
-"""What a blob holds before anything is learned: Caffe's seven fillers.
+"""Initial values of blobs: Caffe's seven fillers.
 
 Caffe: include/caffe/filler.hpp
 """
@@ -37,7 +37,9 @@ def check(filler: Any, shape: Shape) -> None:
     if math.prod(shape) == 0:
         raise ValueError(f"cannot fill an empty blob of shape {shape}")
     if filler.sparse != -1 and filler.type != "gaussian":
-        raise ValueError(f'filler "{filler.type}" knows no sparse (found {filler.sparse}); only "gaussian" does')
+        raise ValueError(
+            f'filler "{filler.type}" does not support sparse (found {filler.sparse}); only "gaussian" does'
+        )
     if filler.type in _NEED_AN_AXIS and not shape:
         raise ValueError(f'filler "{filler.type}" needs a blob of at least one axis, found a scalar')
     if filler.type in _CHECKS:

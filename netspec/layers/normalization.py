@@ -1,4 +1,4 @@
-"""Layers that bring values to a common scale: BatchNorm, Scale, Bias, LRN, MVN."""
+"""Layers that normalize or scale values: BatchNorm, Scale, Bias, LRN, MVN."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_OFFSET = 8  # means, in standard deviations, up to which torch's CPU kernel 
 
 @register("BatchNorm", "batch_norm_param")
 class BatchNorm(Layer):
-    """Subtract each channel's mean, divide by its standard deviation; of the batch in training, of the past in testing.
+    """Subtract each channel's mean, divide by its standard deviation: of the batch in training, averages in testing.
 
     y = (x - mean) / sqrt(var + eps) with the biased variance of the batch, or with blobs[0 and 1] / blobs[2] where
     ``use_global_stats`` (by default: in the test phase). Training adds to the sums: S = S moving_average_fraction + the
@@ -62,12 +62,12 @@ class BatchNorm(Layer):
         """Return the bottom's shape; its channels must stay as many."""
         shape = bottom_shapes[0]
         if len(shape) < 2 or shape[1] != self.channels:
-            raise self.error(f"bottom of shape {shape} has not the {self.channels} channels seen first", "bottom")
+            raise self.error(f"found a bottom of shape {shape}, expected {self.channels} channels as before", "bottom")
         return [shape]
 
     @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the normalised values; in training also add the batch's statistics to the sums."""
+        """Return the normalized values; in training also add the batch's statistics to the sums."""
         return self._by_past(data) if self.use_global_stats else self._by_batch(data)
 
     def past(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -180,7 +180,7 @@ def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
 
 
 def _normalize(data: torch.Tensor, eps: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the normalised batch, its mean and its unbiased variance, by torch's own kernel.
+    """Return the normalized batch, its mean and its unbiased variance, by torch's own kernel.
 
     The statistics come out exact as that kernel's running ones, all weight on the present batch.
     """
@@ -293,7 +293,7 @@ class Scale(_Affine):
         if self.is_exact(data, small=by_channel and math.prod(data.shape[1:]) <= SMALL_ITEM):
             return self.apply_exactly(data, scale, bias, self.axis)
         if by_channel:
-            # By channel: batch normalisation with mean 0 and variance 1 is this, three times as fast, backward too.
+            # By channel: batch normalization with mean 0 and variance 1 is this, three times as fast, backward too.
             zero, one = torch.zeros_like(scale), torch.ones_like(scale)
             return torch.batch_norm(data, scale, bias, zero, one, False, 0.0, 0.0, torch.backends.cudnn.enabled)
         top = data * _along(scale, self.axis, data)
@@ -391,7 +391,7 @@ class Bias(_Affine):
 class LRN(Layer):
     """Divide each value by a power of the squares around it: (k + alpha times their mean) ** beta.
 
-    The n = ``local_size`` neighbours are channels (ACROSS_CHANNELS), or n x n pixels (WITHIN_CHANNEL, where k is
+    The n = ``local_size`` neighbors are channels (ACROSS_CHANNELS), or n x n pixels (WITHIN_CHANNEL, where k is
     ignored: it is 1); those outside count as zeros.
 
     bottom[0]  (N, C, H, W)

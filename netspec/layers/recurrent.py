@@ -120,9 +120,9 @@ class Recurrent(Layer):
         x, cont = bottom_shapes[:2]
         steps, streams = x[:2]
         if tuple(cont) != (steps, streams):
-            raise self.error(f"found cont of shape {cont}, expected {(steps, streams)}, x being {x}", "bottom", 1)
+            raise self.error(f"found cont of shape {cont}, expected {(steps, streams)} for x of shape {x}", "bottom", 1)
         if self.has_static and bottom_shapes[2][:1] != (streams,):
-            message = f"found x_static of shape {bottom_shapes[2]}, expected ({streams}, ...), x being {x}"
+            message = f"found x_static of shape {bottom_shapes[2]}, expected ({streams}, ...) for x of shape {x}"
             raise self.error(message, "bottom", 2)
         state = (1, streams, self.hidden)
         first = 2 + self.has_static

@@ -19,7 +19,7 @@ def register(type_name: str, *reads: str, replaces: type[Layer] | None = None) -
 
     ``reads`` are the fields of LayerParameter that are the layer's own, e.g. ``"pooling_param"``, and what a dialect
     adds to them, e.g. ``"pooling_param.extra"``; a net warns of all others (netspec/net/ignored_fields.py). With
-    ``replaces`` a dialect's subclass takes the place of the class that has the type, to honour such an addition.
+    ``replaces`` a dialect's subclass takes the place of the class that has the type, to honor such an addition.
     """
 
     def add(cls: L) -> L:

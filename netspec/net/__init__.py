@@ -1,4 +1,4 @@
-"""A runnable net: built from a Plan, its weights, its forward pass."""
+"""Runnable nets: building, weights, forward pass."""
 
 from netspec.net.build import build_net, load_net
 from netspec.net.net import Net

@@ -1,4 +1,4 @@
-"""Fields of a prototxt that have no effect: where Caffe says nothing, a net names each of them once.
+"""Fields of a prototxt that have no effect: Caffe ignores them silently, a net here warns once for each.
 
 A field may belong to another layer's type (``pooling_param`` in a Convolution, ``loss_param`` in an EuclideanLoss), to
 another filler (``std`` with xavier), or to an older format (``data_param { scale: ... }``).
@@ -15,18 +15,18 @@ from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
 from netspec.layers.fillers import READS
 
-#: Fields of every layer: the net's affair, not a layer's own.
+#: Fields of every layer, which the net reads.
 COMMON = frozenset(
     {"name", "type", "bottom", "top", "phase", "loss_weight", "param", "blobs", "propagate_down", "include", "exclude"}
 )
-#: These say how Caffe computes, not what: no result here depends on them.
+#: These set how Caffe computes, not what: no result depends on them.
 HOW_NOT_WHAT = frozenset({"engine", "force_nd_im2col", "share_in_parallel", "stable_prod_grad"})
 
 Path = tuple[str, ...]
 
 
 def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
-    """Yield a line for each field without effect, with its first place in the file and how many more there are."""
+    """Yield a line for each field without effect: its first place in the file, and the number of others."""
     found: dict[tuple[str, Path, str], list[int]] = {}
     for i, layer in enumerate(layers):
         for path, reason in _unused(layer):
@@ -34,10 +34,10 @@ def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
     for (kind, path, reason), places in found.items():
         first = places[0]
         where = plan.source.at(first, *path, layer=plan.nodes[first].name, type=kind)
-        others = f" (nor in {len(places) - 1} more of these layers)" if len(places) > 1 else ""
+        others = f" (also in {len(places) - 1} more of these layers)" if len(places) > 1 else ""
         yield f"{where}: {'.'.join(path)} has no effect: {reason}{others}"
     if plan.net.debug_info:
-        yield f"{plan.source.net.find('debug_info')}: debug_info has no effect: only the solver's has"
+        yield f"{plan.source.net.find('debug_info')}: debug_info has no effect in a net; set it in the solver"
 
 
 def _unused(layer: Layer) -> Iterator[tuple[Path, str]]:

@@ -1,12 +1,12 @@
-"""Gradients where in-place layers follow one another, as Caffe's shared memory makes them.
+"""Gradients of consecutive in-place layers, as they result from Caffe's shared memory.
 
-Caffe's backward reads the data of bottom and top where they lie. If a later layer has written over them in place, it
-reads that layer's result: where an in-place Sigmoid follows an in-place ReLU, every value is positive, and the ReLU
-passes every gradient. Nets were trained with these gradients, so they are computed here too. It matters only for
-layers whose backward reads what was overwritten; the others keep a copy or a mask.
+Caffe's backward reads bottom and top from memory. If a later layer has overwritten them in place, it reads that
+layer's result. For example, if an in-place Sigmoid follows an in-place ReLU, every value is positive, and the ReLU
+passes every gradient. Nets were trained with these gradients, so they are computed here too. This matters only for
+layers whose backward reads overwritten data; other layers keep a copy or a mask.
 
-What a layer's backward reads, its ``gradient_reads`` say: the "bottom", only the "sign" of the bottom, which its own
-top has too, or the "top".
+``gradient_reads`` of a layer lists what its backward reads: the "bottom", only the "sign" of the bottom (which its
+own top has too), or the "top".
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from netspec.layers.base import Layer
 
 @dataclass
 class Memory:
-    """What a piece of Caffe's memory holds at the end of the forward pass."""
+    """The contents of a part of Caffe's memory at the end of the forward pass."""
 
     data: torch.Tensor | None = None
 
 
 def is_overwritten(layer: Layer, node: Node, plan: Plan) -> bool:
-    """Return whether the layer's backward reads data that it, or a later layer, has written over."""
+    """Return whether the layer's backward reads data that this layer, or a later one, has overwritten."""
     if not layer.gradient_reads:
         return False
     in_place, later = node.in_place[0], plan.final[node.tops[0]] != node.tops[0]
@@ -37,7 +37,7 @@ def is_overwritten(layer: Layer, node: Node, plan: Plan) -> bool:
 
 
 def run_overwritten(layer: Layer, bottom: torch.Tensor, memory: Memory, in_place: bool) -> tuple[torch.Tensor, ...]:
-    """Run a layer whose gradient is to read ``memory`` for its top and, where it is in place, for its bottom."""
+    """Run a layer; its gradient reads ``memory`` as its top and, if it is in place, as its bottom."""
     held = in_place and bool(layer.gradient_reads & {"bottom", "sign"})
     return (_Overwritten.apply(bottom, layer, memory, held),)
 

@@ -1,4 +1,4 @@
-"""Net: a torch.nn.Module that walks a Plan. It knows no layer by name.
+"""Net: a torch.nn.Module that executes a Plan. It does not depend on any layer type.
 
 Caffe: src/caffe/net.cpp
 """
@@ -35,7 +35,7 @@ Array = np.ndarray | torch.Tensor
 
 @dataclass(frozen=True)
 class Learnable:
-    """A parameter as the solver sees it: once, with its owner's place and its multipliers."""
+    """A parameter as the solver sees it: once, with the place of its owner and its multipliers."""
 
     parameter: torch.nn.Parameter
     lr_mult: float
@@ -48,10 +48,10 @@ class Net(torch.nn.Module):
     """A runnable net.
 
     ``net(data=array, label=array)`` runs one forward pass and returns the output blobs, by name in Caffe's
-    (alphabetical) order; inputs are ndarrays or tensors. ``inputs`` and ``outputs`` list blob names; ``blobs`` holds
-    what the last pass kept: the outputs, or with ``keep = "all"`` every blob, or with a list those named besides the
-    outputs. ``params`` maps layer names to lists of tensors in Caffe's blob order; shared ones are one object.
-    ``layers`` and ``param.layer`` run in step, splits included. Gradients are torch's.
+    (alphabetical) order; inputs are ndarrays or tensors. ``inputs`` and ``outputs`` list blob names. ``blobs`` has the
+    blobs kept by the last pass: the outputs, with ``keep = "all"`` every blob, or with a list also the listed ones.
+    ``params`` maps layer names to lists of tensors in Caffe's blob order; shared parameters are one object.
+    ``layers[i]`` belongs to ``param.layer[i]``, splits included. Gradients are computed by torch.
     """
 
     def __init__(self, plan: Plan, options: BuildOptions | None = None) -> None:
@@ -82,7 +82,7 @@ class Net(torch.nn.Module):
     # Building
 
     def _build_layers(self, options: BuildOptions) -> Any:
-        layers: dict[int, Layer] = {}  # without the faulty ones, where faults are collected
+        layers: dict[int, Layer] = {}  # without those with errors, if errors are collected
         shapes: dict[int, Shape] = {}
         memory = 0
         for i, (node, param) in enumerate(zip(self.plan.nodes, self.param.layer, strict=True)):
@@ -95,7 +95,7 @@ class Net(torch.nn.Module):
                 options.report(SpecError(unknown_type(node.type), at("type")))
                 continue
             if any(v not in shapes for v in node.bottoms):
-                continue  # for a fault upstream, which was reported
+                continue  # an error upstream was reported
             context = Context(
                 phase=self.phase,
                 random=self.random,
@@ -146,7 +146,7 @@ class Net(torch.nn.Module):
                 log.info("net.cpp:382", f"{node.name} -> {self.plan.blobs[v]}")
 
     def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer, report: Report) -> None:
-        """Tie the shared parameters of layer ``i`` to their owners; list the others as learnable."""
+        """Connect the shared parameters of layer ``i`` to their owners; list the others as learnable."""
         node = self.plan.nodes[i]
         if len(node.params) > len(layer.blobs):
             message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one per blob"
@@ -160,7 +160,7 @@ class Net(torch.nn.Module):
                 continue
             owner_index, owner_blob = spec.owner
             if owner_index not in layers:
-                continue  # for a fault of the owner, which was reported
+                continue  # an error in the owner was reported
             owner = layers[owner_index]
             if owner_blob >= len(owner.blobs):
                 continue  # the owner has too many param { }, which was reported
@@ -180,7 +180,7 @@ class Net(torch.nn.Module):
             log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {place}")
 
     def _finish(self, layers: list[Layer]) -> None:
-        """Log what needs backward computation, as Caffe decides it, and what is put out."""
+        """Log which layers need backward computation, as decided by Caffe, and the outputs."""
         learns = []
         for node, layer in zip(self.plan.nodes, layers, strict=True):
             learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
@@ -209,7 +209,7 @@ class Net(torch.nn.Module):
         return self._run(inputs)[1]
 
     def forward_loss(self, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Run the net; return the weighted sum of its losses (a scalar; 0 where there is none) and the outputs."""
+        """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
         return self._run(inputs)
 
     def _run(self, inputs: Mapping[str, Array]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -246,7 +246,7 @@ class Net(torch.nn.Module):
     ) -> tuple[torch.Tensor, ...]:
         """Run layer ``i`` alone on ``values`` (by value number) and return its tops.
 
-        ``memory`` is what its gradient is to read where later layers write in place over its top.
+        ``memory`` is what its gradient reads if later layers overwrite its top in place.
         """
         node, layer = self.plan.nodes[i], self.layers[i]
         if layer.is_input:
@@ -260,7 +260,7 @@ class Net(torch.nn.Module):
         return layer.run(*bottoms)
 
     def weighted_sum(self, top: torch.Tensor, weight: float) -> torch.Tensor:
-        """Return the share of a top in the net's loss (Caffe: Layer::Forward)."""
+        """Return the contribution of a top to the net's loss (Caffe: Layer::Forward)."""
         if top.numel() > 1 and applies(self._exact, top):
             return RowSums.apply(top.reshape(1, -1), weight)[0]
         return top.sum() if weight == 1 else top.sum() * weight
@@ -283,7 +283,7 @@ class Net(torch.nn.Module):
 
     @property
     def params(self) -> dict[str, list[torch.nn.Parameter]]:
-        """Layer name -> learnable blobs, in Caffe's order; layers without any are left out."""
+        """Layer name -> learnable blobs, in Caffe's order; only layers that have some."""
         return {
             node.name: list(layer.blobs)
             for node, layer in zip(self.plan.nodes, self.layers, strict=True)
@@ -292,7 +292,7 @@ class Net(torch.nn.Module):
 
     @property
     def output_loss_weights(self) -> dict[str, float]:
-        """Output blob -> its loss weight, 0 where it is no loss."""
+        """Output blob -> its loss weight, 0 if it is not a loss."""
         weights = {
             v: weight
             for node, row in zip(self.plan.nodes, self.loss_weights, strict=True)
@@ -301,9 +301,9 @@ class Net(torch.nn.Module):
         return {name: weights[v] for name, v in self.plan.outputs.items()}
 
     def share_weights_with(self, other: Net, report: Report = raise_fault) -> None:
-        """Use the learnable blobs of ``other``, layer by layer of equal name (Caffe: ShareTrainedLayersWith).
+        """Use the learnable blobs of ``other`` in the layers of equal names (Caffe: ShareTrainedLayersWith).
 
-        ``report`` gets a SpecError for each layer whose blobs have other shapes there.
+        ``report`` gets a SpecError for each layer whose blobs have different shapes there.
         """
         mine = {layer.param.name: layer for layer in self.layers}
         for theirs in other.layers:
@@ -312,7 +312,7 @@ class Net(torch.nn.Module):
                 continue
             shapes = (layer.blob_shapes, theirs.blob_shapes)
             if shapes[0] != shapes[1]:
-                message = f"cannot share weights with the training net: blobs {shapes[0]} here, {shapes[1]} there"
+                message = f"cannot share weights with the training net: shapes are {shapes[0]} here, {shapes[1]} there"
                 report(layer.error(message))
                 continue
             for j, blob in enumerate(theirs.blobs):
@@ -335,18 +335,18 @@ class Net(torch.nn.Module):
         taker.set_input_arrays(data, np.zeros(len(data), np.float32) if labels is None else labels)
 
     def missing_inputs(self) -> Iterator[SpecError]:
-        """Yield what keeps a solver, which gives its nets no inputs, from running this one."""
+        """Yield an error for each layer that needs inputs: a solver gives no inputs to its nets."""
         for layer in self.layers:
             if fault := layer.missing_input():
                 yield fault
 
     def restart_data(self) -> None:
-        """Make every layer that reads records begin at its first one again."""
+        """Make every data layer start again at its first record."""
         for layer in self.layers:
             layer.restart()
 
     def close(self) -> None:
-        """Let go of files and threads."""
+        """Close files and stop threads."""
         for layer in self.layers:
             layer.close()
 
@@ -356,13 +356,13 @@ def _tops(plan: Plan, node: Node) -> list[str]:
 
 
 def _spec(node: Node, layer: Layer, j: int) -> Param:
-    """Return what the prototxt, or the layer, says of learnable blob ``j``."""
+    """Return the settings of learnable blob ``j``, from the prototxt or the layer."""
     spec = node.params[j] if j < len(node.params) else Param("", layer.default_param_lr, 1.0, False, None)
     return replace(spec, lr_mult=0.0, decay_mult=0.0) if j in layer.not_learned else spec
 
 
 def _last_uses(plan: Plan) -> list[list[int]]:
-    """Return, by node, the values that nobody needs once it has run."""
+    """Return, by node, the values that are no longer needed once it has run."""
     last: dict[int, int] = {}
     for i, node in enumerate(plan.nodes):
         for v in (*node.tops, *node.bottoms):

@@ -1,4 +1,4 @@
-"""One layer without a net around it: to try what it does, and to test it."""
+"""A single layer without a net, for experiments and tests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from netspec.proto.schema import PHASES, LayerParameter, NetParameter
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.upgrade.current import upgrade_net
 
-FILE = "<layer>"  # what errors call the text
+FILE = "<layer>"  # the file name in errors
 
 
 def layer(
@@ -33,12 +33,12 @@ def layer(
     allow_python: bool = False,
     exact: str = SMALL,
 ) -> OneLayer:
-    """Return the layer that ``text``, what stands between the braces of ``layer { }``, describes.
+    """Return the layer described by ``text``, the part between the braces of ``layer { }``.
 
     ``netspec.layer('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }')(x)`` is its top for the bottom ``x``.
-    Bottoms and tops need no names; ``tops`` is how many there are, by default the fewest. The layer is built when the
-    shapes of its bottoms are known: at the first call, or at once where ``shapes`` gives them. ``exact`` is what it is
-    for a net (netspec/exact). Raises SpecError, and ValueError for an unknown ``exact``.
+    Bottoms and tops need no names; ``tops`` is the number of tops, by default the smallest. The layer is built when the
+    shapes of its bottoms are known: at the first call, or at once if ``shapes`` are given. ``exact`` is as for a net
+    (netspec/exact). Raises SpecError, and ValueError for an unknown ``exact``.
     """
     check_choice(exact)
     number = PHASES[phase] if isinstance(phase, str) else phase
@@ -47,7 +47,7 @@ def layer(
 
 
 class OneLayer(torch.nn.Module):
-    """A layer that is called with its bottoms, tensors or arrays, and returns its top, or a tuple of several.
+    """A layer to call with its bottoms, tensors or arrays; it returns its top, or a tuple of tops.
 
     ``layer`` is the Layer, with its ``blobs`` and ``top_shapes``; None before it is built.
     """
@@ -66,7 +66,7 @@ class OneLayer(torch.nn.Module):
 
 
 def make_layer(text: str, shapes: Sequence[Shape], tops: int | None = None, **context: Any) -> Layer:
-    """Return the built layer of a text for bottoms of these shapes; ``context`` has fields of :class:`Context`."""
+    """Build the layer of a text for bottoms of these shapes; ``context`` has fields of :class:`Context`."""
     param = LayerParameter()
     place = read_text(text, FILE, param)
     net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Place(place.where), (place,)))

@@ -1,4 +1,4 @@
-"""How a net is built, whoever asks for it."""
+"""How a net is built."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class BuildOptions:
     """How a net is built.
 
     ``seed`` None draws one; ``open_data`` False opens no data (``given_shapes``: the tops of data layers, by blob);
-    ``report`` gets each fault (the default raises the first); ``allow_python`` lets Python layers run code. Of
-    ``ranks`` nets that train side by side this one is number ``rank``: its data layers read their share of the records,
-    and draw from ``data_seed``, which all ranks must have in common (None: from ``seed``).
-    ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (netspec/exact/__init__.py).
-    ``accumulate_in_place`` makes layers add their parameters' gradients to ``grad`` themselves where they sum them up,
-    as Caffe does; hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see these.
+    ``report`` gets each error (the default raises the first); ``allow_python`` lets Python layers run code. This net is
+    number ``rank`` of ``ranks`` nets that train in parallel: its data layers read their share of the records, and draw
+    from ``data_seed``, which must be the same for all ranks (None: from ``seed``).
+    ``exact`` sets which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
+    ``accumulate_in_place`` makes layers add the gradients that they sum up to ``grad`` themselves, like Caffe;
+    hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see these gradients.
     """
 
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
@@ -45,13 +45,13 @@ class BuildOptions:
 
 
 def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
-    """Return a fault for each given shape of a blob that no data layer (or Python layer) makes."""
+    """Return an error for each given shape whose blob is not a top of a data layer (or Python layer)."""
     makers = [layer for net in nets for layer in net.layer if not layer.bottom or layer.type == "Python"]
     blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
     known = ", ".join(blobs) or "none"
     return [
         SpecError(
-            f'--shape names "{name}"{did_you_mean(name, blobs) or ";"} the blobs of data layers: {known}',
+            f'--shape: no data layer has a top "{name}"{did_you_mean(name, blobs) or ";"} their tops: {known}',
             Where(str(path)),
         )
         for name in shapes

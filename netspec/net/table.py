@@ -1,4 +1,4 @@
-"""A built net, shown: as a table to read, as JSON for programs."""
+"""A built net as a table for people, and as JSON for programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from netspec.net.net import Net
 
 _HEAD = ("layer", "type", "bottoms", "tops", "shapes", "parameters", "MiB", "multiply-adds")
-_WORDS = 5  # columns of words, flush left; then come the numbers
+_WORDS = 5  # columns of words, aligned left; then come the numbers
 
 
 def as_json(net: Net) -> dict[str, Any]:
@@ -24,9 +24,9 @@ def as_json(net: Net) -> dict[str, Any]:
 
 
 def table(net: Net) -> str:
-    """Return one line per layer: its name and type, its blobs and the shapes of its tops, what it costs; and totals.
+    """Return one line per layer: its name and type, its blobs, the shapes of its tops, its costs; and totals.
 
-    What it costs: learnable numbers ("shared" where an earlier layer has them), memory of its tops, multiply-adds of
+    Costs: number of learnable values ("shared" if an earlier layer owns them), memory of its tops, multiply-adds of
     one forward pass.
     """
     rows: list[tuple[str, ...]] = [_HEAD]

@@ -113,8 +113,8 @@ def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, s
 def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
     """Write all layers of the net, splits included, and their weights; with ``diff`` their gradients too.
 
-    A blob that layers share is written by each of them, in HDF5 by its owner alone. Raises SpecError where the file
-    cannot be written; then what was there before is there still.
+    A shared blob is written for each of its layers, in HDF5 only for its owner. Raises SpecError if the file cannot be
+    written; an older file is then not changed.
     """
     (write_hdf5 if str(path).endswith(".h5") else write_binary)(net, path, diff)
 
@@ -180,7 +180,7 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
     with _opened(path) as file:
         data = file.get("data")
         if not isinstance(data, h5py.Group):
-            raise SpecError("these are not weights: the HDF5 file has no group /data", Where(str(path)))
+            raise SpecError("this is not a weights file: the HDF5 file has no group /data", Where(str(path)))
         for name, arrays in _layer_groups(data):
             target = targets.get(name)
             if target is None:
@@ -206,12 +206,12 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
 def _opened(path: Path) -> h5py.File:
     try:
         return h5py.File(path, "r")
-    except OSError as fault:  # it begins as HDF5 files do
+    except OSError as fault:  # it begins like an HDF5 file
         raise SpecError(f"cannot be read: {fault}", Where(str(path))) from None
 
 
 def _layer_groups(data: h5py.Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
-    """Walk the layers, in Caffe's (alphabetical) order; a layer with a slash in its name is a group within a group."""
+    """Yield the layers, in Caffe's (alphabetical) order; a layer with a slash in its name is a group within a group."""
     for name, group in data.items():
         if isinstance(group, h5py.Group):
             arrays = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
@@ -241,7 +241,7 @@ def _to_hdf5(net: Net, path: Path, diff: bool) -> None:
 
 
 def _layers_by_name(net: Net) -> dict[str, Any]:
-    """Return the layers by name, the first of a name winning, as in Caffe."""
+    """Return the layers by name; of equal names the first is used, as in Caffe."""
     return {layer.param.name: layer for layer in reversed(net.layers)}
 
 
@@ -268,7 +268,7 @@ def _gradient(layer: Any, j: int) -> np.ndarray:
     return gradient.detach().cpu().numpy().reshape(layer.blob_shapes[j])
 
 
-# The sentences
+# The messages
 
 
 def _ignore(name: str) -> None:

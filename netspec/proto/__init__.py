@@ -1,1 +1,1 @@
-"""The language: Caffe's schema, its text and binary forms, the upgrades from older forms. No torch, no numpy."""
+"""Caffe's schema, its text and binary formats, upgrades from older formats. No torch, no numpy in this package."""

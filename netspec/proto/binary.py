@@ -1,4 +1,4 @@
-"""Messages in protobuf's binary form: .caffemodel, .solverstate, .binaryproto. Files of any size that memory holds."""
+"""Messages in protobuf's binary format: .caffemodel, .solverstate, .binaryproto. Any size that fits in memory."""
 
 from __future__ import annotations
 
@@ -17,16 +17,21 @@ M = TypeVar("M", bound=Message)
 
 
 def read_binary(path: str | Path, message_class: type[M]) -> M:
-    """Return the message that a file holds.
+    """Return the message in a file.
 
-    Raises SpecError for a file that cannot be read, is empty, or holds something else. Protobuf's binary form has no
-    mark of its own: what decodes without a single known field is taken for something else.
+    Raises SpecError for a file that cannot be read, is empty, or has other contents. Protobuf's binary format has no
+    signature: data that decodes without any known field counts as other contents.
     """
-    where = Where(str(path))
     try:
         data = Path(path).read_bytes()
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror or fault}", where) from None
+        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+    return parse_binary(data, str(path), message_class)
+
+
+def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
+    """Return the message that ``data`` holds; ``file`` is what errors call it. Raises as :func:`read_binary`."""
+    where = Where(file)
     name = message_class.DESCRIPTOR.name
     if not data:
         raise SpecError(f"the file is empty, expected a binary {name}", where)
@@ -49,7 +54,7 @@ def read_net_binary(path: str | Path) -> NetParameter:
 
 
 def parse_net_binary(path: str | Path, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
-    """Return the net of a .caffemodel, and a map that knows the file only. Raises SpecError."""
+    """Return the net of a .caffemodel, and a map that has only the file name. Raises SpecError."""
     net = read_binary(path, NetParameter)
     source = SourceMap.unknown(str(path), len(net.layer) + len(net.layers))
     return upgrade_net(net, source) if upgrade else (net, source)
@@ -68,9 +73,9 @@ def is_net_binary(path: str | Path) -> bool:
 
 
 def _guess(data: bytes) -> str:
-    """Say what else a file seems to be."""
+    """Return a guess at what a file is."""
     if data.startswith(b"\x89HDF\r\n\x1a\n"):
         return "an HDF5 file; its name should end in .h5"
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:1000]):
         return "text"
-    return "something else, or a part of one: is the file whole?"
+    return "another kind of data, or a truncated file"

@@ -1,7 +1,7 @@
-"""Protobuf's text format cut into tokens that know their line and column.
+"""Splits protobuf's text format into tokens with their line and column.
 
-What a token is: https://protobuf.dev/reference/protobuf/textformat-spec/, and where that is stricter than the C++
-parser that Caffe uses (strings over several lines, a number glued to the next name), what the C++ parser takes.
+Tokens: https://protobuf.dev/reference/protobuf/textformat-spec/. Where that is stricter than the C++ parser of Caffe
+(strings over several lines, a number directly before a name), the rules of the C++ parser.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SIMPLE_ESCAPES = {"a": 7, "b": 8, "f": 12, "n": 10, "r": 13, "t": 9, "v": 11, "
 
 @dataclass(frozen=True)
 class Token:
-    """A token: its kind, its spelling, and where its first character stands in the text."""
+    """A token: its kind, its spelling, and the position of its first character in the text."""
 
     kind: str
     text: str
@@ -44,18 +44,18 @@ class Token:
 class Lexer:
     """The tokens of a text, one after the other, ending with one of kind END.
 
-    Bytes that were not UTF-8 are expected as ``surrogateescape`` leaves them; in comments they do no harm.
+    Bytes that are not UTF-8 must be decoded with ``surrogateescape``; in comments they are allowed.
     """
 
     def __init__(self, text: str, file: str) -> None:
-        """``file`` is the name that the tokens' places and the errors give."""
+        """``file`` is the file name in tokens' places and in errors."""
         self.text = text
         self.file = file
         self._long_strings: list[Token] = []
         self._lines = [0, *(m.end() for m in re.finditer("\n", text))]
 
     def __iter__(self) -> Iterator[Token]:
-        """Yield the tokens. Raises SpecError where the text has something that is none."""
+        """Yield the tokens. Raises SpecError for text that is not a token."""
         position, text = 0, self.text
         while position < len(text):
             match = _TOKEN.match(text, position)
@@ -76,9 +76,9 @@ class Lexer:
         return Where(self.file, line, start - self._lines[line - 1] + 1)
 
     def suspicion(self, start: int) -> str:
-        """Return what to say of a fault at a character right after a string over several lines, else nothing.
+        """Return a hint for an error at a character right after a string over several lines, else an empty string.
 
-        Where a closing quote is missing, the string runs on to the next opening one, and the fault is seen there.
+        If a closing quote is missing, the string continues to the next opening quote, and the error appears there.
         """
         for token in reversed(self._long_strings):
             end = token.start + len(token.text)
@@ -88,7 +88,7 @@ class Lexer:
         return ""
 
     def unquote(self, token: Token) -> bytes:
-        """Return what a STRING token stands for, escapes resolved."""
+        """Return the value of a STRING token, with escapes resolved."""
         inner = token.text[1:-1]
         offset = token.start + 1
         pieces: list[bytes] = []

@@ -1,8 +1,8 @@
-"""Protobuf's text format into a message, by reflection, with the place of everything that was read.
+"""Reads protobuf's text format into a message, by reflection, with the place of every part.
 
-What is accepted is what the C++ parser accepts that Caffe uses, so that a file which Caffe reads is read here, and one
-that it refuses is refused, in one line that says where and why. One word more belongs to the language: the
-``ceil_mode: true`` of a pooling_param, which so many forks write for ``round_mode: CEIL`` that no dialect need be on.
+It accepts what the C++ parser of Caffe accepts: a file that Caffe reads is read here, and a file that Caffe refuses is
+refused here, with one line that says where and why. One field is added: ``ceil_mode: true`` in a pooling_param, which
+many forks write for ``round_mode: CEIL``; it needs no dialect.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class _Reader:
             return
         if not field.repeated and field.present(message):
             first = children[alias][0].where.line
-            raise self._error(f'"{alias}" was given already, in line {first}; it can be given once', name)
+            raise self._error(f'"{alias}" was already given in line {first}; it can be given only once', name)
         nodes = children.setdefault(alias, [])
         if self._at(":"):
             self._next()
@@ -295,13 +295,13 @@ class _Reader:
         self.token = next(self._tokens)
         return token
 
-    # ---- Faults ----
+    # ---- Errors ----
 
     def _check_required(self, message: Message) -> None:
         for field in fields_of(message.DESCRIPTOR).values():
             if field.required and not field.present(message):
                 place = self._open[-1][1]
-                raise self._error(f'{message.DESCRIPTOR.name} lacks "{field.name}", which it requires', place)
+                raise self._error(f'{message.DESCRIPTOR.name} lacks the required field "{field.name}"', place)
 
     def _unclosed(self, name: str, place: Token, closing: str) -> SpecError:
         line = self.lexer.where(place.start).line

@@ -1,8 +1,8 @@
 """Caffe's messages as Python classes, in a descriptor pool of their own.
 
 The pool is private: another "caffe.proto" in the process (pycaffe's, a converter's) does not clash with this one, and
-no generated module ties netspec to one version of protobuf. ``caffe.desc`` is ``caffe.proto`` compiled; how, is said
-there; ``caffe_pb2.pyi`` is made with it and tells type checkers the fields.
+no generated module ties netspec to one version of protobuf. ``caffe.desc`` is the compiled ``caffe.proto``, which says
+how to compile it; ``caffe_pb2.pyi`` is made with it and gives the fields to type checkers.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _load() -> None:
     files.ParseFromString(Path(__file__).with_name("caffe.desc").read_bytes())
     for file in files.file:
         for declared in file.message_type:
-            # Numbers above Caffe's own are open for the fields of forks: as extensions they can come later, and do
+            # Numbers above Caffe's own are free for the fields of forks: as extensions they can be added later, and do
             # not change the classes below.
             declared.extension_range.add(start=max(f.number for f in declared.field) + 1, end=_LAST_NUMBER)
         add_file(file)
@@ -107,7 +107,7 @@ PHASE_NAMES = ("TRAIN", "TEST")
 
 @dataclass(frozen=True)
 class Field:
-    """A field as reading and writing text need it, Caffe's own or a fork's.
+    """A field, Caffe's own or a fork's, for reading and writing text.
 
     ``type`` is a FieldDescriptorProto.Type. ``descriptor`` is protobuf's, whose property for the label changed between
     its versions.
@@ -120,7 +120,7 @@ class Field:
     descriptor: Any
 
     def get(self, message: Message) -> Any:
-        """Return the value, its default where it is absent; of a repeated field, its list."""
+        """Return the value, or its default if it is absent; for a repeated field, its list."""
         return message.Extensions[self.descriptor] if self.descriptor.is_extension else getattr(message, self.name)
 
     def set(self, message: Message, value: Any) -> None:
@@ -131,7 +131,7 @@ class Field:
             setattr(message, self.name, value)
 
     def present(self, message: Message) -> bool:
-        """Say whether a value was given."""
+        """Return whether a value was given."""
         if self.repeated:
             return len(self.get(message)) > 0
         if self.descriptor.is_extension:
@@ -171,10 +171,10 @@ def _field(message: Message, name: str) -> Field:
 
 
 def value(message: Message, name: str) -> Any:
-    """Return the value of a field, its default where it is absent; ``name`` may be a field of an active dialect."""
+    """Return the value of a field, or its default if it is absent; ``name`` may be a field of an active dialect."""
     return _field(message, name).get(message)
 
 
 def has(message: Message, name: str) -> bool:
-    """Say whether a field was given; ``name`` may be a field of an active dialect."""
+    """Return whether a field was given; ``name`` may be a field of an active dialect."""
     return _field(message, name).present(message)

@@ -1,4 +1,4 @@
-"""Which line and column each part of a net came from; carried beside the NetParameter through every pass."""
+"""The line and column of each part of a net; passed along with the NetParameter through every pass."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from netspec.errors import Where
 
 @dataclass(frozen=True)
 class Place:
-    """Position of one message in its file and, by field name, of each of its fields' values, in order."""
+    """Position of one message in its file and, by field name, the positions of all values of its fields, in order."""
 
     where: Where
     fields: Mapping[str, tuple[Place, ...]] = field(default_factory=dict)
@@ -18,7 +18,7 @@ class Place:
     def find(self, *path: str | int) -> Where:
         """Return the place of ``path``, e.g. ``("convolution_param", "pad", 1)``, or of its nearest known ancestor.
 
-        A name steps to the first value of that field, an index after it to the value of that index.
+        A name selects the first value of that field, an index after it the value of that index.
         """
         node = self
         steps = list(path)
@@ -34,7 +34,7 @@ class Place:
 
 @dataclass(frozen=True)
 class SourceMap:
-    """``layers[i]`` says where layer ``i`` of the NetParameter beside it came from."""
+    """``layers[i]`` is the place of layer ``i`` of the NetParameter."""
 
     file: str
     net: Place
@@ -42,22 +42,22 @@ class SourceMap:
 
     @staticmethod
     def of(net: Place) -> SourceMap:
-        """Return the map of a net just read, whose layers are in ``layer``, or of an old one, in ``layers``."""
+        """Return the map of a net that was just read; its layers are in ``layer``, or in ``layers`` (old format)."""
         return SourceMap(net.where.file, net, (*net.fields.get("layer", ()), *net.fields.get("layers", ())))
 
     @staticmethod
     def unknown(file: str, count: int) -> SourceMap:
-        """A map for a net that did not come from text (a binary file, a message made in Python)."""
+        """Return a map for a net that was not read from text (a binary file, a message made in Python)."""
         node = Place(Where(file))
         return SourceMap(file, node, (node,) * count)
 
     def as_net(self) -> Place:
-        """Return the places of the net with those of its layers as they are now; see :meth:`of`."""
+        """Return the places of the net with those of its current layers; see :meth:`of`."""
         others = {name: nodes for name, nodes in self.net.fields.items() if name not in ("layer", "layers")}
         return replace(self.net, fields={**others, "layer": self.layers})
 
     def at(self, index: int, *path: str | int, layer: str = "", type: str = "") -> Where:
-        """Return the place of a field of layer ``index``, labelled with the layer's name and type."""
+        """Return the place of a field of layer ``index``, labeled with the layer's name and type."""
         return replace(self.layers[index].find(*path), layer=layer, type=type)
 
     def with_layers(self, layers: Iterable[Place]) -> SourceMap:

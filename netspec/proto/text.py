@@ -1,4 +1,4 @@
-"""The doors of this room: text files in, upgraded messages and the places of their parts out; messages as text."""
+"""The functions to read text files into upgraded messages, with the places of their parts, and to write text."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def parse_solver_text(
 
 
 def _text_of(path: str | Path) -> str:
-    """Return a file's text without a byte-order mark; bytes that are not UTF-8 are left for the lexer to judge."""
+    """Return a file's text without a byte-order mark; the lexer checks bytes that are not UTF-8."""
     try:
         data = Path(path).read_bytes()
     except OSError as fault:

@@ -1,4 +1,4 @@
-"""A message as text, the way Caffe prints one into its log (protobuf C++ DebugString)."""
+"""A message as text, as Caffe prints it in its log (DebugString of protobuf for C++)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ESCAPES = {9: "\\t", 10: "\\n", 13: "\\r", 34: '\\"', 39: "\\'", 92: "\\\\"}
 
 
 def write_text(message: Message) -> str:
-    """Return a message as protobuf text: a line a field, in the order of their numbers, nested ones indented by two."""
+    """Return a message as protobuf text: one line per field, in the order of field numbers, indented by two spaces."""
     lines: list[str] = []
     _write(message, "", lines)
     return "".join(f"{line}\n" for line in lines)
@@ -47,7 +47,7 @@ def _scalar(field: Field, value: Any) -> str:
 
 
 def _shortest(value: float, digits: int, all_digits: int, kind: str) -> str:
-    """Print with few digits if that reads back as the same value, else with enough for any value."""
+    """Print with few digits if they give the same value when read, else with enough digits for any value."""
     text = f"{value:.{digits}g}"
     same = struct.unpack(kind, struct.pack(kind, float(text)))[0] == value
     return text if same or value != value else f"{value:.{all_digits}g}"

@@ -42,7 +42,7 @@ def stop() -> None:
 
 
 def init_log(level: int | None = None, stderr: bool = True) -> None:
-    """Show the log from ``level`` on: 0 (INFO) to 3 (FATAL)."""
+    """Show the log from ``level`` on: 0 (INFO) to 3 (FATAL); it goes to stderr, whatever ``stderr`` says."""
     if level is not None:
         _set_level(level)
 

@@ -87,7 +87,7 @@ class Net:
         self._blob_names = list(passes.names)
         self._blobs = list(passes.blobs)
         self.blobs: Named[Blob] = Named("blob", zip(passes.names, passes.blobs, strict=True))
-        self.layers = [
+        self.layers: list[Any] = [
             layer.code if isinstance(layer, Python) else Layer(layer.type, blobs)
             for layer, blobs in zip(net.layers, passes.params, strict=True)
         ]
@@ -205,7 +205,7 @@ class Net:
             ):
                 for name, array in made.items():
                     found[name].extend(array.copy())
-        return _without_padding(data, inputs), _without_padding(grads, inputs)
+        return _without_padding(data, arrays), _without_padding(grads, arrays)
 
     def _batch(self, arrays: Mapping[str, Any]) -> Iterator[Arrays]:
         """Yield the arrays batch by batch."""
@@ -313,7 +313,9 @@ def _older_form(network_file: FilePath, weights: FilePath, phase: int | None) ->
     return phase, weights, 0
 
 
-def _without_padding(found: Mapping[str, list[np.ndarray]], inputs: Mapping[str, Any]) -> Arrays:
+def _without_padding(found: Mapping[str, list[np.ndarray]], given: Mapping[str, Any]) -> Arrays:
     """Return whole arrays, without the items that filled up the last batch."""
-    count = len(next(iter(inputs.values())))
-    return {name: np.asarray(rows)[:count] for name, rows in found.items()}
+    if not given:
+        raise ValueError("no arrays were given to run the net on")
+    padding = len(next(iter(found.values()), [])) - len(next(iter(given.values())))
+    return {name: np.asarray(rows)[: -padding or None] for name, rows in found.items()}

@@ -145,6 +145,7 @@ class Solver:
 
     def restore(self, state_file: str | Path) -> None:
         """Go on from a .solverstate, and from its weights."""
+        self.net.passes.upload()
         self._training.restore(state_file)
 
     def snapshot(self) -> None:

@@ -66,7 +66,8 @@ class CaffeFinder(importlib.abc.MetaPathFinder):
         found = None if self.shadow else real_caffe()
         if found is None:
             return ModuleSpec(NAME, _Alias(HOME), is_package=True)
-        print(f"netspec: the Caffe that is installed at {found} is used, not netspec's", file=sys.stderr)
+        advice = "netspec run --shadow-caffe uses netspec's"
+        print(f"netspec: the Caffe that is installed at {found} is used; {advice}", file=sys.stderr)
         return None
 
 

@@ -1,1 +1,1 @@
-"""Training: the rate of an iteration, the update rules, the loop, and the files it can go on from."""
+"""Training: learning rates, update rules, the training loop, and the files to resume from."""

@@ -1,4 +1,4 @@
-"""What is refused before anything is built: settings that Caffe dies of, some of them only after days of training."""
+"""Checks of a solver's settings before anything is built. In Caffe some of these errors appear only after days."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NOT_NEGATIVE = ("max_iter", "display", "test_interval", "snapshot")
 
 
 def check_settings(param: Any, node: Place, report: Report = raise_fault) -> None:
-    """Report every fault of the solver's own settings; the nets have theirs."""
+    """Report every error in the solver's own settings; its nets are checked separately."""
     for fault in (*rule_faults(param, node), *policy_faults(param, node)):
         report(fault)
     if param.regularization_type not in REGULARIZATIONS:
@@ -45,9 +45,9 @@ def fields_without_effect(param: Any, node: Place) -> Iterator[str]:
 
 
 def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_it: bool = True) -> None:
-    """Report a snapshot_prefix that cannot be written to.
+    """Report a snapshot_prefix that is not writable.
 
-    The file system is asked, and then, with ``try_it``, written to (Caffe: CheckSnapshotWritePermissions).
+    The permissions are checked; with ``try_it`` a file is also written (Caffe: CheckSnapshotWritePermissions).
     """
     probe = Path(f"{param.snapshot_prefix}_iter_0.tempfile")
     reason = why_unwritable(probe)

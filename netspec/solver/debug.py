@@ -1,4 +1,4 @@
-"""``debug_info``: how large every blob and gradient of a net is, as it runs.
+"""``debug_info``: the magnitude of every blob and gradient of a net during a run.
 
 Caffe: Net::ForwardDebugInfo, Net::BackwardDebugInfo, Net::Backward (src/caffe/net.cpp)
 """
@@ -19,9 +19,9 @@ from netspec.net.net import Net
 
 @contextmanager
 def debug_info(net: Net) -> Iterator[None]:
-    """Log the mean absolute values of what passes forward within the block, and at its end of what came back.
+    """Log the mean absolute values of the blobs of forward passes within the block and, at its end, of the gradients.
 
-    Of a parameter that layers share, each of them shows the sum of all their gradients; Caffe shows the sum so far.
+    For a shared parameter each layer shows the sum of all gradients; Caffe shows the sum so far.
     """
     diffs: dict[tuple[int, int], torch.Tensor] = {}
     hooks = [layer.register_forward_hook(partial(_forward, net, i, diffs)) for i, layer in enumerate(net.layers)]

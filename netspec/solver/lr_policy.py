@@ -1,4 +1,4 @@
-"""The learning rate of an iteration: nothing but a function of the solver's parameters, the iteration and the step.
+"""The learning rate of an iteration: a function of the solver's parameters, the iteration and the step.
 
 Caffe: SGDSolver::GetLearningRate (src/caffe/solvers/sgd_solver.cpp:27)
 """
@@ -21,14 +21,14 @@ Rate = Callable[[Any, int, int], Any]
 
 @dataclass(frozen=True)
 class Policy:
-    """``rate(param, iteration, step)``, and the fields of SolverParameter without which it means nothing."""
+    """``rate(param, iteration, step)``, and the fields of SolverParameter that it requires."""
 
     needs: tuple[str, ...]
     rate: Rate
 
 
 def _power(base: float, exponent: float) -> np.float64:
-    return np.power(np.float64(base), np.float64(exponent))  # inf and nan where Python's ** would raise
+    return np.power(np.float64(base), np.float64(exponent))  # inf and nan, for which Python's ** raises an error
 
 
 def _powf(base: np.float32, exponent: float) -> float:
@@ -51,10 +51,10 @@ POLICIES: dict[str, Policy] = {
 
 
 def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
-    """Yield a SpecError for an unknown policy, or for each field that it needs and lacks.
+    """Yield a SpecError for an unknown policy, or for each required field that is missing.
 
-    Caffe refuses a stepsize of 0 and a negative gamma only when it comes to them, and lets a forgotten gamma or
-    max_iter make the rate 0 or infinite.
+    Caffe detects a stepsize of 0 and a negative gamma only when it uses them; with a missing gamma or max_iter its rate
+    becomes 0 or infinite.
     """
     policy = POLICIES.get(param.lr_policy)
     if policy is None:
@@ -74,9 +74,9 @@ def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
 
 
 def next_step(param: Any, iteration: int, step: int) -> int:
-    """Return the step that iteration ``iteration`` runs in, ``step`` being that of the iteration before.
+    """Return the step of iteration ``iteration``; ``step`` is that of the iteration before.
 
-    multistep goes up by at most one an iteration, however many stepvalues were passed (sgd_solver.cpp:46).
+    multistep increases by at most one per iteration, even if several stepvalues were passed (sgd_solver.cpp:46).
     """
     if param.lr_policy == "step":
         return iteration // param.stepsize
@@ -86,9 +86,9 @@ def next_step(param: Any, iteration: int, step: int) -> int:
 
 
 def learning_rate(param: Any, iteration: int, step: int) -> float:
-    """Return the rate of an iteration in a step, rounded to float32 as Caffe's.
+    """Return the rate of an iteration in a step, rounded to float32 as in Caffe.
 
-    Raises SpecError where the rate is not a number, as poly's is beyond max_iter.
+    Raises SpecError if the rate is not a number, as for poly beyond max_iter.
     """
     with np.errstate(all="ignore"):
         rate = float(np.float32(POLICIES[param.lr_policy].rate(param, iteration, step)))

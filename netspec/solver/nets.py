@@ -1,4 +1,4 @@
-"""Which nets a solver trains and tests, each in its state.
+"""The nets that a solver trains and tests, each in its state.
 
 Caffe: Solver::InitTrainNet, Solver::InitTestNets (src/caffe/solver.cpp)
 """
@@ -18,13 +18,13 @@ from netspec.proto.text import parse_net
 
 TRAIN_NET = "train net"
 TRAIN_FIELDS = ("net", "net_param", "train_net", "train_net_param")
-_GENERIC = ("net_param", "net")  # they serve for training and, as often as test_iter says, for testing
+_GENERIC = ("net_param", "net")  # used for training, and for one test net per further test_iter
 _Found = tuple[str, NetParameter, SourceMap]
 
 
 @dataclass(frozen=True)
 class SolverNet:
-    """A net of a solver, not yet filtered: its ``state`` is set. ``origin`` is its source as Caffe words it."""
+    """A net of a solver, not yet filtered: its ``state`` is set. ``origin`` describes its source in Caffe's words."""
 
     label: str
     origin: str
@@ -33,12 +33,12 @@ class SolverNet:
 
 
 def seed_of(seed: int, label: str) -> int:
-    """Return the seed of one of a solver's nets: no two draw alike, and the training net has the solver's own."""
+    """Return the seed of one of a solver's nets: all differ, and the training net has the solver's own."""
     return seed if label == TRAIN_NET else derived(seed, label)
 
 
 def solver_nets(param: SolverParameter, node: Place, report: Report = raise_fault) -> list[SolverNet]:
-    """Return the training net and the test nets; a file is read once, however many nets it holds.
+    """Return the training net and the test nets; a file is read once, even if it is used for several nets.
 
     The test nets are in Caffe's order: each test_net_param, each test_net, then the general net for every further
     test_iter. ``report`` gets a SpecError for all that the solver does not say clearly and for each file that cannot be
@@ -49,7 +49,7 @@ def solver_nets(param: SolverParameter, node: Place, report: Report = raise_faul
     names = [name for name in TRAIN_FIELDS if param.HasField(name)]
     expected = f"expected exactly one of {', '.join(TRAIN_FIELDS)}"
     if not names:
-        report(SpecError(f"the solver names no net to train, {expected}", node.where))
+        report(SpecError(f"the solver has no net to train, {expected}", node.where))
     if len(names) > 1:
         report(SpecError(f"found {' and '.join(names)}, {expected}", node.find(names[1])))
     found = [read(name) for name in names]
@@ -70,7 +70,7 @@ def _test_nets(param: SolverParameter, node: Place, read: _Reader, report: Repor
     found = [read(name, i) for name in ("test_net_param", "test_net") for i in range(len(getattr(param, name)))]
     general = next((name for name in _GENERIC if param.HasField(name)), None)
     missing = len(param.test_iter) - len(found)
-    a_net_is_named = any(param.HasField(name) for name in TRAIN_FIELDS)  # else that is the fault
+    a_net_is_named = any(param.HasField(name) for name in TRAIN_FIELDS)  # otherwise that is the error
     if missing < 0 or (missing > 0 and general is None and a_net_is_named):
         expected = f"{len(found)}, one for each test_net and test_net_param" + (" (or more)" if general else "")
         report(SpecError(f"found {len(param.test_iter)} test_iter, expected {expected}", node.find("test_iter")))
@@ -86,9 +86,9 @@ def _test_nets(param: SolverParameter, node: Place, read: _Reader, report: Repor
 
 
 class _Reader:
-    """Reads the net that a field of the solver holds or names: where it came from, the net and its map.
+    """Reads the net that a field of the solver contains or names: its origin, the net and its map.
 
-    None where it cannot be read, which is reported once.
+    None if it cannot be read, which is reported once.
     """
 
     def __init__(self, param: SolverParameter, node: Place, report: Report) -> None:

@@ -1,7 +1,7 @@
-"""Copies of the training net on further devices: each runs its share of the records, the root does the update.
+"""Copies of the training net on further devices: each runs its share of the records, the root updates.
 
-So the batch of an iteration is batch_size records a device, and the gradient the mean of the devices' own.
-BatchNorm's statistics stay each device's own during a run; the root's are tested and saved.
+So an iteration uses batch_size records per device, and the gradient is the mean over the devices.
+Each device has its own BatchNorm statistics during a run; those of the root are tested and saved.
 
 Caffe: src/caffe/parallel.cpp (NCCL: all-reduce of the gradients, scaled by 1 / solver_count)
 """
@@ -23,11 +23,11 @@ class Replicas:
 
     @torch.no_grad()
     def begin(self) -> None:
-        """Give every replica the root's parameters, BatchNorm's statistics too."""
+        """Copy the root's parameters, including BatchNorm's statistics, to every replica."""
         self._copy(everything=True)
 
     def backward(self) -> None:
-        """Add the gradients of one pass to each replica's own. Nothing waits for a device: they work together."""
+        """Add the gradients of one pass to each replica's own. The devices run in parallel."""
         losses = [net.forward_loss()[0] for net in self.nets]
         for loss in losses:
             if loss.requires_grad:
@@ -44,23 +44,23 @@ class Replicas:
             own.parameter.grad /= 1 + len(theirs)
 
     def clear(self) -> None:
-        """Forget the gradients of the last iteration."""
+        """Clear the gradients of the last iteration."""
         for net in self.nets:
             for learnable in net.learnable:
                 learnable.parameter.grad = None
 
     @torch.no_grad()
     def update(self) -> None:
-        """Give every replica the weights that the root has learned."""
+        """Copy the root's learned weights to every replica."""
         self._copy(everything=False)
 
     def restart_data(self) -> None:
-        """Make every replica begin at its first record again."""
+        """Make every replica start again at its first record."""
         for net in self.nets:
             net.restart_data()
 
     def close(self) -> None:
-        """Let go of files and threads."""
+        """Close files and stop threads."""
         for net in self.nets:
             net.close()
 

@@ -1,4 +1,4 @@
-"""What a training goes on from: .solverstate in Caffe's binary form, and its HDF5 form in files that end in ``.h5``.
+"""The state to resume a training from: .solverstate in Caffe's binary format, or in HDF5 (files that end in ``.h5``).
 
 Caffe: SGDSolver::SnapshotSolverState, RestoreSolverState (src/caffe/solvers/sgd_solver.cpp)
 """
@@ -22,11 +22,11 @@ from netspec.whole_file import whole_file
 
 @dataclass(frozen=True)
 class State:
-    """Where a training stands.
+    """The state of a training.
 
-    ``history`` has one float32 array a learnable parameter, in the net's order; the second set of Adam and AdaDelta
-    follows the first. ``iteration`` counts updates done. ``learned_net`` is the path of the weights as it was written,
-    relative to the working directory of that run.
+    ``history`` has one float32 array per learnable parameter, in the net's order; the second set of Adam and AdaDelta
+    follows the first. ``iteration`` is the number of updates done. ``learned_net`` is the path of the weights as in
+    the file, relative to the working directory of that run.
     """
 
     iteration: int
@@ -78,7 +78,7 @@ def merge_shared(history: list[np.ndarray], owners: Sequence[int]) -> list[np.nd
 
 
 def write_state(path: str | Path, state: State) -> None:
-    """Write the state, whole or not at all. Raises SpecError where it cannot be written."""
+    """Write the state atomically. Raises SpecError if it cannot be written."""
     with whole_file(path) as unfinished:
         if str(path).endswith(".h5"):
             _write_hdf5(unfinished, state)
@@ -89,7 +89,7 @@ def write_state(path: str | Path, state: State) -> None:
 
 
 def find_learned_net(state: State, path: str | Path) -> Path | None:
-    """Return the file of the state's weights: as written, else beside the state; None where the state names none."""
+    """Return the file of the state's weights: as written, else beside the state; None if the state has no weights."""
     if not state.learned_net:
         return None
     written = Path(state.learned_net)

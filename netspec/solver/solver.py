@@ -56,7 +56,7 @@ def load_solver(
     exact: str = SMALL,
     strict: bool = False,
 ) -> Solver:
-    """Make the solver of a prototxt, its nets built and ready to step.
+    """Build the solver of a prototxt and its nets, ready to run.
 
     ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
     ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
@@ -96,28 +96,28 @@ def load_solver(
 
 
 def choose_device(param: Any, node: Place) -> torch.device:
-    """Return the device that solver_mode and device_id ask for; the CPU, with a warning, where there is no GPU."""
+    """Return the device set by solver_mode and device_id; the CPU, with a warning, if there is no GPU."""
     if param.solver_mode == SolverParameter.SolverMode.Value("CPU"):
         return torch.device("cpu")
     count = torch.cuda.device_count()
     if not count:
         place = node.find("solver_mode")
-        log.warning("caffe.cpp:197", f"{place}: solver_mode GPU, but torch finds no GPU here: running on the CPU")
+        log.warning("caffe.cpp:197", f"{place}: solver_mode GPU, but torch finds no GPU: running on the CPU")
         return torch.device("cpu")
     if not 0 <= param.device_id < count:
         raise SpecError(
-            f"found device_id {param.device_id}, but torch finds {count} GPU(s) here", node.find("device_id")
+            f"found device_id {param.device_id}, but torch finds {count} GPU(s) on this machine", node.find("device_id")
         )
     return torch.device("cuda", param.device_id)
 
 
 class Solver:
-    """A training: the net it trains, the nets it tests, and where it stands.
+    """A training: the training net, the test nets, and its state.
 
-    ``iteration`` counts the updates done; ``net`` is the training net, ``test_nets`` the others; ``scores`` has, for
-    each test net, the mean of every output element of its last test. ``on_start()`` is called before each iteration's
-    passes, ``on_gradients()`` between them and the update, ``on_iteration()`` after it; ``on_test(i)`` after test net i
-    was run, ``on_snapshot(model)`` after weights and state were written, with the path
+    ``iteration`` is the number of updates done; ``net`` is the training net, ``test_nets`` the others; ``scores`` has,
+    for each test net, the mean of each output element in its last test. ``on_start()`` is called before the passes of
+    each iteration, ``on_gradients()`` between them and the update, ``on_iteration()`` after it; ``on_test(i)`` after
+    test net i was run, ``on_snapshot(model)`` after weights and state were written, with the path
     of the weights.
     """
 
@@ -135,12 +135,11 @@ class Solver:
         action: Callable[[], str | None] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """Build the nets of a solver as ``proto.text.parse_solver`` returns it; raise SpecError for what is wrong.
+        """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError.
 
-        ``device`` overrides solver_mode and device_id; on ``others`` run replicas of the training net. ``seed`` stands
-        in for a random_seed that is not given; without it one is drawn. ``action`` is
-        asked between iterations, also those of a test: "stop" ends the training, "snapshot" takes one. ``clock`` gives
-        the seconds behind "iter/s".
+        ``device`` overrides solver_mode and device_id; replicas of the training net run on ``others``. ``seed`` is used
+        if there is no random_seed; without it one is drawn. ``action`` is called between iterations, also those of a
+        test: "stop" ends the training, "snapshot" takes one. ``clock`` gives the seconds for "iter/s".
         """
         node = node or Place(Where("<solver>"))
         log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
@@ -179,7 +178,7 @@ class Solver:
         log.info(site, sentence.format(train.origin))
         ranks = 1 + len(others)
         self.net = self._build(train, train.label, self._device, 0, ranks)
-        with log.silent():  # Caffe tells of the root only
+        with log.silent():  # Caffe logs only the root
             replicas = [self._build(train, f"rank {k}", other, k, ranks) for k, other in enumerate(others, 1)]
         self.replicas = Replicas(self.net, replicas)
         self.test_nets: list[Net] = []
@@ -196,7 +195,7 @@ class Solver:
     def _build(self, described: nets.SolverNet, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> Net:
         """Build a net and load the weights to start from.
 
-        Each ``role`` has random draws of its own, but for the records: those that train side by side share their order.
+        Each ``role`` has its own random numbers, except for the records: nets that train in parallel share their order.
         """
         options = BuildOptions(
             device,
@@ -223,11 +222,11 @@ class Solver:
 
     @property
     def learning_rate(self) -> float:
-        """The rate of the iteration to come."""
+        """The rate of the next iteration."""
         return learning_rate(self.param, self.iteration, next_step(self.param, self.iteration, self.current_step))
 
     def solve(self) -> None:
-        """Train up to max_iter, then show the loss and test once more where the settings say so."""
+        """Train up to max_iter, then show the loss and test once more if the settings require it."""
         log.info("solver.cpp:289", f"Solving {self.net.name}")
         log.info("solver.cpp:290", f"Learning Rate Policy: {self.param.lr_policy}")
         if self.param.snapshot_after_train:
@@ -247,9 +246,9 @@ class Solver:
         log.info("solver.cpp:332", "Optimization Done.")
 
     def step(self, iterations: int) -> None:
-        """Run some iterations. The window of the averaged loss begins anew.
+        """Run some iterations. The window of the averaged loss starts again.
 
-        Raises SpecError where a net has inputs, which nobody would fill.
+        Raises SpecError if a net has inputs: a solver cannot fill them.
         """
         self.check_inputs()
         self.stopped = False
@@ -301,7 +300,7 @@ class Solver:
         return float(total / np.float32(self.param.iter_size)), outputs
 
     def clear_gradients(self) -> None:
-        """Begin the sum of an iteration's gradients anew."""
+        """Clear the gradients, before an iteration sums them up."""
         for learnable in self.net.learnable:
             learnable.parameter.grad = None
 
@@ -317,12 +316,12 @@ class Solver:
         return net.forward_loss()
 
     def debugged(self, net: Net) -> AbstractContextManager[None]:
-        """Log the passes within, as ``debug_info`` asks for."""
+        """Log the passes within the block, as for ``debug_info``."""
         return debug_info(net)
 
     @torch.no_grad()
     def apply_update(self) -> None:
-        """Move the weights and count the iteration; the gradients then hold what was subtracted, as in Caffe."""
+        """Update the weights and count the iteration; the gradients then contain the subtracted values, as in Caffe."""
         rate = self._advance_rate()
         if self._is_due(self.param.display):
             log.info("sgd_solver.cpp:112", f"Iteration {self.iteration}, lr = {log.number(rate)}")
@@ -365,7 +364,7 @@ class Solver:
     # Testing
 
     def test_all(self) -> None:
-        """Run every test net, each over its test_iter batches, with the present weights."""
+        """Run every test net for its test_iter batches with the current weights."""
         self.scores = [{} for _ in self.test_nets]
         for i in range(len(self.test_nets)):
             if not self.stopped:
@@ -393,12 +392,12 @@ class Solver:
         _log_scores("solver.cpp:414", "Test", self.scores[i], net.output_loss_weights)
         self.on_test(i)
 
-    # Going on later
+    # Snapshot and restore
 
     def snapshot(self) -> tuple[str, str]:
         """Write the weights and the state; return their paths, ``PREFIX_iter_N.caffemodel`` and ``.solverstate``.
 
-        With ``snapshot_format: HDF5`` both end in ``.h5``. Raises SpecError where they cannot be written.
+        With ``snapshot_format: HDF5`` both end in ``.h5``. Raises SpecError if they cannot be written.
         """
         hdf5 = self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5")
         form, ending = ("HDF5", ".h5") if hdf5 else ("binary proto", "")
@@ -414,9 +413,9 @@ class Solver:
         return model, state
 
     def restore(self, path: str | Path) -> None:
-        """Go on from a .solverstate or .solverstate.h5, Caffe's or ours, and from its weights.
+        """Resume from a .solverstate or .solverstate.h5, of Caffe or of netspec, and from its weights.
 
-        As in Caffe the data layers begin again at their first record. Raises SpecError, and changes nothing, where the
+        As in Caffe the data layers start again at their first record. Raises SpecError, and changes nothing, if the
         state does not fit this solver's type and net.
         """
         where = Where(str(path))
@@ -460,7 +459,7 @@ class Solver:
         return replace(state, history=merge_shared(state.history, owners))
 
     def close(self) -> None:
-        """Let go of the files and threads of all nets."""
+        """Close the files and stop the threads of all nets."""
         for net in (self.net, *self.test_nets):
             net.close()
         self.replicas.close()
@@ -472,5 +471,5 @@ def _log_scores(site: str, phase: str, scores: Outputs, weights: dict[str, float
 
 
 def _same_shape(mine: tuple[int, ...], theirs: tuple[int, ...]) -> bool:
-    """Say whether two shapes are equal, or theirs is one of the old ones of four axes, filled up with ones in front."""
+    """Return whether two shapes are equal, or theirs is an old shape of four axes, with ones in front."""
     return theirs == mine or theirs == (1,) * (4 - len(mine)) + mine

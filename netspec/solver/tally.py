@@ -1,4 +1,4 @@
-"""What a test says: the mean of every output element over its batches, and how Caffe prints it.
+"""The result of a test: the mean of every output element over its batches, and how Caffe prints it.
 
 Caffe: Solver::Test (src/caffe/solver.cpp), test() (tools/caffe.cpp)
 """
@@ -49,7 +49,7 @@ def as_scores(outputs: Mapping[str, torch.Tensor]) -> Outputs:
 
 
 def score_lines(scores: Outputs, weights: Mapping[str, float]) -> Iterator[str]:
-    """Yield ``name = value`` of each element, with its part of the loss where its output has a loss weight."""
+    """Yield ``name = value`` of each element, with its contribution to the loss if its output has a loss weight."""
     for name, values in scores.items():
         weight = weights[name]
         for value in values:

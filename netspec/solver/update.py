@@ -1,6 +1,6 @@
 """How gradients become new weights: one rule for each of Caffe's solver types, on lists of tensors.
 
-Caffe lets a solver overwrite the gradients step by step until they hold what is subtracted from the weights; so here.
+As in Caffe, a solver overwrites the gradients step by step until they contain what is subtracted from the weights.
 The lists are in the order of the net's learnable parameters. ``torch._foreach_*`` does the same to each tensor of a
 list; on a GPU in one kernel.
 
@@ -27,9 +27,9 @@ Tensors = list[torch.Tensor] | tuple[torch.Tensor, ...]
 
 
 def clip(diffs: Tensors, limit: float) -> tuple[float, float] | None:
-    """Scale all gradients so that their common L2 norm is ``limit``, where it is more (SGDSolver::ClipGradients).
+    """Scale all gradients so that their common L2 norm is at most ``limit`` (SGDSolver::ClipGradients).
 
-    Returns the norm and the factor where it acted. A negative limit is none.
+    Returns the norm and the factor if it scaled. A negative limit means no limit.
     """
     if limit < 0 or not diffs:
         return None
@@ -42,7 +42,7 @@ def clip(diffs: Tensors, limit: float) -> tuple[float, float] | None:
 
 
 def normalize(diffs: Tensors, iter_size: int) -> None:
-    """Make the gradients that ``iter_size`` passes have summed up their mean (SGDSolver::Normalize)."""
+    """Divide the gradients, summed over ``iter_size`` passes, to get their mean (SGDSolver::Normalize)."""
     if iter_size != 1:
         torch._foreach_mul_(diffs, 1 / iter_size)
 
@@ -58,7 +58,7 @@ def regularize(diffs: Tensors, weights: Tensors, decays: Sequence[float], kind: 
 
 
 def subtract(weights: Tensors, diffs: Tensors) -> None:
-    """Move the weights (Net::Update)."""
+    """Update the weights (Net::Update)."""
     torch._foreach_sub_(weights, diffs)
 
 
@@ -69,9 +69,9 @@ Compute = Callable[[Any, Tensors, Sequence[float], Tensors, int], None]
 class Rule:
     """A solver type.
 
-    ``compute(param, diffs, rates, history, iteration)`` turns gradients into what is subtracted from the weights
-    (Caffe: ComputeUpdateValue) and updates the history. ``rates`` has the learning rate of each parameter, its lr_mult
-    included. ``sets`` is how many values the history holds for each weight: the second set follows the first.
+    ``compute(param, diffs, rates, history, iteration)`` turns gradients into the values to subtract from the weights
+    (Caffe: ComputeUpdateValue) and updates the history. ``rates`` has the learning rate of each parameter, with its
+    lr_mult. ``sets`` is the number of history values per weight: the second set follows the first.
     """
 
     compute: Compute
@@ -80,13 +80,13 @@ class Rule:
 
 
 def sgd(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
-    """Momentum with the rate inside the history: after a step of the rate the old velocity keeps its old rate."""
+    """Momentum with the rate inside the history: after the rate changes, the old velocity keeps its old rate."""
     _accelerate(diffs, rates, history, param.momentum)
     torch._foreach_copy_(diffs, history)
 
 
 def nesterov(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
-    """(1 + momentum) h(t) - momentum h(t-1), h being the history of :func:`sgd`."""
+    """(1 + momentum) h(t) - momentum h(t-1), where h is the history of :func:`sgd`."""
     before = torch._foreach_mul(history, -param.momentum)
     _accelerate(diffs, rates, history, param.momentum)
     torch._foreach_copy_(diffs, before)
@@ -94,7 +94,7 @@ def nesterov(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensor
 
 
 def adagrad(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
-    """Rate g / (sqrt(sum of g^2) + delta): delta outside the root."""
+    """Rate g / (sqrt(sum of g^2) + delta): delta is outside the root."""
     torch._foreach_add_(history, _powers(diffs, 2))
     _divide_by_root(diffs, history, param.delta)
     torch._foreach_mul_(diffs, rates)
@@ -141,12 +141,12 @@ RULES: dict[str, Rule] = {
 
 
 def find_rule(type_name: str) -> Rule | None:
-    """Return the rule of a solver's ``type``, in any case of letters; None where there is none of that name."""
+    """Return the rule of a solver's ``type``, in upper or lower case; None if the type is unknown."""
     return {name.lower(): rule for name, rule in RULES.items()}.get(type_name.lower())
 
 
 def rule_faults(param: Any, node: Place) -> Iterator[SpecError]:
-    """Yield what the constructors of Caffe's solvers refuse."""
+    """Yield the errors that the constructors of Caffe's solvers detect."""
     rule = find_rule(param.type)
     if rule is None:
         message = f'unknown solver type "{param.type}", expected one of {", ".join(RULES)}'

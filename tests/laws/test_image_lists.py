@@ -1,4 +1,4 @@
-"""The two wings, which may not import each other, read folders and lists of images by one rule: docs/images.md."""
+"""netspec and loopclosure, which may not import each other, read images by one rule: docs/images.md."""
 
 from pathlib import Path
 from typing import Any
@@ -68,9 +68,9 @@ FOUND: dict[str, tuple[dict[str, str], str, list[str], list[float] | None]] = {
         ["../a.png", "./b.png"], None),
 }  # fmt: skip
 REFUSED: dict[str, tuple[dict[str, str], str, str]] = {
-    "a folder without images": ({"notes.txt": ""}, "here", "here: holds no image; expected files that end in .png, "),
-    "an empty list": ({"l.txt": "# nothing\n\n"}, "l.txt", "l.txt: lists no image"),
-    "an empty rgb.txt": ({"here/rgb.txt": "", "here/a.png": ""}, "here", "here/rgb.txt: lists no image"),
+    "a folder without images": ({"notes.txt": ""}, "here", "here: contains no images; expected files that end in "),
+    "an empty list": ({"l.txt": "# nothing\n\n"}, "l.txt", "l.txt: lists no images"),
+    "an empty rgb.txt": ({"here/rgb.txt": "", "here/a.png": ""}, "here", "here/rgb.txt: lists no images"),
     "a missing image": (
         {"l.txt": "a.png\n  gone.png\n", "a.png": ""}, "l.txt", 'l.txt:2:3: no such image "gone.png" in .'),
     "a missing image with all else": (

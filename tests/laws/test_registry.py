@@ -12,12 +12,12 @@ import pytest
 import torch
 from google.protobuf import text_format
 
+from fake_gpu import NAME, POSSIBLE, fake_gpu
 from netspec.errors import SpecError, Where
 from netspec.layers import Context, Layer, Random, layer_class, layer_types
 from netspec.layers.data.memory import MemoryData
 from netspec.proto.schema import TEST, TRAIN, LayerParameter, PhaseValue
 from paths import GOLDEN
-from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 Shape = tuple[int, ...]
 MAPS = (2, 4, 5, 6)
@@ -264,7 +264,7 @@ def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
     assert torch.autograd.gradcheck(compute, (*bottoms, *learned))
 
 
-@pytest.mark.skipif(not POSSIBLE, reason="this torch cannot pretend a GPU")
+@pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
 @pytest.mark.parametrize("name", [name for name in TYPES if name != "Python"])  # whose code sees numpy arrays
 def test_computes_on_the_gpu_what_it_computes_on_the_cpu(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
@@ -273,7 +273,7 @@ def test_computes_on_the_gpu_what_it_computes_on_the_cpu(
     example = EXAMPLES[name]
     found = []
     for device in ("cpu", NAME):
-        with pretended_gpu():
+        with fake_gpu():
             layer = build(name, folder, example.shapes, device)
             if isinstance(layer, MemoryData):
                 layer.set_input_arrays(np.zeros((4, 3, 4, 5)), np.zeros(4))

@@ -1,4 +1,4 @@
-"""What must never erode: the walls between the rooms, and that light imports stay light."""
+"""The rules for imports between packages, and light imports that must stay light."""
 
 import importlib
 import subprocess

@@ -100,7 +100,7 @@ def test_warped_and_joined(walks: Path, tmp_path: Path) -> None:
         (["pairs", "{0}/nowhere", "--out", "{1}"], "no such folder"),
         (["pairs", "{0}/walk_1", "--out", "{1}", "--train", "3"], "even, not 3"),
         (["pairs", "{0}/walk_1", "--out", "{1}", "--train", "100000"], "--at-most"),
-        (["pairs", "--folders", "{0}/walk_1", "{1}", "--out", "{1}"], "holds no image"),
+        (["pairs", "--folders", "{0}/walk_1", "{1}", "--out", "{1}"], "contains no images"),
         (["pairs", "--table", "{1}/none.csv", "--out", "{1}"], "cannot be read"),
         (["sheet", "{1}/none.txt", "{1}/x.png"], "cannot be read"),
         (["walk", "{0}"], "holds a sequence already"),

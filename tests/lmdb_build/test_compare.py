@@ -130,7 +130,7 @@ def test_what_is_wrong_is_one_line(
 ) -> None:
     absent = "sgd_step/ref: no snapshot of this net; train it first (without --no-train)"
     assert fault(capfd, "--no-train") == absent
-    twice = 'sgd_step/train_val.prototxt: found a second net named "sgd_step"; give each a name of its own'
+    twice = 'sgd_step/train_val.prototxt: found a second net named "sgd_step"; give each net its own name'
     assert fault(capfd, SOLVER) == twice
     edited("base_lr", "base_rl")
     assert 'SolverParameter has no field "base_rl"' in fault(capfd)

@@ -132,7 +132,7 @@ def test_a_pair_is_stacked_along_the_channels(tmp_path: Path, pair_list: str) ->
         assert (array[3:] == image(f"{b}.png").transpose(2, 0, 1)).all()
 
 
-def test_grey_pairs_have_two_channels_and_any_size(tmp_path: Path, pair_list: str) -> None:
+def test_gray_pairs_have_two_channels_and_any_size(tmp_path: Path, pair_list: str) -> None:
     flags = ["--gray=true", "--resize_width", "10", "--resize_height=12", "-nocheck_size", "-backend", "lmdb"]
     assert convert_pairs_lmdb([PNG, *flags, pair_list, f"{tmp_path}/db"]) == 0
     expected = [cv2.resize(image(f"{n}.png", cv2.IMREAD_GRAYSCALE), (10, 12)) for n in (0, 1)]
@@ -158,7 +158,7 @@ def test_encode_type_alone_means_encoded(tmp_path: Path, pair_list: str) -> None
     assert (datum.channels, datum.height, datum.width) == (3, 48, 64)
 
 
-def test_grey_encoded_images_are_grey(tmp_path: Path) -> None:  # Caffe stores the colour file as it is
+def test_gray_encoded_images_are_gray(tmp_path: Path) -> None:  # Caffe stores the color file as it is
     assert convert_imageset(["-gray", "-encoded", PNG, str(GOLDEN / "list.txt"), f"{tmp_path}/db"]) == 0
     assert [array.shape for _, array, _ in pairs_in(tmp_path / "db")] == [(1, 48, 64)] * 6
 
@@ -205,13 +205,13 @@ def test_a_missing_image_is_named_with_its_line(
     [
         ("text.png 0.png 1", [], 'l:1:1: image "{root}/text.png" cannot be decoded as an image'),
         ("text.png 0.png 1", ["-encoded"], 'l:1:1: image "{root}/text.png" cannot be decoded as an image'),
-        ("0.png small.png 1", [], "give -resize_width and -resize_height"),
+        ("0.png small.png 1", [], "set -resize_width and -resize_height"),
         (
             "0.png 0.png 1\nsmall.png small.png 1",
             ["-check_size"],
-            'l:2:1: "small.png" gives 6 x 5 x 5, the first line 6 x',
+            'l:2:1: "small.png" gives 6 x 5 x 5, but the first line gives 6 x',
         ),
-        ("0.png 0 1", ["-encoded"], 'l:1:1: image "{root}/0" has no ending that tells its format; give -encode_type'),
+        ("0.png 0 1", ["-encoded"], 'l:1:1: image "{root}/0" has no extension that gives its format; set -encode_type'),
         ("0.png 0.png 1", ["-encode_type=abc"], 'cannot be encoded as "abc"'),
         ("0.png 1.png", [], "l:1:1: found '0.png 1.png', expected two images and a label"),
         ("0.png 1.png 2", [], "a label is 1 (same place) or 0 (other places)"),
@@ -246,7 +246,7 @@ def test_a_missing_list_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_an_existing_database_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str], pair_list: str) -> None:
     (tmp_path / "db").mkdir()
-    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, pair_list], "exists already")
+    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, pair_list], "already exists")
 
 
 @pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def test_both_kinds_of_lists_raise_one_kind_of_error(tmp_path: Path, read: objec
         read(f"{tmp_path}/nowhere")
 
 
-# compute_image_mean, and the doors
+# compute_image_mean, and the scripts in tools/
 
 
 def test_the_mean_image_and_its_log_are_caffes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -290,7 +290,7 @@ def test_the_mean_image_and_its_log_are_caffes(tmp_path: Path, capsys: pytest.Ca
 
 def test_the_mean_of_a_missing_database_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute_image_mean([f"{tmp_path}/nix"]) == 1
-    assert capsys.readouterr().err.startswith(f'{tmp_path}/nix: database "{tmp_path}/nix" is not there')
+    assert capsys.readouterr().err.startswith(f'{tmp_path}/nix: database "{tmp_path}/nix" does not exist')
 
 
 @pytest.mark.slow

@@ -60,10 +60,10 @@ def test_negatives_are_other_places_of_the_batch() -> None:
     ("settings", "words"),
     [
         ({"size": 100}, "a batch of 100 different places cannot be made: the 5 runs gave 3[0-5]; lower --size"),
-        ({"size": 0}, "--size is at least 1, not 0"),
+        ({"size": 0}, "--size must be at least 1, not 0"),
         ({"apart": 1.0, "max_gap": 2.0}, "--apart 1 is less than --max-gap 2"),
-        ({"other": 1.5}, "--other is 0 to 1"),
-        ({"negatives": -0.5}, "--negatives is 0 to 1"),
+        ({"other": 1.5}, "--other must be 0 to 1"),
+        ({"negatives": -0.5}, "--negatives must be 0 to 1"),
         ({"size": 10, "negatives": 0.1}, "is one pair; expected none or two"),
     ],
 )

@@ -145,7 +145,7 @@ def test_the_logger_is_left_as_it_was() -> None:
 
 
 class Fault(ValueError):
-    """Another wing's error."""
+    """The error of another package."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Nets and solvers on a GPU: on a pretended one, which shows what is left on the wrong device."""
+"""Nets and solvers on a GPU: on a fake GPU, which shows what is on the wrong device."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -7,23 +7,23 @@ import numpy as np
 import pytest
 import torch
 
+from fake_gpu import NAME, POSSIBLE, FakeTensor, fake_gpu
 from netspec.features.describer import Describer
 from netspec.solver.solver import load_solver
-from pretend_gpu import NAME, POSSIBLE, PretendTensor, pretended_gpu
 
-pytestmark = pytest.mark.skipif(not POSSIBLE, reason="this torch cannot pretend a GPU")
+pytestmark = pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
 
 
 @pytest.fixture(autouse=True)
 def _gpu() -> Iterator[None]:
-    with pretended_gpu():
+    with fake_gpu():
         yield
 
 
-def test_a_pretended_gpu_refuses_what_a_gpu_refuses() -> None:
+def test_a_fake_gpu_refuses_what_a_gpu_refuses() -> None:
     x = torch.ones(2, 3, device=NAME)
     assert x.device == torch.device(NAME, 0)
-    assert isinstance(x, PretendTensor)
+    assert isinstance(x, FakeTensor)
     for wrong in (lambda: x + torch.ones(3), lambda: x @ torch.ones(3, 2), lambda: torch.cat([x, torch.ones(2, 3)])):
         with pytest.raises(RuntimeError, match="expected all tensors on one device"):
             wrong()

@@ -1,4 +1,4 @@
-"""The doors in tools/ find a Python that has what they need, or say in one line what to run."""
+"""The scripts in tools/ find a Python with the required packages, or say in one line what to run."""
 
 import os
 import shutil
@@ -30,7 +30,7 @@ def bare_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """The doors and the packages in a folder without ``.venv``."""
+    """The scripts and the packages in a folder without ``.venv``."""
     folder = tmp_path / "project"
     shutil.copytree(ROOT / "tools", folder / "tools")
     for package in ("netspec", "loopclosure", "lmdb_build"):

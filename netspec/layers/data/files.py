@@ -60,7 +60,7 @@ class ReadingLayer(Layer):
         if p.batch_size <= 0:
             yield self.error(f"batch_size must be above 0, found {p.batch_size}", self.group, "batch_size")
         if not p.source:
-            yield self.error("source is missing: where is the data?", self.group, "source")
+            yield self.error("source is missing; set it to the path of the data", self.group, "source")
 
     @override
     def construct(self) -> None:
@@ -104,8 +104,8 @@ class ReadingLayer(Layer):
 
     def shape_wanted(self, blob: str, example: str) -> SpecError:
         """Return the error that asks for the shape of a top."""
-        advice = f"say --shape {blob}={example}, or --data"
-        return self.error(f'the shape of "{blob}" is known by its data only; {advice}', "top")
+        advice = f"give --shape {blob}={example}, or --data"
+        return self.error(f'the shape of "{blob}" is known only from its data; {advice}', "top")
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -128,7 +128,7 @@ class ReadingLayer(Layer):
         return self._feed.position if self._feed else 0
 
     def keys(self, iteration: int) -> list[str]:
-        """Return the keys (or file names) of the records of an iteration, one a row of the tops."""
+        """Return the keys (or file names) of the records of an iteration, one per row of the tops."""
         return self.source.keys(iteration)
 
     @override
@@ -177,7 +177,7 @@ class ReadingLayer(Layer):
         if rand_skip:
             log.info("image_data_layer.cpp:70", f"Skipping first {skip} data points.")
         if skip >= count:
-            raise self.error(f"not enough records to skip {skip} of them (rand_skip): there are {count}", *path)
+            raise self.error(f"cannot skip {skip} records (rand_skip): there are only {count}", *path)
         return skip
 
     def log_size(self, source: Source, site: str) -> None:
@@ -188,7 +188,7 @@ class ReadingLayer(Layer):
 def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:
     """Make a batch, in whatever thread; page-locked where it goes to a GPU, so that the copy need not wait.
 
-    It knows nothing of the layer, so that a layer nobody needs any more goes at once, and its threads with it.
+    It has no reference to the layer, so that an unused layer is deleted at once, and its threads are stopped.
     """
     tops = tuple(torch.from_numpy(array) for array in source.batch(iteration)[:num_tops])
     return tuple(top.pin_memory() if pinned else top for top in tops), source.cursor.wraps(iteration)
@@ -310,7 +310,7 @@ class HDF5Data(ReadingLayer):
         """Yield what is wrong with hdf5_data_param; there is no transform_param."""
         yield from super().wrong_settings()
         if self.param.HasField("transform_param"):
-            yield self.error("HDF5Data does not transform data; take transform_param away", "transform_param")
+            yield self.error("HDF5Data does not transform data; remove transform_param", "transform_param")
 
     @override
     def open(self) -> Source | None:
@@ -398,7 +398,7 @@ class HDF5Output(Layer):
         name = self.param.hdf5_output_param.file_name
         place = ("hdf5_output_param", "file_name")
         if not name:
-            raise self.error("file_name is missing: where shall the results go?", *place)
+            raise self.error("file_name is missing; set it to the path of the results", *place)
         if reason := why_unwritable(name):
             raise self.error(f'HDF5 file "{name}" cannot be written: {reason}', *place)
         self._sink = None
@@ -413,7 +413,7 @@ class HDF5Output(Layer):
         if max(len(data), len(label)) > 4:
             raise self.error(f"found shapes {data} and {label}; at most 4 axes can be saved", "bottom")
         if data[:1] != label[:1]:
-            raise self.error(f"data has {data[:1]} rows, label {label[:1]}; expected as many", "bottom")
+            raise self.error(f"data has {data[:1]} rows and label {label[:1]}; expected the same number", "bottom")
         return ()
 
     @override

@@ -24,7 +24,7 @@ T = TypeVar("T")
 class Input(Layer):
     """Name blobs that the caller fills: ``net(data=array)``.
 
-    top[i]  the shape given for it; one shape may stand for all tops; the caller's own wins (``check --shape``)
+    top[i]  the shape given for it; one shape may be used for all tops; ``check --shape`` overrides it
     Caffe: src/caffe/layers/input_layer.cpp
     """
 
@@ -39,7 +39,7 @@ class Input(Layer):
         if not shapes and all(top in given for top in self.param.top):
             shapes = [given[top] for top in self.param.top]
         if len(shapes) not in (1, self.num_tops):
-            raise self.error(f"found {len(shapes)} shapes, expected 1 or one a top ({self.num_tops})", "input_param")
+            raise self.error(f"found {len(shapes)} shapes, expected 1 or one per top ({self.num_tops})", "input_param")
         shapes = shapes * self.num_tops if len(shapes) == 1 else shapes
         self.shapes = [given.get(top, shape) for top, shape in zip(self.param.top, shapes, strict=True)]
 
@@ -50,8 +50,8 @@ class Input(Layer):
     @override
     def missing_input(self) -> SpecError:
         blobs = " and ".join(f'"{top}"' for top in self.param.top)
-        advice = "a layer that reads data (Data, ImageData, HDF5Data, ...) must make them"
-        return self.error(f"nothing fills {blobs} while a solver runs; {advice}")
+        advice = "use a layer that reads data (Data, ImageData, HDF5Data, ...)"
+        return self.error(f"nothing fills {blobs} during training; {advice}")
 
     @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -127,7 +127,7 @@ class DummyData(Layer):
 
     def _one_a_top(self, values: list[T], field: str) -> list[T]:
         if len(values) not in (1, self.num_tops):
-            message = f"found {len(values)} {field}, expected 1 or one a top ({self.num_tops})"
+            message = f"found {len(values)} {field}, expected 1 or one per top ({self.num_tops})"
             raise self.error(message, "dummy_data_param", field)
         return values * self.num_tops if len(values) == 1 else values
 
@@ -149,7 +149,7 @@ class DummyData(Layer):
 
 @register("MemoryData", "memory_data_param", "transform_param")
 class MemoryData(Layer):
-    """Hand out arrays that the program gives with ``set_input_arrays``, batch after batch, over and over.
+    """Return arrays that the program gives with ``set_input_arrays``, batch after batch, over and over.
 
     top[0]  images (batch_size, channels, height, width)
     top[1]  labels (batch_size,)

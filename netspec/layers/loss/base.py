@@ -67,7 +67,7 @@ class Classified(Layer):
         if math.prod(labels) != self.outer * self.inner:
             raise self.error(
                 f"found {math.prod(labels)} labels, shape {labels}, for {self.outer * self.inner} predictions, shape "
-                f"{scores}; expected one label (0 to {self.classes - 1}) a prediction along axis {axis}",
+                f"{scores}; expected one label (0 to {self.classes - 1}) per prediction along axis {axis}",
                 "bottom",
                 1,
             )

@@ -1,4 +1,4 @@
-"""Losses, and Accuracy. Each returns its plain value: whoever sums the losses applies loss_weight.
+"""Losses, and Accuracy. Each returns its plain value: the net applies loss_weight when it sums the losses.
 
 Caffe: include/caffe/layers/loss_layer.hpp
 """
@@ -57,7 +57,7 @@ class SoftmaxLoss(Loss, Classified):
         return shapes[: self.num_tops]
 
     def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
-        """Return the normalised sum of the losses (outer, inner) that count."""
+        """Return the normalized sum of the losses (outer, inner) that count."""
         if valid is not None:
             losses = losses.where(valid, 0)
         return total(losses, exact) / normalizer(self.normalization, self.outer, self.inner, valid)
@@ -87,14 +87,14 @@ class _NegativeLogOfSoftmax(torch.autograd.Function):
 
 @register("SoftmaxWithLoss", "loss_param", "softmax_param")
 class SoftmaxWithLoss(SoftmaxLoss):
-    """-log(softmax(scores)[label]), summed and normalised.
+    """-log(softmax(scores)[label]), summed and normalized.
 
     The logarithm is taken of no less than FLT_MIN, so one prediction costs 87.34 at most; its label's gradient is p - 1
     all the same. Real Caffe refuses a second top unless loss_weight is written twice; here it needs nothing. As in
     Caffe no gradient comes from it.
 
     bottom[0]  scores (N, C, ...), C at softmax_param.axis
-    bottom[1]  labels, one a prediction, (N,), (N, 1, ...) or (N, ...)
+    bottom[1]  labels, one per prediction, (N,), (N, 1, ...) or (N, ...)
     top[0]     the loss, ()
     top[1]     optional: the softmax, bottom[0]'s shape
     Caffe: src/caffe/layers/softmax_loss_layer.cpp
@@ -102,7 +102,7 @@ class SoftmaxWithLoss(SoftmaxLoss):
 
     @override
     def setup(self) -> None:
-        """Read the ignored label and the normalisation (default VALID)."""
+        """Read the ignored label and the normalization (default VALID)."""
         self.ignore_label = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, VALID)
 
@@ -147,12 +147,12 @@ class SoftmaxWithLoss(SoftmaxLoss):
 
 @register("InfogainLoss", "infogain_loss_param", "loss_param")
 class InfogainLoss(SoftmaxLoss):
-    """-sum over classes of H[label, class] log(softmax(scores)[class]), summed and normalised.
+    """-sum over classes of H[label, class] log(softmax(scores)[class]), summed and normalized.
 
     The logarithm is taken of no less than 1e-20; the gradient takes no notice of that.
 
     bottom[0]  scores (N, C, ...), C at infogain_loss_param.axis
-    bottom[1]  labels, one a prediction
+    bottom[1]  labels, one per prediction
     bottom[2]  optional: the matrix H, C x C numbers in any shape; without it a BlobProto file is read (source)
     top[0]     the loss, ()
     top[1]     optional: the softmax, bottom[0]'s shape, without gradient
@@ -165,7 +165,7 @@ class InfogainLoss(SoftmaxLoss):
 
     @override
     def setup(self) -> None:
-        """Read the ignored label, the normalisation (default VALID) and, without a third bottom, the matrix."""
+        """Read the ignored label, the normalization (default VALID) and, without a third bottom, the matrix."""
         loss_param, source = self.param.loss_param, self.param.infogain_loss_param.source
         if loss_param.HasField("normalize"):
             message = "InfogainLoss does not take the old field normalize; use normalization"
@@ -333,7 +333,7 @@ class HingeLoss(Loss, Classified):
 
 @register("SigmoidCrossEntropyLoss", "loss_param", "sigmoid_param")
 class SigmoidCrossEntropyLoss(Loss):
-    """Cross entropy of sigmoid(x) and targets of any value, summed and normalised (default BATCH_SIZE).
+    """Cross entropy of sigmoid(x) and targets of any value, summed and normalized (default BATCH_SIZE).
 
     bottom[0]  x (N, ...)
     bottom[1]  targets, as many; those that cast to loss_param.ignore_label are left out
@@ -400,7 +400,7 @@ class EuclideanLoss(Loss):
     """The sum of (a - b)^2 / (2 N).
 
     bottom[0]  a (N, ...)
-    bottom[1]  b, as many numbers an item; gets a gradient too
+    bottom[1]  b, as many values per item; gets a gradient too
     top[0]     the loss, ()
     Caffe: src/caffe/layers/euclidean_loss_layer.cpp
     """
@@ -412,7 +412,7 @@ class EuclideanLoss(Loss):
         shapes = super().reshape(bottom_shapes)
         a, b = bottom_shapes
         if math.prod(a[1:]) != math.prod(b[1:]):
-            raise self.error(f"found bottoms of shapes {a} and {b}, expected as many numbers an item", "bottom")
+            raise self.error(f"found bottoms of shapes {a} and {b}, expected as many values per item", "bottom")
         return shapes
 
     @override
@@ -491,7 +491,7 @@ class ContrastiveLoss(Loss):
         if a[1] != b[1]:
             raise self.error(f"found bottoms of shapes {a} and {b}, expected the same number of channels", "bottom", 1)
         if label[:1] != a[:1] or math.prod(label[1:]) != 1:
-            raise self.error(f"found labels of shape {label}, expected one a pair: ({a[0]},)", "bottom", 2)
+            raise self.error(f"found labels of shape {label}, expected one per pair: ({a[0]},)", "bottom", 2)
         return shapes
 
     @override
@@ -530,7 +530,7 @@ class Accuracy(Classified):
     It is 0 where every label is ignored. No gradient.
 
     bottom[0]  scores (N, C, ...), C at accuracy_param.axis
-    bottom[1]  labels, one a prediction
+    bottom[1]  labels, one per prediction
     top[0]     the accuracy, ()
     top[1]     optional: the accuracy of each class, (C,); 0 for a class that does not occur
     Caffe: src/caffe/layers/accuracy_layer.cpp

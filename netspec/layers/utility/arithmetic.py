@@ -1,4 +1,4 @@
-"""Utilities that compute: arithmetic between blobs and over axes; and the blob that stands by itself."""
+"""Arithmetic between blobs and over axes; and a learnable blob without bottoms."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Eltwise(Layer):
         self.operation: int = p.operation
         self.coeff: list[float] = list(p.coeff) or [1.0] * len(self.bottom_shapes)
         if len(self.coeff) != len(self.bottom_shapes):
-            message = f"found {len(self.coeff)} coeff, expected none or one a bottom blob ({len(self.bottom_shapes)})"
+            message = f"found {len(self.coeff)} coeff, expected none or one per bottom blob ({len(self.bottom_shapes)})"
             raise self.error(message, "eltwise_param", "coeff")
         if p.coeff and self.operation == self.PROD:
-            raise self.error("found coeff in a product, expected it for SUM only", "eltwise_param", "coeff")
+            raise self.error("found coeff for PROD, expected it for SUM only", "eltwise_param", "coeff")
         if self.operation == self.MAX:
             self.ignores = frozenset({"eltwise_param.coeff"})
 
@@ -50,7 +50,7 @@ class Eltwise(Layer):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         for i, shape in enumerate(bottom_shapes):
             if shape != bottom_shapes[0]:
-                message = f"found bottoms of shapes {bottom_shapes[0]} and {shape}, expected equal ones"
+                message = f"found bottoms of shapes {bottom_shapes[0]} and {shape}, expected equal shapes"
                 raise self.error(message, "bottom", i)
         return bottom_shapes[:1]
 

@@ -232,7 +232,7 @@ class Blob:
         """Take another shape, at once; the values stay where they are, those of memory that has to grow are 0."""
         axes = tuple(operator.index(size) for size in shape)
         if min(axes, default=0) < 0:
-            raise ValueError(f"Check failed: shape[i] >= 0: found shape {axes}, expected no size below 0")
+            raise ValueError(f"Check failed: shape[i] >= 0: found shape {axes}, expected no negative size")
         if len(axes) > MOST_AXES:
             raise ValueError(f"Check failed: shape.size() <= kMaxBlobAxes ({len(axes)} vs. {MOST_AXES})")
         self._shape = axes

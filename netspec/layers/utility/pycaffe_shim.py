@@ -38,7 +38,7 @@ class Layer:
 
 
 def __getattr__(name: str) -> NoReturn:
-    raise AttributeError(f"netspec's stand-in for pycaffe has no {name}; it offers Layer, TRAIN and TEST")
+    raise AttributeError(f"netspec's replacement for pycaffe has no {name}; it has Layer, TRAIN and TEST")
 
 
 _offered: dict[str, ModuleType] = {"caffe": sys.modules[__name__]}  # the modules that ``import caffe...`` gives

@@ -59,7 +59,7 @@ class Python(Layer):
             return
         if not self.context.allow_python:
             raise self.error(
-                "a Python layer runs code that the prototxt names; pass --allow-python-layers where you trust it",
+                "a Python layer runs code named in the prototxt; pass --allow-python-layers if you trust it",
                 "type",
             )
         names = list(self.param.bottom)
@@ -127,13 +127,13 @@ class Python(Layer):
         except Exception as fault:
             raise self.error(f"{p.module}.{p.layer}: {_describe(fault)}", "python_param", "layer") from fault
         if not hasattr(code, "blobs"):
-            raise self.error(f"{p.module}.{p.layer} is no caffe.Layer", "python_param", "layer")
+            raise self.error(f"{p.module}.{p.layer} is not a caffe.Layer", "python_param", "layer")
         code.param_str = code.param_str_ = p.param_str  # the second is the name of 2014
         code.phase = self.phase
         return code
 
     def _call(self, method: str, *arguments: Any) -> None:
-        """Call a method of the code; whatever it raises is a fault of the user's file."""
+        """Call a method of the code; anything it raises is an error in the user's file."""
         p = self.param.python_param
         try:
             with importable():

@@ -1,4 +1,4 @@
-"""Utilities that move numbers and compute none: shapes, parts, copies, rows."""
+"""Utilities that only move values: shapes, parts, copies, rows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
 
 @register("Flatten", "flatten_param")
 class Flatten(Layer):
-    """Make one axis of the axes from axis (default 1) to end_axis (default the last).
+    """Join the axes from axis (default 1) to end_axis (default the last) into one.
 
     bottom[0]  any shape
     top[0]     the same numbers, shape[:axis] + (product,) + shape[end_axis + 1:]
@@ -141,7 +141,7 @@ class Concat(Layer):
         for i, shape in enumerate(bottom_shapes):
             others = zip(first[:axis] + first[axis + 1 :], shape[:axis] + shape[axis + 1 :], strict=False)
             if len(shape) != len(first) or any(a != b for a, b in others):
-                message = f"found bottoms of shapes {first} and {shape}, expected equal ones but for axis {axis}"
+                message = f"found bottoms of shapes {first} and {shape}, expected equal shapes except along axis {axis}"
                 raise self.error(message, "bottom", i)
         return [(*first[:axis], sum(shape[axis] for shape in bottom_shapes), *first[axis + 1 :])]
 
@@ -187,7 +187,7 @@ class Slice(Layer):
                 raise self.error(message, "slice_param", "slice_point")
             self.sizes = [end - start for start, end in zip([0, *points], [*points, size], strict=True)]
             if min(self.sizes) <= 0:
-                expected = f"rising ones above 0 and below {size}, the size of axis {axis}"
+                expected = f"increasing values above 0 and below {size}, the size of axis {axis}"
                 message = f"found slice_point {points} for a bottom of shape {shape}, expected {expected}"
                 raise self.error(message, "slice_param", "slice_point")
         elif size % self.num_tops:
@@ -230,7 +230,7 @@ class Slice(Layer):
 
 @register("Split")
 class Split(Layer):
-    """Hand the bottom to several layers; their gradients add up. Nets insert it by themselves.
+    """Give the bottom to several layers; their gradients are added. Nets insert it automatically.
 
     bottom[0]  any shape
     top[i]     the bottom
@@ -247,7 +247,7 @@ class Split(Layer):
 
     @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return one tensor a top, so that each has a gradient of its own."""
+        """Return one tensor per top, so that each has its own gradient."""
         if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
@@ -355,17 +355,19 @@ class Filter(Layer):
     def setup(self) -> None:
         filtered = len(self.bottom_shapes) - 1
         if self.num_tops != filtered:
-            message = f"found {self.num_tops} top blob(s), expected {filtered}: one a bottom but for the selector"
+            message = f"found {self.num_tops} top blob(s), expected {filtered}: one per bottom except the selector"
             raise self.error(message, "top")
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         *data, selector = bottom_shapes
         if math.prod(selector[1:]) != 1:
-            raise self.error(f"found a selector of shape {selector}, expected one number an item", "bottom", len(data))
+            raise self.error(f"found a selector of shape {selector}, expected one number per item", "bottom", len(data))
         for i, shape in enumerate(data):
             if shape[:1] != selector[:1]:
-                message = f"found a bottom of shape {shape} and a selector of shape {selector}, expected as many items"
+                message = (
+                    f"found a bottom of shape {shape} and a selector of shape {selector}, expected equally many items"
+                )
                 raise self.error(message, "bottom", i)
         return data
 

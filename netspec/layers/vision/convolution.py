@@ -1,4 +1,4 @@
-"""Layers that slide a filter over a map, and Crop, which brings two maps to one size afterwards."""
+"""Layers that slide a filter over a map, and Crop, which cuts a map to the size of another."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _by(sizes: Shape) -> str:
 
 
 class _SlidingFilter(Layer):
-    """Base of the layers described by a ConvolutionParameter: the filter's geometry, one number a spatial axis."""
+    """Base of the layers described by a ConvolutionParameter: the filter's geometry, one number per spatial axis."""
 
     kernel: Shape
     stride: Shape
@@ -74,7 +74,7 @@ class _SlidingFilter(Layer):
     def slide(self, shape: Shape) -> Shape:
         """Return how often the filter fits, along each spatial axis of a bottom of ``shape``."""
         axes = zip(shape[self.channel_axis + 1 :], self.pad, self.extent, self.stride, strict=True)
-        # C++ rounds a quotient towards zero: a filter too long by less than a stride still fits once, over zeros.
+        # C++ rounds a quotient toward zero: a filter too long by less than a stride still fits once, over zeros.
         fits = tuple(int((size + 2 * p - e) / s) + 1 for size, p, e, s in axes)
         self.check_output(fits, shape)
         return fits
@@ -93,7 +93,7 @@ class _SlidingFilter(Layer):
         shape = bottom_shapes[0]
         if len(shape) != self.channel_axis + 1 + self.spatial_axes or shape[self.channel_axis] != channels:
             raise self.error(
-                f"bottom of shape {shape} does not suit the filters, made for {channels} channels at axis "
+                f"bottom of shape {shape} does not fit the filters, made for {channels} channels at axis "
                 f"{self.channel_axis} and {self.spatial_axes} spatial axes",
                 "bottom",
             )
@@ -160,7 +160,7 @@ class Convolution(_SlidingFilter):
         self.read_geometry()
         if self.spatial_axes > 3:
             raise self.error(
-                f"{self.type} of {self.spatial_axes} spatial axes is not supported, 3 are the most", "bottom"
+                f"{self.type} of {self.spatial_axes} spatial axes is not supported, at most 3 are", "bottom"
             )
         param = self.param.convolution_param
         self.channels = self.bottom_shapes[0][self.channel_axis]

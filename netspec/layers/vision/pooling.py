@@ -154,7 +154,7 @@ class _PoolingBase(Layer):
     def check_pad(self, windows: Windows, method: int, field: str) -> None:
         """Refuse padding as Caffe does: as long as the kernel, or for another method than MAX and AVE."""
         if any(windows.pad) and method == STOCHASTIC:
-            raise self.error("STOCHASTIC pooling knows no padding", field)
+            raise self.error("STOCHASTIC pooling does not support padding", field)
         if any(p and p >= k for p, k in zip(windows.pad, windows.kernel, strict=True)):
             raise self.error(f"pad {windows.pad} must be less than the kernel {windows.kernel}", field)
 
@@ -268,7 +268,7 @@ class Pooling(_PoolingBase):
         self.stride = self._pair("stride", "stride_h", "stride_w", least=1)
         self.pad = self._pair("pad", "pad_h", "pad_w", least=0)
         if param.global_pooling and (self.pad != (0, 0) or self.stride != (1, 1)):
-            raise self.error("global_pooling goes with pad 0 and stride 1 only", "pooling_param", "global_pooling")
+            raise self.error("global_pooling requires pad 0 and stride 1", "pooling_param", "global_pooling")
 
     def _pair(self, name: str, name_h: str, name_w: str, least: int) -> Pair:
         param, field = self.param.pooling_param, "pooling_param"

@@ -1,7 +1,7 @@
-"""The language of .proto files, as far as Caffe's schema and those of its forks use it, into descriptors.
+"""Parses the .proto language, as far as Caffe's schema and those of its forks use it, into descriptors.
 
 Messages, enums in them or beside them, optional, repeated and required fields with ``default`` and ``packed``, and
-``extend``. protoc does the same and more; this reader is for the additions of forks, which arrive at run time.
+``extend``. protoc does the same and more; this parser is for the additions of forks, which are added at run time.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _INTEGERS = {_SCALARS[name] for name in ("int64", "uint64", "int32", "uint32")}
 
 
 def read_declarations(source: str, file: str, package: str) -> FileDescriptorProto:
-    """Return the descriptor of a .proto source; ``package`` is what it is in unless it says itself.
+    """Return the descriptor of a .proto source; ``package`` is its default package.
 
-    Types are left as written, for a descriptor pool to resolve. Raises SpecError for what is not of this language.
+    Types are kept as written, for a descriptor pool to resolve. Raises SpecError for a syntax error.
     """
     return _Declarations(source, file).read(package)
 
@@ -145,7 +145,7 @@ class _Declarations:
         self._take(";")
 
     def _default(self, kind: int, value: str) -> str:
-        """Return a default as descriptors have it: strings without quotes, integers in decimal."""
+        """Return a default value as in descriptors: strings without quotes, integers in decimal."""
         if value.startswith('"'):
             return value[1:-1]
         return str(int(value, 0)) if kind in _INTEGERS and value.lower().startswith(("0x", "-0x")) else value

@@ -1,7 +1,7 @@
-"""Where the files of dialects are, and what they declare; to know that, none of them is run.
+"""The files of dialects, and their declarations, which are read without running the files.
 
-``DECLARATIONS`` and the types of the layers are read from a file's syntax (how one is written: netspec/dialects), so
-that a hint about a dialect needs neither torch nor trust in what else is installed.
+``DECLARATIONS`` and the types of the layers are read from a file's syntax (how to write one: netspec/dialects), so
+that a hint about a dialect needs neither torch nor the execution of installed code.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name 
 
 @dataclass(frozen=True)
 class DialectFile:
-    """A file that was not read yet. ``module`` is the name that Python imports it by, "" for one given by its path."""
+    """A file that was not read yet. ``module`` is its name for Python's import, "" for a file given by its path."""
 
     name: str
     path: Path
@@ -40,10 +40,10 @@ def known_files() -> dict[str, DialectFile]:
         module = point.value.partition(":")[0].strip()
         try:
             spec = find_spec(module)
-        except Exception:  # whatever another package does when it is imported, it must not hide the user's own fault
+        except Exception:  # an error in another package's import must not hide the user's own error
             spec = None
         if spec is None or spec.origin is None:
-            log.logger.warning(f'dialect "{point.name}": there is no module {module}; it is left out')
+            log.logger.warning(f'dialect "{point.name}": there is no module {module}; the dialect is ignored')
         else:
             found[point.name] = DialectFile(point.name, Path(spec.origin), module)
     for folder, package in FOLDERS:
@@ -59,13 +59,14 @@ def find_file(name: str | Path) -> DialectFile:
         return DialectFile(re.sub(r"\W", "_", path.stem), path)
     files = known_files()
     if str(name) not in files:
-        close = did_you_mean(str(name), list(files)) or f"; known ones: {', '.join(files)}, or the path of a .py file"
-        raise SpecError(f'there is no dialect "{name}"{close}')
+        known = f"; expected one of: {', '.join(files)}, or the path of a .py file"
+        close = did_you_mean(str(name), list(files)) or known
+        raise SpecError(f'unknown dialect "{name}"{close}')
     return files[str(name)]
 
 
 def read_dialect(file: DialectFile) -> Dialect:
-    """Return what a file declares. Raises SpecError where it cannot be read or declares nothing."""
+    """Return what a file declares. Raises SpecError if it cannot be read or declares nothing."""
     try:
         text = file.path.read_text("utf-8")
         tree = ast.parse(text)
@@ -73,7 +74,7 @@ def read_dialect(file: DialectFile) -> Dialect:
         raise SpecError(f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(str(file.path))) from None
     except SyntaxError as fault:
         place = Where(str(file.path), fault.lineno or 0, fault.offset or 0)
-        raise SpecError(f"this is not Python: {fault.msg}", place) from None
+        raise SpecError(f"this is not valid Python: {fault.msg}", place) from None
     source = ""
     for node in tree.body:
         if isinstance(node, ast.Assign) and any(_name(target) == "DECLARATIONS" for target in node.targets):
@@ -90,7 +91,7 @@ def read_dialect(file: DialectFile) -> Dialect:
 
 
 def _registered_types(tree: ast.Module) -> Iterator[str]:
-    """Yield the types under which new layers are registered, not those put in the place of Caffe's."""
+    """Yield the types under which new layers are registered, not those that replace Caffe's."""
     for call in ast.walk(tree):
         if isinstance(call, ast.Call) and _name(call.func) == "register" and call.args:
             first = call.args[0]
@@ -105,12 +106,12 @@ def _name(node: ast.expr) -> str:
 
 @cache
 def announce_known() -> None:
-    """Make every dialect that can be found known, so that errors name it; once, when the first error asks for it.
+    """Announce every dialect that can be found, so that errors can name it; once, when the first error needs it.
 
-    A file that cannot be read is left out with a warning.
+    A file that cannot be read is ignored with a warning.
     """
     for file in known_files().values():
         try:
             announce(read_dialect(file))
         except SpecError as fault:
-            log.logger.warning(f'dialect "{file.name}" is left out: {fault}')
+            log.logger.warning(f'dialect "{file.name}" is ignored: {fault}')

@@ -1,6 +1,6 @@
-"""Folders whose .py files are dialects, as (folder, package): whoever has one adds it; the language knows none itself.
+"""Folders whose .py files are dialects, as (folder, package); packages add their own.
 
-Without an import, so that it costs nothing to add one.
+This module imports nothing, so that adding a folder is fast.
 """
 
 FOLDERS: list[tuple[str, str]] = []

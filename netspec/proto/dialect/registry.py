@@ -1,7 +1,7 @@
 """The dialects of Caffe's forks: their messages and fields, added to the schema while a dialect is active.
 
-A dialect writes its additions down in the language of caffe.proto: new messages as they stand in the fork's own file,
-and new fields of Caffe's messages in ``extend``::
+A dialect declares its additions in the language of caffe.proto: new messages as in the fork's own file, and new
+fields of Caffe's messages in ``extend``::
 
     message NormalizeParameter {
       optional bool across_spatial = 1 [default = true];
@@ -10,10 +10,10 @@ and new fields of Caffe's messages in ``extend``::
       optional NormalizeParameter norm_param = 206;
     }
 
-The text reader and writer then take ``norm_param { ... }`` for one of LayerParameter's fields, and a layer reads it
-with ``schema.value(self.param, "norm_param")``. The classes of Caffe's messages stay the same objects throughout; while
-no dialect is active, the schema is Caffe's. Numbers must be above those that Caffe itself uses in the message, so a
-fork that took one of these (``interp_param = 143``) needs another one here: text files do not tell the difference.
+The text reader and writer then treat ``norm_param { ... }`` as a field of LayerParameter, and a layer reads it
+with ``schema.value(self.param, "norm_param")``. The classes of Caffe's messages stay the same objects; while no
+dialect is active, the schema is Caffe's. Numbers must be above those that Caffe itself uses in the message. A fork
+that uses one of these (``interp_param = 143``) needs another number here; text files do not contain the numbers.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from netspec.proto.schema import PACKAGE, add_file, added_fields, as_field, fiel
 
 @dataclass(frozen=True)
 class Dialect:
-    """What a fork adds. ``advice`` says to a user how to switch it on, e.g. ``"add --plugin ssd"``.
+    """What a fork adds. ``advice`` tells a user how to enable it, e.g. ``"add --plugin ssd"``.
 
-    ``file`` is where the source stands, for errors.
+    ``file`` is the source file, for errors.
     """
 
     name: str
@@ -65,9 +65,9 @@ _active: dict[str, Dialect] = {}
 
 
 def announce(dialect: Dialect) -> None:
-    """Make a dialect known, so that errors about its fields and layer types say that it has them.
+    """Make a dialect known, so that errors about its fields and layer types can name it.
 
-    Raises SpecError where its declarations cannot be read, or extend a message that Caffe does not have.
+    Raises SpecError if its declarations cannot be read, or extend a message that Caffe does not have.
     """
     for full_name, _ in dialect.fields():
         try:
@@ -80,8 +80,8 @@ def announce(dialect: Dialect) -> None:
 def activate(dialect: Dialect) -> None:
     """Announce a dialect and add its fields and messages to the schema. Does nothing if it is active.
 
-    Raises SpecError as :func:`announce`, and where Caffe or another active dialect has a field or a number of it, or
-    its name.
+    Raises SpecError like :func:`announce`, and if Caffe or another active dialect already has one of its fields or
+    numbers, or its name.
     """
     if dialect.name in _active:
         if _active[dialect.name] != dialect:
@@ -92,7 +92,7 @@ def activate(dialect: Dialect) -> None:
     file = dialect.declarations
     for full_name, field in dialect.fields():
         if field in fields_of(pool.FindMessageTypeByName(full_name)):
-            raise SpecError(f'{full_name} has a field "{field}" already', Where(file.name))
+            raise SpecError(f'{full_name} already has a field "{field}"', Where(file.name))
     _check_numbers(dialect)
     try:
         pool.FindFileByName(file.name)
@@ -109,8 +109,8 @@ def _check_numbers(dialect: Dialect) -> None:
     numbers = dialect.numbers()
     for other in _active.values():
         for key in numbers.keys() & other.numbers().keys():
-            message = f'number {key[1]} of {key[0]} is taken, by "{other.numbers()[key]}" of dialect "{other.name}"'
-            raise SpecError(f'{message}; give "{numbers[key]}" another one', Where(dialect.declarations.name))
+            message = f'number {key[1]} of {key[0]} is used by "{other.numbers()[key]}" of dialect "{other.name}"'
+            raise SpecError(f'{message}; give "{numbers[key]}" another number', Where(dialect.declarations.name))
 
 
 def _add(file: FileDescriptorProto) -> None:
@@ -121,9 +121,14 @@ def _add(file: FileDescriptorProto) -> None:
 
 
 def deactivate(name: str) -> None:
-    """Take the fields of an active dialect out of the schema again."""
+    """Remove the fields of an active dialect from the schema."""
     for full_name, field in _active.pop(name).fields():
         del added_fields[full_name][field]
+
+
+def known() -> list[Dialect]:
+    """Return the dialects that were announced, by name."""
+    return [_known[name] for name in sorted(_known)]
 
 
 def active() -> list[str]:
@@ -152,7 +157,7 @@ def advice_of(dialect: str) -> str:
 
 
 def advice_for(name: str, dialects: tuple[str, ...]) -> str:
-    """Return the sentence that known dialects have a field or layer type, and what to do; or an empty string."""
+    """Return a hint at the known dialects that have a field or layer type, or an empty string."""
     if not dialects:
         return ""
     names = " and ".join(f'"{d}"' for d in dialects)

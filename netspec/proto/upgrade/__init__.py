@@ -1,1 +1,1 @@
-"""From every older form of nets and solvers to the current one."""
+"""Upgrades of nets and solvers from all older formats to the current one."""

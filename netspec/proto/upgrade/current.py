@@ -1,8 +1,8 @@
-"""From every older form of Caffe's nets and solvers to the current one, the places of their parts included.
+"""Upgrades Caffe's nets and solvers from all older formats to the current one, with the places of their parts.
 
-Each pass takes a net and its map and returns new ones; one that has nothing to do returns what it was given. They run
-in Caffe's order, on text as on weights. Where Caffe drops a field without a word (of a net that is partly V0: its V1
-layers, its ``state``), it is kept here.
+Each pass takes a net and its map and returns new ones, or the same ones if nothing is to be done. They run in Caffe's
+order, for text and for weights. Caffe silently drops some fields (in a net that is partly V0: its V1 layers, its
+``state``); here they are kept.
 
 Caffe: src/caffe/util/upgrade_proto.cpp, UpgradeNetAsNeeded, UpgradeSolverAsNeeded, UpgradeSnapshotPrefixProperty
 """
@@ -74,7 +74,7 @@ _V1_TYPES = {
     "THRESHOLD": "Threshold",
     "WINDOW_DATA": "WindowData",
 }
-# Field of a V1 layer, one value a learnable array -> field of the ParamSpec that holds them now.
+# Field of a V1 layer, one value per learnable array -> field of the ParamSpec that now holds them.
 _PARAM_SPEC = {"param": "name", "blob_share_mode": "share_mode", "blobs_lr": "lr_mult", "weight_decay": "decay_mult"}
 
 _DATA_PARAMETERS = {"DATA": "data_param", "IMAGE_DATA": "image_data_param", "WINDOW_DATA": "window_data_param"}
@@ -96,7 +96,7 @@ _SOLVER_NETS = ("net_param", "train_net_param", "test_net_param")
 
 @dataclass(frozen=True)
 class _Pass:
-    """A pass, and what Caffe logs about it: ``lines`` of upgrade_proto.cpp, and the sentences' variable parts."""
+    """A pass, and what Caffe logs about it: ``lines`` of upgrade_proto.cpp, and the variable parts of the messages."""
 
     needed: Callable[[NetParameter], bool]
     run: Callable[[NetParameter, SourceMap], Upgraded]
@@ -109,7 +109,7 @@ class _Pass:
 def upgrade_net(net: NetParameter, source: SourceMap) -> Upgraded:
     """Return a net in the current format, and its map; log what was done in Caffe's words.
 
-    Raises SpecError for a net that has both ``layer`` and ``layers``, and for what a single pass refuses.
+    Raises SpecError for a net that has both ``layer`` and ``layers``, and for the errors of the passes.
     """
     if len(net.layer) and len(net.layers):
         line = source.net.find("layer").line
@@ -130,12 +130,12 @@ def upgrade_net(net: NetParameter, source: SourceMap) -> Upgraded:
 
 
 def net_needs_upgrade(net: NetParameter) -> bool:
-    """Say whether any pass has something to do."""
+    """Return whether any pass has something to do."""
     return any(step.needed(net) for step in _PASSES)
 
 
 def needs_data_upgrade(net: NetParameter) -> bool:
-    """Say whether a V1 data layer has fields of its transformation among its own parameters."""
+    """Return whether a V1 data layer has transformation fields among its own parameters."""
     return any(_own_transform(layer) for layer in net.layers)
 
 
@@ -171,12 +171,12 @@ def _own_transform(layer: V1LayerParameter) -> list[str]:
 
 
 def needs_v1_upgrade(net: NetParameter) -> bool:
-    """Say whether a net has V1 layers."""
+    """Return whether a net has V1 layers."""
     return len(net.layers) > 0
 
 
 def upgrade_v1(net: NetParameter, source: SourceMap) -> Upgraded:
-    """Return a V1 net with ``layer`` for ``layers``: types by name, and a ParamSpec a learnable array."""
+    """Return a V1 net with ``layer`` for ``layers``: types by name, and one ParamSpec per learnable array."""
     if not needs_v1_upgrade(net):
         return net, source
     assert not net.layer, "upgrade_net refuses such a net"
@@ -208,15 +208,15 @@ def _upgrade_param_specs(layer: V1LayerParameter, place: Place, draft: Draft) ->
 
 
 def needs_input_upgrade(net: NetParameter) -> bool:
-    """Say whether a net declares inputs by fields of its own."""
+    """Return whether a net declares inputs by fields of its own."""
     return len(net.input) > 0
 
 
 def upgrade_input(net: NetParameter, source: SourceMap) -> Upgraded:
     """Return a net with an Input layer named "input" before all others, for its ``input`` fields and their shapes.
 
-    Inputs without any shape, as old weights have them, are dropped. Raises SpecError where only some have one. Shapes
-    beyond those of the inputs, and input_dim beside input_shape, are left out with a warning, as Caffe does without.
+    Inputs without any shape, as in old weights, are dropped. Raises SpecError if only some have a shape. Extra shapes,
+    and input_dim if there is input_shape, are dropped with a warning; Caffe drops them silently.
     """
     if not needs_input_upgrade(net):
         return net, source
@@ -239,7 +239,7 @@ def upgrade_input(net: NetParameter, source: SourceMap) -> Upgraded:
 
 
 def _surplus(net: NetParameter, place: Place) -> list[str]:
-    """Return the parts of the input fields that no Input layer can take."""
+    """Return the parts of the input fields that do not fit into the Input layer."""
     if not len(net.input_shape) and not len(net.input_dim):
         where = place.find("input")
         return [f"{where}: input without input_shape or input_dim"] if where.line else []
@@ -268,12 +268,12 @@ def _input_shape(net: NetParameter, place: Place, index: int) -> tuple[Message, 
 
 
 def needs_batch_norm_upgrade(net: NetParameter) -> bool:
-    """Say whether a BatchNorm layer declares a ParamSpec for each of its three arrays that lets training move it."""
+    """Return whether a BatchNorm layer declares, for its three arrays, ParamSpecs that let training change them."""
     return any(_old_batch_norm(layer) for layer in net.layer)
 
 
 def upgrade_batch_norm(net: NetParameter, source: SourceMap) -> Upgraded:
-    """Return a net whose BatchNorm layers with three ParamSpecs have lr_mult and decay_mult 0 in them, names kept."""
+    """Return a net whose BatchNorm layers with three ParamSpecs have lr_mult 0 and decay_mult 0; names are kept."""
     if not needs_batch_norm_upgrade(net):
         return net, source
     result = copy_without(net, ())
@@ -338,9 +338,9 @@ _PASSES = (
 
 
 def upgrade_solver(solver: SolverParameter, place: Place) -> tuple[SolverParameter, Place]:
-    """Return a solver with ``type`` for ``solver_type`` and with the nets in it upgraded, and the places of its parts.
+    """Return a solver with ``type`` instead of ``solver_type`` and upgraded nets, and the places of its parts.
 
-    Raises SpecError where both are given.
+    Raises SpecError if both are given.
     """
     file = place.where.file
     nets = [name for name in _SOLVER_NETS if fields_of(solver.DESCRIPTOR)[name].present(solver)]
@@ -376,8 +376,8 @@ def upgrade_solver(solver: SolverParameter, place: Place) -> tuple[SolverParamet
 
 
 def upgrade_snapshot_prefix(solver: SolverParameter, path: str | Path) -> SolverParameter:
-    """Return a solver with a snapshot_prefix: its file's path without extension where it has none; where it names a
-    directory, the file's stem in there.
+    """Return a solver with a snapshot_prefix. If it has none: its file's path without extension; if it is a directory:
+    the file's stem in that directory.
     """
     stem = os.path.splitext(str(path))[0]
     result = copy_without(solver, ())

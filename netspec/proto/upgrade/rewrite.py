@@ -1,4 +1,4 @@
-"""What the upgrade passes share: messages rebuilt from parts of others, each part keeping the place it came from."""
+"""Shared by the upgrade passes: messages rebuilt from parts of others; each part keeps its original place."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ M = TypeVar("M", bound=Message)
 
 
 class Draft:
-    """A message under construction, and the places of what was put into it."""
+    """A message under construction, and the places of its parts."""
 
     def __init__(self, message: Message, where: Where) -> None:
-        """``message`` is what is filled; ``where`` is the place that stands for it as a whole."""
+        """``message`` is the message to fill; ``where`` is the place of the whole message."""
         self.message: Any = message
         self.where = where
         self.places: dict[str, tuple[Place, ...]] = {}
         self._inner: dict[str, Draft] = {}
 
     def copy(self, message: Message, places: Place, leave_out: Collection[str] = ()) -> None:
-        """Put in all fields of a message that this one has too, but those to leave out."""
+        """Copy all fields of a message that this one has too, except those to omit."""
         for name, field in fields_of(message.DESCRIPTOR).items():
             if name not in leave_out and name in fields_of(self.message.DESCRIPTOR) and field.present(message):
                 self.put(name, field.get(message), places.fields.get(name, ()))
 
     def put(self, name: str, value: Any, places: tuple[Place, ...]) -> None:
-        """Set a field, or add one value or several to a repeated one."""
+        """Set a field, or add one or several values to a repeated one."""
         field = fields_of(self.message.DESCRIPTOR)[name]
         _put(self.message, field, value)
         before = self.places.get(name, ()) if field.repeated else ()
         self.places[name] = (*before, *places)
 
     def inner(self, name: str, where: Where) -> Draft:
-        """Return the draft of a singular message field; where it does not exist yet, it begins empty at ``where``."""
+        """Return the draft of a singular message field; a new one is empty and has the place ``where``."""
         if name not in self._inner:
             places = self.places.pop(name, ())
             self._inner[name] = draft = Draft(getattr(self.message, name), places[0].where if places else where)
@@ -47,7 +47,7 @@ class Draft:
         return self._inner[name]
 
     def place(self) -> Place:
-        """Return the places of everything put in."""
+        """Return the places of all parts."""
         inner = {name: (draft.place(),) for name, draft in self._inner.items()}
         return Place(self.where, {**self.places, **inner})
 
@@ -63,7 +63,7 @@ def _put(message: Message, field: Field, value: Any) -> None:
 
 
 def copy_without(message: M, leave_out: Collection[str]) -> M:
-    """Return a copy of a message without some of its fields, which are not copied even for a moment."""
+    """Return a copy of a message without some of its fields; these are never copied, not even temporarily."""
     result = type(message)()
     for name, field in fields_of(message.DESCRIPTOR).items():
         if name not in leave_out and field.present(message):

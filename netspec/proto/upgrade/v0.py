@@ -1,4 +1,4 @@
-"""From the layers of 2013 to those of 2014: ``layers { layer { type: "conv" } }`` to ``layers { type: CONVOLUTION }``.
+"""Upgrades layers of 2013 to those of 2014: ``layers { layer { type: "conv" } }`` to ``layers { type: CONVOLUTION }``.
 
 Caffe: src/caffe/util/upgrade_proto.cpp, UpgradeV0Net, UpgradeV0PaddingLayers, UpgradeV0LayerParameter
 """
@@ -88,15 +88,15 @@ _UNCHANGED = ("name", "blobs", "blobs_lr", "weight_decay")
 
 
 def needs_v0_upgrade(net: NetParameter) -> bool:
-    """Say whether a net has a V0 layer."""
+    """Return whether a net has a V0 layer."""
     return any(layer.HasField("layer") for layer in net.layers)
 
 
 def upgrade_v0(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
     """Return a net with its V0 layers as V1 layers, padding layers merged into the layers they feed.
 
-    Raises SpecError for an unknown layer type and for a padding layer that cannot be merged. A field that its layer's
-    type does not take is dropped, as in Caffe, with a warning.
+    Raises SpecError for an unknown layer type and for a padding layer that cannot be merged. A field that the layer
+    type does not have is dropped with a warning, as in Caffe.
     """
     if not needs_v0_upgrade(net):
         return net, source
@@ -113,9 +113,9 @@ def upgrade_v0(net: NetParameter, source: SourceMap) -> tuple[NetParameter, Sour
 
 
 def merge_padding(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
-    """Return a V0 net without its padding layers: the convolution or pooling that each feeds pads by itself.
+    """Return a V0 net without its padding layers: the convolution or pooling after each one gets its padding.
 
-    Raises SpecError where a padding layer feeds anything else, or has not one bottom and one top.
+    Raises SpecError if a padding layer feeds any other layer, or does not have one bottom and one top.
     """
     result = copy_without(net, {"layers"})
     places: list[Place] = []
@@ -155,7 +155,7 @@ def _merge(producer: tuple[V1LayerParameter, Place], layer: V1LayerParameter, pl
 
 
 def _upgrade_layer(old: V0LayerParameter, place: Place, draft: Draft) -> None:
-    """Put the fields of a V0LayerParameter into the draft of a V1 layer."""
+    """Copy the fields of a V0LayerParameter into the draft of a V1 layer."""
     draft.copy(old, place, {n for n in fields_of(old.DESCRIPTOR) if n not in _UNCHANGED})
     if old.HasField("type"):
         if old.type not in _TYPES:
@@ -179,7 +179,7 @@ def _upgrade_layer(old: V0LayerParameter, place: Place, draft: Draft) -> None:
 
 
 def _inner(place: Place) -> Place:
-    """Return the places of the V0 part of a layer, the layer's own where they are unknown."""
+    """Return the places of the V0 part of a layer, or of the layer itself if they are unknown."""
     inner = place.fields.get("layer", ())
     return inner[0] if inner else Place(place.where)
 

@@ -1,4 +1,4 @@
-"""Pairs that somebody listed: masks, folders, tables, single images."""
+"""Pairs from lists: masks, folders, tables, single images."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ class TestMask:
         cv2.imwrite(str(tmp_path / "mask.png"), mask)
         return tmp_path
 
-    def test_marked_pairs_are_positive_and_neighbours_left_out(self, run: Path) -> None:
+    def test_marked_pairs_are_positive_and_neighbors_left_out(self, run: Path) -> None:
         source = MaskSource(run / "mask.png", run / "run", run)
         assert source.names[:2] == ["run/1.png", "run/2.png"]  # natural order: row 1 is 2.png, not 10.png
         assert label(source, "run/1.png", "run/7.png") == POSITIVE
@@ -116,7 +116,7 @@ class TestFolders:
     def test_pairs_join_the_two_folders_only(self, source: PlaceSource) -> None:
         assert label(source, "day/2.png", "day/3.png") == LEFT_OUT
 
-    def test_neighbouring_places_can_be_left_out(self, source: PlaceSource, tmp_path: Path) -> None:
+    def test_neighboring_places_can_be_left_out(self, source: PlaceSource, tmp_path: Path) -> None:
         apart = folders_source(tmp_path / "day", tmp_path / "night", tmp_path, min_gap=2)
         assert label(apart, "day/3.png", "night/10.jpg") == LEFT_OUT
         assert label(apart, "day/1.png", "night/3.jpg") == NEGATIVE
@@ -171,7 +171,7 @@ class TestTables:
         assert label(source, "1.jpg", "9.jpg") == NEGATIVE
         assert len(source.group_names) == 2
 
-    def test_neighbours_in_time_of_an_index(self, tmp_path: Path) -> None:
+    def test_neighbors_in_time_of_an_index(self, tmp_path: Path) -> None:
         index = self.write(tmp_path / "i.csv", self.INDEX)
         source = index_source(index, tmp_path, "floor", "clip", "second", 2.0)
         assert label(source, "f1/a_1.jpg", "f1/a_3.jpg") == POSITIVE

@@ -11,7 +11,7 @@ from loopclosure.places.trajectory import Frame, PosedSequence
 
 
 def sequence(name: str, views: list[tuple[float, float, float]]) -> PosedSequence:
-    """Frames at (second, x in metres, heading in degrees)."""
+    """Frames at (second, x in meters, heading in degrees)."""
     stamps, x, heading = np.array(views, float).T
     quaternions = Rotation.from_euler("y", heading[:, None], degrees=True).as_quat()
     positions = np.column_stack([x, np.zeros((len(x), 2))])
@@ -19,7 +19,7 @@ def sequence(name: str, views: list[tuple[float, float, float]]) -> PosedSequenc
     return PosedSequence(name, frames, stamps, positions, quaternions, 0)
 
 
-# Index: 0 and 1 are neighbours in time and place, 2 a revisit of 0, 3 turned by 20 degrees, 4 by 90, 5 far away.
+# Index: 0 and 1 are neighbors in time and place, 2 a revisit of 0, 3 turned by 20 degrees, 4 by 90, 5 far away.
 VIEWS = [(0.0, 0.0, 0.0), (0.5, 0.1, 1.0), (20.0, 0.3, 5.0), (30.0, 0.0, 20.0), (40.0, 0.0, 90.0), (50.0, 9.0, 0.0)]
 # Another run: 6 is where 0 is, 7 is far away.
 OTHER = [(100.0, 0.2, 2.0), (110.0, 30.0, 0.0)]
@@ -46,7 +46,7 @@ def test_the_papers_rule() -> None:
     assert [label(source, 0, other) for other in (6, 7)] == [NEGATIVE, NEGATIVE]
 
 
-def test_a_least_time_gap_leaves_neighbours_out_within_a_sequence_only() -> None:
+def test_a_least_time_gap_leaves_neighbors_out_within_a_sequence_only() -> None:
     source = two(PoseRule(min_gap_s=25.0))
     assert [label(source, 0, other) for other in (1, 2, 3)] == [LEFT_OUT, LEFT_OUT, NEGATIVE]
     close = two(PoseRule(min_gap_s=1e6))
@@ -109,7 +109,7 @@ def test_negatives_across_undeclared_sequences_are_warned_about() -> None:
     assert not warned(two(scenes=Scenes(same_scene=(("a", "b"),))), pairs)
 
 
-def test_positives_that_are_neighbours_in_time_are_warned_about() -> None:
+def test_positives_that_are_neighbors_in_time_are_warned_about() -> None:
     assert "100% of the positives are images less than 3 s apart" in warned(two(), [(0, 1), (0, 4)])
     assert not warned(two(), [(0, 2), (0, 4)])
 

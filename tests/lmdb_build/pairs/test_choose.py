@@ -47,7 +47,7 @@ def as_sets(pairs: np.ndarray) -> set[tuple[int, int]]:
 @pytest.mark.parametrize("by", ["time", "group"])
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("lengths", [(120, 90, 110), (61, 200, 40, 77)])
-def test_lists_are_balanced_disjoint_and_labelled_by_the_rule(
+def test_lists_are_balanced_disjoint_and_labeled_by_the_rule(
     tmp_path: Path, by: str, seed: int, lengths: tuple[int, ...]
 ) -> None:
     rule = PoseRule(min_gap_s=0.25)

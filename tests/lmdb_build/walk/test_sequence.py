@@ -1,4 +1,4 @@
-"""The made-up walk: true geometry, places really seen again, all from the seed."""
+"""The synthetic walk: true geometry, places really seen again, all from the seed."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -67,7 +67,7 @@ def test_an_image_without_a_point_is_no_crash(check):
     assert check.inliers(blank, blank) == 0
 
 
-def test_grey_images_and_the_limit_of_points():
+def test_gray_images_and_the_limit_of_points():
     few = GeometricCheck(max_features=30)
     assert len(few.describe(cv2.cvtColor(wall(0), cv2.COLOR_BGR2GRAY)).points) == 30
 

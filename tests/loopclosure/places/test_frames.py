@@ -58,7 +58,7 @@ def test_folders_lists_and_sequences(tmp_path):
 
 def test_broken_sources(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no image"):
+    with pytest.raises(InputError, match="contains no images"):
         image_paths(tmp_path / "empty")
     (tmp_path / "list.txt").write_text("\ngone.png\n")
     with pytest.raises(InputError, match=r'list.txt:2:1: no such image "gone.png"'):

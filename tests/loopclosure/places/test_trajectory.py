@@ -78,7 +78,7 @@ def test_missing_empty_and_binary_files_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"rgb\.txt: cannot be read \(No such file"):
         read_tum_sequence(tmp_path)
     write(tmp_path / "rgb.txt", "# nothing\n")
-    with pytest.raises(InputError, match=r"rgb\.txt: lists no image"):
+    with pytest.raises(InputError, match=r"rgb\.txt: lists no images"):
         read_tum_sequence(tmp_path)
     write(tmp_path / "rgb.txt", "1.5 rgb/a.png\n")
     (tmp_path / "groundtruth.txt").write_bytes(b"\xff\xfe\x00")

@@ -117,7 +117,7 @@ SETTINGS = {
         f's.prototxt:8:1: cannot write to snapshot prefix "net.prototxt/x": Not a directory; {GONE}',
         more='snapshot: 1\nsnapshot_prefix: "net.prototxt/x"',
     ),
-    "no net": solver("s.prototxt: the solver names no net to train, expected", less='net: "net.prototxt"\n'),
+    "no net": solver("s.prototxt: the solver has no net to train, expected", less='net: "net.prototxt"\n'),
     "files that are missing or broken": Case(
         [
             's.prototxt:1:1: net "gone.prototxt" is not a file; paths are relative',
@@ -153,14 +153,14 @@ FILLERS = {
         'type: "gaussian" sparse: 3', f'net.prototxt:5:5: {IP}filler "gaussian" needs sparse <= shape[0] = 2, found 3'
     ),
     "sparse without sense": filled(
-        'type: "xavier" sparse: 1', f'net.prototxt:5:5: {IP}filler "xavier" knows no sparse (found 1)'
+        'type: "xavier" sparse: 1', f'net.prototxt:5:5: {IP}filler "xavier" does not support sparse (found 1)'
     ),
     "uniform": filled('type: "uniform" min: 2', f'net.prototxt:5:5: {IP}filler "uniform" needs min <= max'),
     "bilinear": filled('type: "bilinear"', f'net.prototxt:5:5: {IP}filler "bilinear" needs a 4-D blob with square'),
     "empty blobs": net(
         'net.prototxt:1:48: layer "no" (DummyData): cannot fill an empty blob of shape (4, 0)',
         f"net.prototxt:5:5: {IP}cannot fill an empty blob of shape (2, 0)",
-        'net.prototxt:1:95: layer "in" (Input): nothing fills "data" and "label" while a solver runs; ',
+        'net.prototxt:1:95: layer "in" (Input): nothing fills "data" and "label" during training; ',
         new='layer { name: "no" type: "DummyData" top: "no" dummy_data_param { shape { dim: 4 dim: 0 } } } '
         + INPUT.replace("dim: 3", "dim: 0")
         + "\n"
@@ -251,13 +251,13 @@ NETS = {
         'file_name: "gone/o.h5" } }',
     ),
     "a Python layer without leave": net(
-        'net.prototxt:8:20: layer "py" (Python): a Python layer runs code that the prototxt names',
+        'net.prototxt:8:20: layer "py" (Python): a Python layer runs code named in the prototxt',
         new=NET + 'layer { name: "py" type: "Python" bottom: "ip" top: "py" python_param { module: "m" layer: "L" } }',
     ),
 }
 FEEDS = {
     "a training net that nobody feeds": net(
-        'net.prototxt:1:1: layer "in" (Input): nothing fills "data" and "label" while a solver runs; ',
+        'net.prototxt:1:1: layer "in" (Input): nothing fills "data" and "label" during training; ',
         new=INPUT + PRODUCT.replace("num_output: 2", "num_output: 3") + LOSS,
     ),
     "arrays that nobody gives": net(
@@ -266,8 +266,8 @@ FEEDS = {
     ),
     "a test net that nobody feeds, of other shapes": Case(
         [
-            'test.prototxt:2:1: layer "ip" (InnerProduct): cannot share weights with the training net: blobs [(3, 3)',
-            'test.prototxt:1:1: layer "in" (Input): nothing fills "data" and "label" while a solver runs; ',
+            'test.prototxt:2:1: layer "ip" (InnerProduct): cannot share weights with the training net: shapes',
+            'test.prototxt:1:1: layer "in" (Input): nothing fills "data" and "label" during training; ',
         ],
         SOLVER + 'test_net: "test.prototxt"\n' + TESTED,
         others={"test.prototxt": INPUT + PRODUCT.replace("num_output: 2", "num_output: 3") + LOSS},
@@ -305,30 +305,30 @@ READERS = {
         "Data",
         "data_param { batch_size: 0 } transform_param { " + TRANSFORM + " }",
         'net.prototxt:2:16: layer "d" (Data): batch_size must be above 0, found 0',
-        'net.prototxt:2:3: layer "d" (Data): source is missing: where is the data?',
-        'net.prototxt:2:68: layer "d" (Data): force_color and force_gray exclude each other',
-        'net.prototxt:2:85: layer "d" (Data): mean_file and mean_value exclude each other',
+        'net.prototxt:2:3: layer "d" (Data): source is missing; set it to the path of the data',
+        'net.prototxt:2:68: layer "d" (Data): force_color and force_gray cannot both be set',
+        'net.prototxt:2:85: layer "d" (Data): mean_file and mean_value cannot both be set',
     ),
     "ImageData": reads(
         "ImageData",
         "image_data_param { new_height: 3 } transform_param { " + TRANSFORM + " }",
         'net.prototxt:2:3: layer "d" (ImageData): new_height and new_width must be given together',
-        'net.prototxt:2:3: layer "d" (ImageData): source is missing: where is the data?',
-        'net.prototxt:2:74: layer "d" (ImageData): force_color and force_gray exclude each other',
-        'net.prototxt:2:91: layer "d" (ImageData): mean_file and mean_value exclude each other',
+        'net.prototxt:2:3: layer "d" (ImageData): source is missing; set it to the path of the data',
+        'net.prototxt:2:74: layer "d" (ImageData): force_color and force_gray cannot both be set',
+        'net.prototxt:2:91: layer "d" (ImageData): mean_file and mean_value cannot both be set',
     ),
     "HDF5Data": reads(
         "HDF5Data",
         "hdf5_data_param { } transform_param { scale: 2 }",
         'net.prototxt:2:3: layer "d" (HDF5Data): batch_size must be above 0, found 0',
-        'net.prototxt:2:3: layer "d" (HDF5Data): source is missing: where is the data?',
-        'net.prototxt:2:23: layer "d" (HDF5Data): HDF5Data does not transform data; take transform_param away',
+        'net.prototxt:2:3: layer "d" (HDF5Data): source is missing; set it to the path of the data',
+        'net.prototxt:2:23: layer "d" (HDF5Data): HDF5Data does not transform data; remove transform_param',
     ),
     "WindowData": reads(
         "WindowData",
         'window_data_param { batch_size: 4 crop_mode: "round" context_pad: 4 } transform_param { crop_size: 8 '
         "mean_value: 1 mean_value: 2 }",
-        'net.prototxt:2:3: layer "d" (WindowData): source is missing: where is the data?',
+        'net.prototxt:2:3: layer "d" (WindowData): source is missing; set it to the path of the data',
         'net.prototxt:2:37: layer "d" (WindowData): unknown crop_mode "round"; expected warp or square',
         'net.prototxt:2:56: layer "d" (WindowData): context_pad 4 on both sides leaves nothing of crop_size 8',
         'net.prototxt:2:104: layer "d" (WindowData): found 2 mean_value, expected 1 or 3',
@@ -338,9 +338,9 @@ PLACE = 'net.prototxt:2:16: layer "d" (Data): '
 FOUND_IN_DATA = {
     "databases of two nets, and a mean": Case(
         [
-            f'{PLACE}database "gone" is not there',
+            f'{PLACE}database "gone" does not exist',
             'net.prototxt:2:79: layer "d" (Data): mean file "gone" cannot be read: No such file or directory',
-            'test.prototxt:2:16: layer "d" (Data): database "empty_lmdb" is empty: it holds no record',
+            'test.prototxt:2:16: layer "d" (Data): database "empty_lmdb" is empty: it contains no records',
         ],
         SOLVER + 'test_net: "test.prototxt"\n' + TESTED,
         READS
@@ -350,7 +350,7 @@ FOUND_IN_DATA = {
     "a mean of another size": reads(
         "Data",
         f'data_param {{ source: "db" {LMDB} batch_size: 1 }} transform_param {{ mean_file: "mean.binaryproto" }}',
-        'net.prototxt:2:77: layer "d" (Data): the mean of "mean.binaryproto" is 3 x 9 x 9, the image (uncropped) 3 x 6',
+        'net.prototxt:2:77: layer "d" (Data): the mean of "mean.binaryproto" has shape 3 x 9 x 9, the image before',
     ),
     "a crop that does not fit": reads(
         "Data",
@@ -365,11 +365,11 @@ FOUND_IN_DATA = {
     "a skip beyond the end": reads(
         "Data",
         f'data_param {{ source: "db" {LMDB} batch_size: 1 rand_skip: 1000000 }}',
-        'net.prototxt:2:57: layer "d" (Data): not enough records to skip',
+        'net.prototxt:2:57: layer "d" (Data): cannot skip',
         solver=SOLVER + "random_seed: 5",
     ),
     "the other backend": reads(
-        "Data", 'data_param { source: "db" batch_size: 1 }', f'{PLACE}database "db" is of backend LMDB, not LEVELDB'
+        "Data", 'data_param { source: "db" batch_size: 1 }', f'{PLACE}database "db" has backend LMDB, not LEVELDB'
     ),
     "a shape that does not suit the net": Case(
         ['net.prototxt:3:67: layer "loss" (EuclideanLoss): found bottoms of shapes (2, 3, 6, 8) and (2,), expected'],
@@ -392,7 +392,7 @@ layer {{ name: "loss" type: "EuclideanLoss"                        bottom: "data
     "a list without labels": reads(
         "ImageData",
         'image_data_param { source: "names.txt" }',
-        'names.txt:1:1: found "0.png", expected an image name, a blank and a whole-number label',
+        'names.txt:1:1: found "0.png", expected an image name, a space and an integer label',
     ),
     "a first image that is missing": reads(
         "ImageData",
@@ -412,7 +412,7 @@ layer {{ name: "loss" type: "EuclideanLoss"                        bottom: "data
     "an HDF5 file without a top": reads(
         "HDF5Data",
         'hdf5_data_param { source: "rows.txt" batch_size: 1 }',
-        'rows.txt:1:1: HDF5 file "rows.h5" has no dataset named like top "label"; it has "data"',
+        'rows.txt:1:1: HDF5 file "rows.h5" has no dataset "label", the name of a top; it has "data"',
     ),
     "no window file, and a mean": reads(
         "WindowData",

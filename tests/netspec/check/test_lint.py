@@ -60,14 +60,14 @@ def test_towers_that_share_only_some_of_their_parameters(advice: Callable[..., l
 def test_a_loss_that_nothing_reaches(advice: Callable[..., list[str]]) -> None:
     fixed = 'param { name: "w" lr_mult: 0 } param { name: "b" lr_mult: 0 }'
     assert advice(siamese((fixed, fixed))) == [
-        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): nothing that learns reaches this loss'
+        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): this loss depends on no learnable parameter'
     ]
     assert advice(siamese((fixed, fixed)), phase=1) == []
 
 
 def test_a_blob_used_by_nothing(advice: Callable[..., list[str]]) -> None:
     spare = 'layer { name: "spare" type: "ReLU" bottom: "f1" top: "spare" }\n'
-    assert advice(siamese(extra=spare)) == ['net.prototxt:9:1: layer "spare" (ReLU): blob "spare" is used by nothing']
+    assert advice(siamese(extra=spare)) == ['net.prototxt:9:1: layer "spare" (ReLU): no layer uses blob "spare"']
     score = 'layer { name: "score" type: "Accuracy" bottom: "f1" bottom: "sim" top: "score" }\n'
     assert advice(siamese(extra=score)) == []
     silent = 'layer { name: "hush" type: "Silence" bottom: "spare" }\n'
@@ -82,8 +82,8 @@ def test_a_batch_norm_without_scale(advice: Callable[..., list[str]]) -> None:
     norm = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 } } }\n'
     norm += 'layer { name: "bn" type: "BatchNorm" bottom: "x" top: "y" }\n'
     assert advice(norm) == [
-        'net.prototxt:2:1: layer "bn" (BatchNorm): no Scale layer follows; Caffe\'s BatchNorm has no scale and shift '
-        "of its own"
+        'net.prototxt:2:1: layer "bn" (BatchNorm): no Scale layer follows; Caffe\'s BatchNorm itself does not scale '
+        "and shift"
     ]
     assert advice(norm + 'layer { name: "s" type: "Scale" bottom: "y" top: "y" }') == []
 
@@ -91,8 +91,8 @@ def test_a_batch_norm_without_scale(advice: Callable[..., list[str]]) -> None:
 def test_two_layers_of_one_name(advice: Callable[..., list[str]]) -> None:
     said = advice(siamese().replace('"ip2"', '"ip1"'))
     assert said == [
-        'net.prototxt:6:1: layer "ip1" (InnerProduct): an earlier layer has this name, and gets the weights that are '
-        "loaded by it"
+        'net.prototxt:6:1: layer "ip1" (InnerProduct): an earlier layer has the same name; loaded weights go to that '
+        "layer only"
     ]
 
 
@@ -118,13 +118,13 @@ def test_nothing_is_said_of_a_sound_solver(advice: Callable[..., list[str]]) -> 
 def test_no_snapshot_is_ever_taken(advice: Callable[..., list[str]]) -> None:
     without = SOLVER + "snapshot_after_train: false\n"
     assert advice(siamese(), without + "snapshot: 101") == [
-        "solver.prototxt:4:1: snapshot 101 never fires in max_iter 100"
+        "solver.prototxt:4:1: snapshot 101 is more than max_iter 100: no effect"
     ]
     assert advice(siamese(), SOLVER + "snapshot: 101") == [
-        "solver.prototxt:3:1: snapshot 101 never fires in max_iter 100"
+        "solver.prototxt:3:1: snapshot 101 is more than max_iter 100: no effect"
     ]
     assert advice(siamese(), without) == [
-        "solver.prototxt: no snapshot is ever taken; set snapshot, or snapshot_after_train: true"
+        "solver.prototxt: no snapshot is taken; set snapshot, or snapshot_after_train: true"
     ]
     assert advice(siamese(), without + "snapshot: 100") == []
 

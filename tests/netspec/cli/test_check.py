@@ -52,15 +52,15 @@ def test_check_builds_all_nets_of_a_solver(run: Run, edited: Edit) -> None:
 def test_check_opens_no_data(run: Run) -> None:
     Path("pairs").unlink()
     assert run("check", NET, *PAIR_SHAPE).status == 0
-    wanted = f'{NET}:14:3: layer "pair_data" (Data): the shape of "pair_data" is known by its data only; '
-    assert run("check", NET).fault == wanted + "say --shape pair_data=50,C,H,W, or --data"
+    wanted = f'{NET}:14:3: layer "pair_data" (Data): the shape of "pair_data" is known only from its data; '
+    assert run("check", NET).fault == wanted + "give --shape pair_data=50,C,H,W, or --data"
 
 
 def test_check_gives_shapes_to_data_layers_and_inputs_only(run: Run) -> None:
-    expected = f'{NET}: --shape names "pair"; did you mean "pair_data"? the blobs of data layers: pair_data, sim'
+    expected = f'{NET}: --shape: no data layer has a top "pair"; did you mean "pair_data"? their tops: pair_data, sim'
     assert run("check", NET, *PAIR_SHAPE, "--shape", "pair=1,2,28,28").fault == expected
     fault = run("check", SOLVER, *PAIR_SHAPE, "--shape", "conv1=1,6,24,24").fault
-    assert fault == f'{SOLVER}: --shape names "conv1"; the blobs of data layers: pair_data, sim'
+    assert fault == f'{SOLVER}: --shape: no data layer has a top "conv1"; their tops: pair_data, sim'
     Path("net.prototxt").write_text(
         'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 } } }'
     )
@@ -122,9 +122,7 @@ def test_check_reports_faults_of_a_solver_and_of_its_nets_at_once(run: Run, edit
 def test_check_warns_and_succeeds(run: Run) -> None:
     result = run("check", SOLVER, *PAIR_SHAPE)
     assert result.status == 0
-    assert result.err == (
-        f"warning: {SOLVER}: no snapshot is ever taken; set snapshot, or snapshot_after_train: true\n"
-    )
+    assert result.err == f"warning: {SOLVER}: no snapshot is taken; set snapshot, or snapshot_after_train: true\n"
 
 
 def test_a_warning_of_both_nets_of_a_solver_is_shown_once(run: Run, edited: Edit) -> None:

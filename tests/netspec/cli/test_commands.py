@@ -184,23 +184,23 @@ def test_layers_prints_what_each_says_of_itself(run: Run) -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a GPU")
 def test_without_a_gpu_the_cpu_is_used_and_a_wish_for_a_gpu_refused(run: Run, edited: Edit) -> None:
     assert run("device_query").fault == "torch finds no GPU on this machine"
-    refused = "this machine has no GPU(s) that torch can use; leave --gpu out for the CPU"
+    refused = "torch finds no GPU(s) on this machine; omit --gpu to use the CPU"
     for words in (["train", SOLVER], ["test", "--model", NET, "--weights", INIT], ["time", "--model", NET]):
         assert run(*words, "-gpu", "0").fault == f"--gpu 0: {refused}"
     result = run("train", edited(SOLVER, "solver_mode: CPU", "solver_mode: GPU", "max_iter: 60", "max_iter: 0"))
     assert result.status == 0
     warnings = [line for line in result.messages if "solver_mode" in line and "running on the CPU" in line]
-    assert warnings == ["edited.prototxt:11:1: solver_mode GPU, but torch finds no GPU here: running on the CPU"]
+    assert warnings == ["edited.prototxt:11:1: solver_mode GPU, but torch finds no GPU: running on the CPU"]
 
 
 # What is wrong, in one line
 
 
 def test_gpus_that_are_not_numbers_or_not_there(run: Run) -> None:
-    fault = "--gpu first: expected the number of a GPU, several separated by commas, or all"
+    fault = "--gpu first: expected the number of a GPU, several numbers separated by commas, or all"
     assert run("train", SOLVER, "--gpu=first").fault == fault
     count = torch.cuda.device_count()
-    assert f"this machine has {count or 'no'} GPU(s)" in run("train", SOLVER, "--gpu", f"0,{count + 1}").fault
+    assert f"torch finds {count or 'no'} GPU(s)" in run("train", SOLVER, "--gpu", f"0,{count + 1}").fault
 
 
 def test_a_typo_in_a_field_a_type_or_a_blob(run: Run, edited: Edit) -> None:
@@ -231,8 +231,8 @@ def test_a_database_that_is_missing_empty_or_of_another_shape(run: Run, edited: 
         return run("train", edited(SOLVER, NET, "net.prototxt"), "--weights", INIT).fault
 
     place = 'net.prototxt:9:16: layer "pair_data" (Data): database '
-    assert fault("nowhere") == f'{place}"nowhere" is not there (relative paths start from {os.getcwd()})'
-    assert fault("empty_lmdb") == f'{place}"empty_lmdb" is empty: it holds no record'
+    assert fault("nowhere") == f'{place}"nowhere" does not exist (relative paths start from {os.getcwd()})'
+    assert fault("empty_lmdb") == f'{place}"empty_lmdb" is empty: it contains no records'
     assert fault("hollow_lmdb").startswith(f'{place}"hollow_lmdb" is a folder without data.mdb')
     assert fault(f"{GOLDEN}/images/lmdb_gray").startswith(
         'net.prototxt:26:30: layer "slice_pair" (Slice): found slice_point [1]'
@@ -244,10 +244,10 @@ def test_a_database_that_is_missing_empty_or_of_another_shape(run: Run, edited: 
 def test_a_solver_that_names_no_net(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, f'net: "{NET}"', "")
     assert run("train", solver).fault.startswith(
-        "edited.prototxt: the solver names no net to train, expected exactly one"
+        "edited.prototxt: the solver has no net to train, expected exactly one"
     )
     assert run("check", solver).fault.startswith(
-        "edited.prototxt: the solver names no net to train, expected exactly one"
+        "edited.prototxt: the solver has no net to train, expected exactly one"
     )
     assert run("train", edited(SOLVER, NET, "nowhere.prototxt")).fault == (
         'edited.prototxt:1:1: net "nowhere.prototxt" is not a file; paths are relative to the working directory'
@@ -284,7 +284,7 @@ def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
     Path("net.prototxt").write_text(deploy)
     expected = "net.prototxt: no value for input 'x'; this net's inputs: x"
     assert run("test", "--model", "net.prototxt", "--weights", INIT).fault == expected
-    unfed = 'net.prototxt:1:1: layer "x" (Input): nothing fills "x" while a solver runs; a layer that reads data '
+    unfed = 'net.prototxt:1:1: layer "x" (Input): nothing fills "x" during training; use a layer that reads '
     assert run("train", edited(SOLVER, NET, "net.prototxt", "test_iter: 4", "")).fault.startswith(unfed)
     assert run("time", "--model", "net.prototxt", "--iterations", 1).status == 0
 
@@ -313,7 +313,7 @@ def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
         (["extract", "--model", "m", "--blob", "b", "--out", "o", "--source", "db"], "found 'db', expected LAYER=DB"),
         (
             ["extract", "--model", "m", "--blob", "a", "b", "--out", "o", "--images", "i"],
-            "--images takes one --blob, found 2",
+            "--images needs exactly one --blob, found 2",
         ),
         (
             ["extract", "--model", "m", "--blob", "a", "--out", "o", "--images", "i", "--shape", "b=1"],

@@ -120,7 +120,7 @@ def test_a_training_net_is_exported_with_its_loss(onnx: Any, run: Run) -> None:
         "--out",
         "net.onnx",
     )
-    assert "known by its data only; say --shape pair_data=" in run(*words).fault
+    assert "known only from its data; give --shape pair_data=" in run(*words).fault
     assert run(*words, "--shape", "pair_data=2,2,28,28").status == 0
     model = onnx.load("net.onnx")
     assert [each.name for each in model.graph.input] == ["pair_data", "sim"]
@@ -148,7 +148,10 @@ def test_images_steps(onnx: Any, net: Net, run: Run) -> None:
     [
         (("--to", "onnx", "--out", "no/net.onnx"), "no/net.onnx: there is no folder no; make it first"),
         (("--to", "torch", "--out", "net.txt"), "--out net.txt: expected a name that ends in .py"),
-        (("--to", "onnx", "--out", "n.onnx", "--shape", "dat=1,3,8,8"), '--shape names "dat"; did you mean "data"?'),
+        (
+            ("--to", "onnx", "--out", "n.onnx", "--shape", "dat=1,3,8,8"),
+            'no data layer has a top "dat"; did you mean "data"?',
+        ),
         (("--to", "onnx", "--out", "n.onnx", "--mean", "no.npy"), "no.npy: cannot be read as an array"),
         (("--to", "onnx", "--out", "n.onnx", "--swap", "--input", "x"), 'no input "x" in this net; it has: data'),
     ],
@@ -161,7 +164,7 @@ def test_faults_are_one_line(words: tuple[str, ...], fault: str, onnx: Any, net:
 def test_weights_that_are_not_there(onnx: Any, net: Net, run: Run) -> None:
     words = ("export", MODEL, "--to", "onnx", "--out", "n.onnx")
     assert "no.caffemodel: cannot be read: No such file or directory" in run(*words, "--weights", "no.caffemodel").fault
-    assert run(*words).err == "warning: no --weights: the net has random ones\n"
+    assert run(*words).err == "warning: no --weights given: the weights are random\n"
 
 
 def test_the_onnx_library_is_an_extra(net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,4 +199,4 @@ def test_folding_needs_weights(net: Net, run: Run) -> None:
 def test_steps_for_images_are_for_onnx(net: Net, run: Run) -> None:
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "n.pt2", "--swap")
     assert result.status == 2
-    assert "go with --to onnx" in result.err
+    assert "need --to onnx" in result.err

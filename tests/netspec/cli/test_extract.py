@@ -64,7 +64,7 @@ def test_extract_reads_another_database_and_as_many_batches_as_asked(run: Run) -
 def test_extract_without_weights_warns_of_random_ones(run: Run) -> None:
     result = run("extract", "--model", NET, "--blob", "feat", "--out", "f.npz", "--iterations", 1)
     assert result.status == 0
-    assert result.err == "warning: no --weights: the net has random ones\n"
+    assert result.err == "warning: no --weights given: the weights are random\n"
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_extract_can_feed_the_other_tower(run: Run, images: Path) -> None:
 def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run, images: Path) -> None:
     Path("pairs").unlink()
     words = [*IMAGES, "--images", images / "rgb"]
-    assert 'database "pairs/test_lmdb" is not there' in run("extract", *words).fault
+    assert 'database "pairs/test_lmdb" does not exist' in run("extract", *words).fault
     assert run("extract", *words, "--shape", "data=1,1,28,28").status == 0
 
 
@@ -154,7 +154,7 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
     [
         (["--images", "nowhere"], "nowhere: cannot be read: No such file or directory; expected a folder of images"),
         (["--images", "list.txt"], 'list.txt:2:1: no such image "b.png" in .'),
-        (["--images", "empty"], "empty: holds no image; expected files that end in .png, "),
+        (["--images", "empty"], "empty: contains no images; expected files that end in .png, "),
         (
             ["--images", "walk/rgb", "--input", "dat"],
             f'{NET}: no blob "dat" in this net; did you mean "data"? it has: ',
@@ -165,9 +165,9 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
         ),
         (
             ["--source", "pair=pairs/train_lmdb"],
-            f'{NET}: no data layer "pair" to give a source to; this net\'s: pair_data',
+            f'{NET}: no data layer "pair" in this net; its data layers: pair_data',
         ),
-        (["--source", "pair_data=nowhere"], 'database "nowhere" is not there'),
+        (["--source", "pair_data=nowhere"], 'database "nowhere" does not exist'),
         (["--out", "nowhere/f.npz"], "--out nowhere/f.npz: cannot be written: No such file or directory"),
         (["--weights", "nowhere.caffemodel"], "nowhere.caffemodel: cannot be read: No such file or directory"),
     ],
@@ -182,10 +182,10 @@ def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: l
     ("words", "fault"),
     [
         (["--images", "walk/rgb", "--zooms", "1,2"], "found zoom 2, expected more than 0 and at most 1"),
-        (["--images", "walk/rgb", "--zooms", "1,x"], 'found zooms "1,x", expected numbers with commas between'),
-        (["--images", "walk/rgb", "--blob", "sim"], "--images takes one --blob, found 2"),
+        (["--images", "walk/rgb", "--zooms", "1,x"], 'found zooms "1,x", expected numbers separated by commas'),
+        (["--images", "walk/rgb", "--blob", "sim"], "--images needs exactly one --blob, found 2"),
         (["--images", "walk/rgb", "--shape", "x=1,1,9,9"], "--shape names x, expected the input blob data"),
-        (["--zooms", "1,0.5"], "--zooms are of --images"),
+        (["--zooms", "1,0.5"], "--zooms needs --images"),
     ],
 )
 def test_extract_refuses_words_that_do_not_go_together(run: Run, images: Path, words: list[str], fault: str) -> None:
@@ -210,7 +210,7 @@ def test_extract_says_in_three_lines_what_it_did(run: Run, images: Path) -> None
     assert (result.status, result.err) == (0, "")
     what, pixels, wrote = result.out.splitlines()
     assert what == f"{NET}: feat of 3 images from walk/rgb"
-    scaled = '0 to 255, times 0.00390625, as the transform_param of layer "pair_data" says'
+    scaled = '0 to 255, times 0.00390625 (transform_param of layer "pair_data")'
     assert pixels == f"data (1 x 28 x 28): gray, {scaled}"
     assert wrote.startswith("f.npz: features (3, 16), names (3,), zooms (2,); ")
     assert wrote.endswith(" ms per image")
@@ -231,7 +231,7 @@ def test_extract_says_what_it_does_to_the_pixels(run: Run, images: Path, param: 
     )
     words = ["--model", "net.prototxt", "--blob", "data", "--images", images / "rgb", "--out", "f.npz"]
     pixels = run("extract", *words).out.splitlines()[1]
-    assert pixels == f'data (3 x 9 x 9): BGR, 0 to 255{told}, as the transform_param of layer "in" says'
+    assert pixels == f'data (3 x 9 x 9): BGR, 0 to 255{told} (transform_param of layer "in")'
 
 
 def test_extract_says_how_many_records_it_read(run: Run) -> None:
@@ -264,7 +264,7 @@ layer {
   name: "conv1" type: "Convolution" bottom: "data" top: "conv1" convolution_param { num_output: 6 kernel_size: 5 }
 }
 """
-TRAINED = f"{INIT} was trained with transform_param {{ scale: 0.00390625 }}, which deploy.prototxt lacks: "
+TRAINED = f"{INIT} was trained with transform_param {{ scale: 0.00390625 }}, but deploy.prototxt has no "
 
 
 def conv1_of(run: Run, model: str, weights: str = INIT) -> tuple[np.ndarray, Any]:
@@ -280,7 +280,7 @@ def test_a_deploy_file_without_the_scale_of_the_training_gets_a_warning(run: Run
     found, result = conv1_of(run, "deploy.prototxt")
     assert result.err.startswith(f"warning: {TRAINED}")
     assert len(result.err.splitlines()) == 1
-    assert "data (1 x 28 x 28): gray, 0 to 255, since no transform_param says otherwise" in result.out
+    assert "data (1 x 28 x 28): gray, 0 to 255 (no transform_param)" in result.out
     assert not np.allclose(found, conv1_of(run, NET)[0], atol=0.1)
 
 
@@ -329,6 +329,6 @@ def test_extract_features_says_in_one_line_what_is_wrong(run: Run) -> None:
         return run("extract_features", INIT, NET, *words).fault
 
     assert 'no blob "feet" in this net; did you mean "feat"? it has: ' in fault("feet", "db", "1", "lmdb")
-    assert "found 2 blob names and 1 databases, expected as many" in fault("feat,sim", "db", "1", "lmdb")
+    assert "found 2 blob names and 1 databases, expected one database per blob" in fault("feat,sim", "db", "1", "lmdb")
     Path("db").mkdir()
-    assert fault("feat", "db", "1", "lmdb").startswith("db: exists already; ")
+    assert fault("feat", "db", "1", "lmdb").startswith("db: already exists; ")

@@ -152,14 +152,14 @@ def make_leveldb(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (make_nothing, "is not there"),
+        (make_nothing, "does not exist"),
         (make_file, "is a file"),
         (make_empty_folder, "without data.mdb"),
         (make_never_written, "empty data.mdb"),
         (make_no_lmdb, "cannot be opened as an LMDB"),
-        (make_without_records, "is empty: it holds no record"),
-        (make_cut_short, "is cut short"),
-        (make_leveldb, "is of backend LEVELDB, not LMDB; say backend: LEVELDB"),
+        (make_without_records, "is empty: it contains no records"),
+        (make_cut_short, "is truncated"),
+        (make_leveldb, "has backend LEVELDB, not LMDB; set backend: LEVELDB"),
     ],
 )
 def test_a_bad_source_is_refused_in_one_line(tmp_path: Path, make: object, message: str) -> None:
@@ -173,7 +173,7 @@ def test_a_bad_source_is_refused_in_one_line(tmp_path: Path, make: object, messa
 
 
 def test_an_lmdb_taken_for_a_leveldb_says_what_to_write() -> None:
-    with pytest.raises(SpecError, match=r"LEVELDB is Caffe's default\); say backend: LMDB"):
+    with pytest.raises(SpecError, match=r"LEVELDB is Caffe's default\); set backend: LMDB"):
         open_reader(str(GOLDEN / "pairs" / "test_lmdb"), "leveldb", PLACE)
 
 
@@ -236,7 +236,7 @@ def test_the_file_is_one_that_plain_liblmdb_opens(tmp_path: Path) -> None:
 
 def test_an_existing_path_is_refused_and_kept(tmp_path: Path) -> None:
     write(tmp_path / "db", {b"a": b"1"})
-    with pytest.raises(SpecError, match="exists already"):
+    with pytest.raises(SpecError, match="already exists"):
         write(tmp_path / "db", {b"a": b"2"})
     assert open_reader(str(tmp_path / "db")).record(0) == b"1"
 

@@ -46,13 +46,13 @@ def test_encoded_images_are_decoded_as_asked(color: bool | None, channels: int) 
         assert (found == COLOURS).all()
 
 
-def test_a_grey_file_stays_grey_unless_colour_is_forced() -> None:
+def test_a_gray_file_stays_gray_unless_color_is_forced() -> None:
     datum = encoded_datum(png(COLOURS[:1]))
     assert (datum_to_array(datum) == COLOURS[:1]).all()
     assert (datum_to_array(datum, color=True) == COLOURS[[0, 0, 0]]).all()
 
 
-def test_planar_takes_grey_and_colour() -> None:
+def test_planar_takes_gray_and_color() -> None:
     assert planar(np.zeros((4, 5), np.uint8)).shape == (1, 4, 5)
     assert planar(np.zeros((4, 5, 3), np.uint8)).shape == (3, 4, 5)
 
@@ -60,9 +60,9 @@ def test_planar_takes_grey_and_colour() -> None:
 @pytest.mark.parametrize(
     ("datum", "message"),
     [
-        (Datum(channels=3, height=2, width=2, data=b"1234"), "holds 4 values in data, but says .* 3 x 2 x 2"),
-        (Datum(channels=1, height=2, width=2, float_data=[1.0]), "holds 1 values in float_data"),
-        (Datum(), "holds 0 values"),
+        (Datum(channels=3, height=2, width=2, data=b"1234"), "contains 4 values in data, but .* is 3 x 2 x 2"),
+        (Datum(channels=1, height=2, width=2, float_data=[1.0]), "contains 1 values in float_data"),
+        (Datum(), "contains 0 values"),
         (Datum(encoded=True, data=b"no image"), "cannot be decoded"),
         (Datum(encoded=True), "cannot be decoded"),
         (encoded_datum(cv2.imencode(".png", np.zeros((2, 2), np.uint16))[1].tobytes()), "uint16 .* only 8 bits"),
@@ -74,7 +74,7 @@ def test_contradictions_are_named(datum: Datum, message: str) -> None:
 
 
 def test_what_is_no_datum_is_refused() -> None:
-    with pytest.raises(ValueError, match="is no Datum"):
+    with pytest.raises(ValueError, match="is not a Datum"):
         parse_datum(b"\xff\xff\xff")
 
 

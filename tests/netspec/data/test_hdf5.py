@@ -66,16 +66,16 @@ def test_bad_files_are_named_with_their_line(tmp_path: Path, listed: str) -> Non
     refuse(tmp_path, f"{tmp_path}/text.h5", 'text.h5" cannot be read')
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["data"] = np.zeros((3, 2, 3))
-    refuse(tmp_path, f"{tmp_path}/other.h5", 'no dataset named like top "label"; it has "data"')
+    refuse(tmp_path, f"{tmp_path}/other.h5", 'no dataset "label", the name of a top; it has "data"')
     with h5py.File(tmp_path / "uneven.h5", "w") as file:
         file["data"], file["label"] = np.zeros((3, 2, 3)), np.zeros(4)
-    refuse(tmp_path, f"{tmp_path}/uneven.h5", r"have \[3, 4\] rows; expected one number of rows")
+    refuse(tmp_path, f"{tmp_path}/uneven.h5", r"have \[3, 4\] rows; expected equal numbers")
     with h5py.File(tmp_path / "wide.h5", "w") as file:
         file["data"], file["label"] = np.zeros((3, 2, 4)), np.zeros(3)
     refuse(tmp_path, f"{tmp_path}/a.h5 {tmp_path}/wide.h5", "all files must agree")
     with h5py.File(tmp_path / "words.h5", "w") as file:
         file["data"], file["label"] = np.zeros((3, 2, 4)), np.array([b"x", b"y", b"z"])
-    refuse(tmp_path, f"{tmp_path}/words.h5", 'dataset "label" .* holds no rows of numbers')
+    refuse(tmp_path, f"{tmp_path}/words.h5", 'dataset "label" .* contains no rows of numbers')
 
 
 def test_results_are_appended_in_caffes_four_axes(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_results_are_appended_in_caffes_four_axes(tmp_path: Path) -> None:
 def test_results_of_another_shape_or_place_are_refused(tmp_path: Path) -> None:
     sink = Hdf5Sink(str(tmp_path / "out.h5"), PLACE)
     sink.append(np.zeros((2, 3)), np.zeros(2))
-    with pytest.raises(SpecError, match=r'rows of "data" had the shape \(3, 1, 1\) so far, now \(4, 1, 1\)'):
+    with pytest.raises(SpecError, match=r'rows of "data" had shape \(3, 1, 1\) in earlier batches, found \(4, 1, 1\)'):
         sink.append(np.zeros((2, 4)), np.zeros(2))
     sink.close()
     with pytest.raises(SpecError, match=r"^net.prototxt:4:2: HDF5 file .* cannot be written"):

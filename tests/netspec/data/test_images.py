@@ -33,7 +33,7 @@ def test_an_image_is_resized_without_antialiasing(tmp_path: Path) -> None:
     assert not read_image(str(tmp_path / "stripes.png"), size=(2, 2)).any()
 
 
-def test_a_grey_image_has_one_channel_also_when_resized() -> None:
+def test_a_gray_image_has_one_channel_also_when_resized() -> None:
     assert read_image(str(PNG / "0.png"), color=False).shape == (1, 48, 64)
     assert read_image(str(PNG / "0.png"), color=False, size=(5, 6)).shape == (1, 5, 6)
 

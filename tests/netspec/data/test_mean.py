@@ -46,7 +46,7 @@ def test_an_image_of_another_size_is_named(tmp_path: Path) -> None:
         for i, width in enumerate((4, 4, 5)):
             writer.put(b"%08d" % i, array_to_datum(np.zeros((1, 3, width), np.uint8)).SerializeToString())
     with pytest.raises(
-        SpecError, match=r'^db: record "00000002" is 1 x 3 x 5, but the first one, "00000000", 1 x 3 x 4'
+        SpecError, match=r'^db: record "00000002" is 1 x 3 x 5, but the first, "00000000", is 1 x 3 x 4'
     ):
         compute_mean(open_reader(str(tmp_path / "db")), PLACE)
 
@@ -60,9 +60,9 @@ def test_means_with_a_new_shape_field_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\xff\xff", "is no BlobProto of a mean image"),
+        (b"\xff\xff", "is not a BlobProto with a mean image"),
         (BlobProto(shape=BlobShape(dim=[2, 2]), data=[1]).SerializeToString(), "1 numbers in data, expected 4"),
-        (BlobProto(shape=BlobShape(dim=[2]), data=[1, 2]).SerializeToString(), r"holds a blob of shape \(2,\)"),
+        (BlobProto(shape=BlobShape(dim=[2]), data=[1, 2]).SerializeToString(), r"contains a blob of shape \(2,\)"),
     ],
 )
 def test_what_is_no_mean_image_is_refused(tmp_path: Path, content: bytes, message: str) -> None:

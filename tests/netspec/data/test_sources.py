@@ -72,7 +72,7 @@ def test_a_record_of_another_size_is_named(tmp_path: Path) -> None:
     with pytest.raises(SpecError) as fault:
         found.batch(1)
     assert str(fault.value).startswith(
-        'net.prototxt:9:5: record "00000003" gives 1 x 4 x 4, but the first one, "00000000", 3 x 4 x 4'
+        'net.prototxt:9:5: record "00000003" gives 1 x 4 x 4, but the first record, "00000000", gives 3 x 4 x 4'
     )
 
 
@@ -93,5 +93,5 @@ def test_a_record_that_is_no_datum_is_named(tmp_path: Path) -> None:
     reader = open_reader(str(tmp_path / "db"))
     transformer = Transformer(TransformationParameter(), 1, lambda *path: PLACE)
     found = DatabaseSource(reader, Cursor(2, 1), transformer, PLACE)
-    with pytest.raises(SpecError, match=r'^net.prototxt:9:5: record "second" is no Datum \(3 bytes\)$'):
+    with pytest.raises(SpecError, match=r'^net.prototxt:9:5: record "second" is not a Datum \(3 bytes\)$'):
         found.batch(1)

@@ -153,5 +153,5 @@ def test_a_bad_window_file_is_named_with_its_line(folder: Path, old: str, new: s
 
 def test_a_window_beyond_the_image_is_named(folder: Path) -> None:
     (folder / "windows.txt").write_text(FILE.format(folder=folder).replace("10 12 25 27", "10 12 25 30"))
-    with pytest.raises(SpecError, match="does not lie within image"):
+    with pytest.raises(SpecError, match="is not inside image"):
         source(folder, bg_threshold=0.3, fg_fraction=0.0).batch(0)

@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator
 import pytest
 import torch
 
+from fake_gpu import NAME, POSSIBLE, fake_gpu
 from fresh_dialects import fresh_dialects
 from netspec.dialects import use_dialect
 from netspec.layers import Layer
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST
-from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 
 @pytest.fixture(autouse=True)
@@ -54,7 +54,7 @@ def gradcheck() -> Callable[..., None]:
 
 def _compare_on_the_gpu(layer: Layer, bottoms: list[torch.Tensor]) -> None:
     expected = layer.run(*bottoms)
-    with pretended_gpu():
+    with fake_gpu():
         for tensors in (module._parameters for module in layer.modules()):
             tensors.update(
                 {name: torch.nn.Parameter(p.detach().to(NAME)) for name, p in tensors.items() if p is not None}

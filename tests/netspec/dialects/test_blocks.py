@@ -238,7 +238,7 @@ def test_upsample_undoes_pooling() -> None:
     [
         ("upsample_h: 7", [(1, 1, 3, 2)] * 2, "found upsample_h alone, expected upsample_h and upsample_w"),
         ("scale: 3 pad_out_w: true", [(1, 1, 3, 2)] * 2, "pad_out_w needs a scale of 2, found 3"),
-        ("scale_h: 3 scale_w: 2", [(1, 1, 3, 2)], "without a mask as second bottom there is only scale"),
+        ("scale_h: 3 scale_w: 2", [(1, 1, 3, 2)], "without a mask as second bottom only scale can be set"),
         ("scale: 0", [(1, 1, 3, 2)], "the top would have no pixel, 0 x 0"),
         ("scale: 2", [(1, 1, 3, 2), (1, 1, 2, 2)], "the mask's the same"),
     ],
@@ -339,7 +339,7 @@ def test_bn_of_segnet(build: Build, gradcheck: Gradcheck) -> None:
 
 
 def test_bn_refuses_two_forks_at_once(build: Build) -> None:
-    with pytest.raises(SpecError, match="momentum is PSPNet's and bn_mode SegNet's; they do not go together"):
+    with pytest.raises(SpecError, match="momentum is PSPNet's and bn_mode is SegNet's; use one kind only"):
         build("blocks", "type: 'BN' bn_param { momentum: 0.9 bn_mode: INFERENCE }", (2, 3, 4, 4))
 
 

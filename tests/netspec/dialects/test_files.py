@@ -12,7 +12,7 @@ import pytest
 import netspec
 import netspec.dialects
 from netspec.cli import main
-from netspec.dialects import use_dialect
+from netspec.dialects import use_dialect, use_dialects_of
 from netspec.errors import SpecError
 from netspec.layers import layer_class, layer_types
 from netspec.proto.dialect import files as dialect_files
@@ -90,15 +90,15 @@ def test_several_plugins_at_once(fork: Path, capsys: pytest.CaptureFixture[str])
 
 
 FAULTS = {
-    "no such dialect": (None, "ssdd", 'there is no dialect "ssdd"; did you mean "ssd"?'),
+    "no such dialect": (None, "ssdd", 'unknown dialect "ssdd"; did you mean "ssd"?'),
     "nothing like it": (
         None,
         "x" * 20,
-        f'there is no dialect "{"x" * 20}"; known ones: blocks, layout, rcnn, ssd, or the path',
+        f'unknown dialect "{"x" * 20}"; expected one of: blocks, layout, rcnn, ssd, or the path',
     ),
     "no such file": (None, "{path}", "{path}: cannot be read: No such file or directory"),
     "not text": (b"\xff\xfe", "{path}", "{path}: cannot be read: 'utf-8' codec can't decode"),
-    "not Python": (b"a = 1\nclass B(:\n", "{path}", "{path}:2:9: this is not Python: "),
+    "not Python": (b"a = 1\nclass B(:\n", "{path}", "{path}:2:9: this is not valid Python: "),
     "nothing in it": (b"a = 1\n", "{path}", "{path}: declares no dialect: neither DECLARATIONS nor a layer"),
     "declarations that are computed": (
         b"import os\nDECLARATIONS = os.linesep\n",
@@ -113,12 +113,12 @@ FAULTS = {
     "a field that Caffe has": (
         b'DECLARATIONS = "extend LayerParameter { optional int32 name = 990; }"\n',
         "{path}",
-        '{path}: caffe.LayerParameter has a field "name" already',
+        '{path}: caffe.LayerParameter already has a field "name"',
     ),
     "a type that Caffe has": (
         b'from netspec.layers import *\n@register("ReLU")\nclass A(Layer): pass\n',
         "{path}",
-        '{path}: layer type "ReLU" is there already, from netspec.layers.activation',
+        '{path}: layer type "ReLU" already exists, from netspec.layers.activation',
     ),
     "a fault when it runs": (
         b'from netspec.layers import register\n\nregister("Mine")(1 / 0)\n',
@@ -145,12 +145,12 @@ def test_two_dialects_with_one_type_number_or_name_do_not_go_together(fork: Path
     use_dialect(fork)
     other = tmp_path / "tripling.py"
     other.write_text('from netspec.layers import Layer, register\n@register("Times")\nclass A(Layer): pass\n')
-    with pytest.raises(SpecError, match='layer type "Times" is there already, from netspec_dialect_doubling'):
+    with pytest.raises(SpecError, match='layer type "Times" already exists, from netspec_dialect_doubling'):
         use_dialect(other)
     third = tmp_path / "same_number.py"
     third.write_text('DECLARATIONS = "extend LayerParameter { optional int32 even_more = 1000; }"\n')
     with pytest.raises(
-        SpecError, match=r'number 1000 of caffe\.LayerParameter is taken, by "times_param" of dialect "doub'
+        SpecError, match=r'number 1000 of caffe\.LayerParameter is used by "times_param" of dialect "doub'
     ):
         use_dialect(third)
     namesake = tmp_path / "elsewhere" / "doubling.py"
@@ -254,10 +254,34 @@ def test_a_packages_entry_point_is_hinted_at_and_used(tmp_path: Path, capsys: py
     assert main(["check", str(net)]) == 1
     error = capsys.readouterr().err
     assert 'of dialect "doubling_too"; add --plugin doubling_too' in error
-    assert 'dialect "absent": there is no module forky.absent; it is left out' in error
-    assert 'dialect "nothing" is left out: ' in error
+    assert 'dialect "absent": there is no module forky.absent; the dialect is ignored' in error
+    assert 'dialect "nothing" is ignored: ' in error
     assert "forky.doubling" not in sys.modules
     assert main(["check", str(net), "--plugin", "doubling_too"]) == 0
     cls = layer_class("Thrice")
     assert cls is not None
     assert cls.__module__ == "forky.doubling"
+
+
+# ---- Found by themselves ----
+
+
+def test_a_prototxt_switches_on_what_it_needs(files_afresh: None) -> None:
+    text = 'layer { name: "n" type: "Normalize" bottom: "x" top: "n" norm_param { across_spatial: false } }'
+    assert use_dialects_of(text, "x.prototxt") == ["ssd"]
+    assert layer_class("Normalize") is not None
+    assert use_dialects_of(text, "x.prototxt") == []
+
+
+def test_a_prototxt_of_caffes_own_layers_switches_on_nothing(files_afresh: None) -> None:
+    text = 'layer { name: "Normalize" type: "ReLU" bottom: "Permute" top: "Swish" }'  # names, not types
+    assert use_dialects_of(text, "x.prototxt") == []
+
+
+def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None:
+    text = 'layer { type: "Permute" permute_param { order: 0 } } layer { type: "Axpy" } layer { type: "Normalize" }'
+    assert use_dialects_of(text, "x.prototxt") == ["ssd", "blocks"]
+
+
+def test_what_no_dialect_has_is_left_to_the_reader(files_afresh: None) -> None:
+    assert use_dialects_of('layer { type: "NoSuchType" no_such_param { } }', "x.prototxt") == []

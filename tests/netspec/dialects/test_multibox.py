@@ -318,7 +318,7 @@ def test_suppression_without_a_top_k_leaves_nothing(build: Build) -> None:
     ("settings", "message"),
     [
         ("", "num_classes must be given"),
-        ("num_classes: 4 background_label_id: 4", "background_label_id 4 is none of the 4 classes"),
+        ("num_classes: 4 background_label_id: 4", "background_label_id 4 is not one of the 4 classes"),
         ("num_classes: 4 map_object_to_agnostic: true", "map_object_to_agnostic needs num_classes: 2"),
         ("num_classes: 4 share_location: false", "mining needs share_location: true"),
         ("num_classes: 4 do_neg_mining: false", "do_neg_mining is outdated and contradicts mining_type"),

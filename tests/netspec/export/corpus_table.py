@@ -47,7 +47,7 @@ def attempt(run: Callable[[], Arrays], expected: Arrays) -> str:
     """Return the difference, or why there is none."""
     try:
         return difference(run(), expected)
-    except Exception as fault:  # a table row says what went wrong, whoever raised it
+    except Exception as fault:  # any error becomes a row of the table
         return " ".join(str(fault).split())[-160:]
 
 

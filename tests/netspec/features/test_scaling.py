@@ -34,7 +34,7 @@ def test_given_steps_replace_the_transform_param():
     layer = LayerParameter(name="d", transform_param={"scale": 3, "mean_value": [1]})
     assert scaled(Steps(), layer) == [27, 57, 87]
     assert scaled(Steps(scale=2.0), layer) == [20, 40, 60]
-    assert str(scaling_of(Steps(scale=2.0), layer, SHAPE, "f")) == "0 to 255, times 2, as the options say"
+    assert str(scaling_of(Steps(scale=2.0), layer, SHAPE, "f")) == "0 to 255, times 2 (from the options)"
 
 
 def test_a_mean_image_is_cut_at_its_center():
@@ -84,7 +84,7 @@ def test_extract_and_the_describer_take_the_steps(run: Callable[..., Any], color
     result = run(*words, "--images", colors, *steps)
     assert (
         result.out.splitlines()[1]
-        == "data (3 x 2 x 2): RGB, 0 to 255, times 2, minus 1, 2, 3, times 0.5, as the options say"
+        == "data (3 x 2 x 2): RGB, 0 to 255, times 2, minus 1, 2, 3, times 0.5 (from the options)"
     )
     expected = np.repeat([29.5, 19, 8.5], 4)
     np.testing.assert_array_equal(np.load("f.npz")["features"], [expected])

@@ -38,7 +38,7 @@ def test_inner_product_gradients(build, gradcheck, settings: str) -> None:
 def test_inner_product_takes_another_batch_but_no_other_length(build) -> None:
     layer = build('type: "InnerProduct" inner_product_param { num_output: 3 }', (2, 3, 4))
     assert layer.run(torch.randn(7, 4, 3))[0].shape == (7, 3)  # only the count matters
-    with pytest.raises(SpecError, match=r"^bottom: .* has 15 values from axis 1 on, the weights 12"):
+    with pytest.raises(SpecError, match=r"^bottom: .* has 15 values from axis 1 on, expected 12"):
         layer.run(torch.randn(2, 3, 5))
 
 
@@ -114,7 +114,7 @@ def test_embed_without_bias_takes_another_shape(build) -> None:
 @pytest.mark.parametrize("index", [-1.0, 5.0, 1.5, math.nan])
 def test_embed_refuses_what_is_no_index(build, index: float) -> None:
     layer = build('type: "Embed" embed_param { num_output: 3 input_dim: 5 }', (2,))
-    with pytest.raises(SpecError, match=rf"^bottom: found the index {index:g}, expected whole numbers from 0 to 4"):
+    with pytest.raises(SpecError, match=rf"^bottom: found index {index:g}, expected integers from 0 to 4"):
         layer.run(torch.tensor([1.0, index]))
 
 
@@ -134,5 +134,5 @@ def test_embed_needs_both_its_sizes(build, missing: str) -> None:
     ],
 )
 def test_no_blob_has_a_size_below_0(build, text: str) -> None:
-    with pytest.raises(SpecError, match=r"found shape \(2, -3\), expected no size below 0"):
+    with pytest.raises(SpecError, match=r"found shape \(2, -3\), expected no negative size"):
         build(text)

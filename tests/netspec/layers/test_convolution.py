@@ -12,7 +12,7 @@ FILL = 'weight_filler { type: "gaussian" } bias_filler { type: "gaussian" }'
 
 
 def positions(bottom: tuple, kernel: tuple, stride: tuple, pad: tuple, dilation: tuple) -> tuple[int, ...]:
-    """Return how often a filter fits along each axis; the quotient rounds towards zero, as in C++."""
+    """Return how often a filter fits along each axis; the quotient rounds toward zero, as in C++."""
     sizes = zip(bottom, kernel, stride, pad, dilation, strict=True)
     return tuple(math.trunc((n + 2 * p - d * (k - 1) - 1) / s) + 1 for n, k, s, p, d in sizes)
 
@@ -178,7 +178,7 @@ def test_another_batch_or_map_size_is_taken_as_it_comes(build) -> None:
     for shape in ((5, 3, 6, 6), (1, 3, 9, 4), (0, 3, 6, 6)):
         (top,) = layer.run(torch.randn(shape))
         assert layer.top_shapes == [tuple(top.shape)] == [(shape[0], 4, shape[2] - 2, shape[3] - 2)]
-    with pytest.raises(SpecError, match=r"^bottom: bottom of shape \(2, 4, 6, 6\) does not suit the filters"):
+    with pytest.raises(SpecError, match=r"^bottom: bottom of shape \(2, 4, 6, 6\) does not fit the filters"):
         layer.run(torch.randn(2, 4, 6, 6))
 
 

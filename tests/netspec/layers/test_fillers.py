@@ -117,7 +117,7 @@ def test_one_seed_gives_one_result() -> None:
         ('type: "gaussian" std: -1', SHAPE, "std > 0, found -1"),
         ('type: "gaussian" sparse: -2', SHAPE, "sparse >= 0"),
         ('type: "gaussian" sparse: 201', SHAPE, "sparse <= shape[0] = 200, found 201"),
-        ('type: "xavier" sparse: 3', SHAPE, 'filler "xavier" knows no sparse'),
+        ('type: "xavier" sparse: 3', SHAPE, 'filler "xavier" does not support sparse'),
         ('type: "uniform" min: 1 max: 0', SHAPE, "min <= max"),
         ('type: "bilinear"', (4, 1, 3, 4), "square filters, found shape (4, 1, 3, 4)"),
         ('type: "bilinear"', (4, 9), "4-D blob"),

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fake_gpu import NAME, POSSIBLE, fake_gpu
 from golden_cases import LayerCase, promised
 from paths import GOLDEN
-from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 
 CASES = sorted((GOLDEN / "layers").iterdir())
 TOLERANCE = 1e-5  # of the largest element
@@ -19,10 +19,10 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
     if request.param == "cpu":
         yield "cpu"
     elif POSSIBLE:
-        with pretended_gpu():
+        with fake_gpu():
             yield NAME
     else:
-        pytest.skip("this torch cannot pretend a GPU")
+        pytest.skip("this torch cannot make a fake device")
 
 
 @pytest.mark.parametrize("exact", ["none", "small", "all"])

@@ -54,7 +54,7 @@ def softmax_loss(x: np.ndarray, labels: np.ndarray, mode: str, ignore: int | Non
 
 @pytest.mark.parametrize("ignore", [None, 2, 255])
 @pytest.mark.parametrize("mode", [FULL, VALID, BATCH_SIZE, NONE])
-def test_softmax_with_loss_in_every_normalisation(build, mode: str, ignore: int | None) -> None:
+def test_softmax_with_loss_in_every_normalization(build, mode: str, ignore: int | None) -> None:
     given = "" if ignore is None else f"ignore_label: {ignore}"
     layer = build(f'type: "SoftmaxWithLoss" loss_param {{ normalization: {mode} {given} }}', (3, 4, 2, 5), (3, 2, 5))
     x = torch.randn(3, 4, 2, 5)
@@ -127,7 +127,7 @@ def test_a_loss_without_top_is_made_one(build) -> None:
 
 
 def infogain_loss(x: np.ndarray, labels: np.ndarray, gain: np.ndarray, ignore: int | None) -> tuple[float, np.ndarray]:
-    """Caffe's loops; x (outer, classes, inner), labels (outer, inner); normalised by the valid ones."""
+    """Caffe's loops; x (outer, classes, inner), labels (outer, inner); normalized by the valid ones."""
     p = softmax(x)
     total, valid, grad = 0.0, 0, np.zeros_like(p)
     for i, j in np.ndindex(*labels.shape):
@@ -422,8 +422,8 @@ def test_labels_never_get_a_gradient_and_batches_may_change(build, kind: str, sh
         (
             'type: "SoftmaxWithLoss"',
             [(4, 3, 2), (4,)],
-            "bottom.1: found 4 labels, shape (4,), for 8 predictions, shape (4, 3, 2); expected one label (0 to 2) a "
-            "prediction along axis 1",
+            "bottom.1: found 4 labels, shape (4,), for 8 predictions, shape (4, 3, 2); expected one label (0 to 2) "
+            "per prediction along axis 1",
         ),
         (
             'type: "SoftmaxWithLoss"',
@@ -459,7 +459,7 @@ def test_labels_never_get_a_gradient_and_batches_may_change(build, kind: str, sh
         (
             'type: "EuclideanLoss"',
             [(4, 3), (4, 2)],
-            "bottom: found bottoms of shapes (4, 3) and (4, 2), expected as many numbers an item",
+            "bottom: found bottoms of shapes (4, 3) and (4, 2), expected as many values per item",
         ),
         ('type: "HingeLoss"', [(4, 3), (4, 2)], "bottom.1: found 8 labels, shape (4, 2), for 4 predictions"),
         (
@@ -475,7 +475,7 @@ def test_labels_never_get_a_gradient_and_batches_may_change(build, kind: str, sh
         (
             'type: "ContrastiveLoss"',
             [(4, 3), (4, 3), (4, 2)],
-            "bottom.2: found labels of shape (4, 2), expected one a pair: (4,)",
+            "bottom.2: found labels of shape (4, 2), expected one per pair: (4,)",
         ),
         (
             'type: "Accuracy" accuracy_param { top_k: 4 }',

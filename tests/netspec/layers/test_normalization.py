@@ -156,7 +156,7 @@ def test_wrong_batch_norm_is_refused(build, settings: str, shape: tuple, words: 
 def test_batch_norm_takes_another_map_but_no_other_channels(build) -> None:
     layer = build('type: "BatchNorm" param { lr_mult: 0 }', (2, 3, 4, 4), phase=TRAIN)
     assert layer.run(torch.randn(5, 3, 2, 2))[0].shape == (5, 3, 2, 2)
-    with pytest.raises(SpecError, match=r"bottom of shape \(2, 4, 4, 4\) has not the 3 channels"):
+    with pytest.raises(SpecError, match=r"found a bottom of shape \(2, 4, 4, 4\), expected 3 channels"):
         layer.run(torch.randn(2, 4, 4, 4))
 
 

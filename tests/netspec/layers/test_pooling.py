@@ -239,15 +239,15 @@ def test_stochastic_pooling_in_the_test_phase_weights_each_pixel_by_itself(build
         ("kernel_size: 2 stride_h: 2 stride_w: 0", (1, 1, 4, 4), 1, "stride must be at least 1, found 2 x 0"),
         ("kernel_size: 2 pad: 1 pad_h: 1 pad_w: 1", (1, 1, 4, 4), 1, "found both pad and pad_h"),
         ("kernel_size: 2 pad: 2", (1, 1, 4, 4), 1, "pad (2, 2) must be less than the kernel (2, 2)"),
-        ("pool: STOCHASTIC kernel_size: 2 pad: 1", (1, 1, 4, 4), 1, "STOCHASTIC pooling knows no padding"),
+        ("pool: STOCHASTIC kernel_size: 2 pad: 1", (1, 1, 4, 4), 1, "STOCHASTIC pooling does not support padding"),
         (
             "global_pooling: true kernel_size: 2",
             (1, 1, 4, 4),
             1,
             "pooling_param.kernel_size: global_pooling takes the",
         ),
-        ("global_pooling: true stride: 2", (1, 1, 4, 4), 1, "global_pooling goes with pad 0 and stride 1 only"),
-        ("global_pooling: true pad: 1", (1, 1, 4, 4), 1, "global_pooling goes with pad 0 and stride 1 only"),
+        ("global_pooling: true stride: 2", (1, 1, 4, 4), 1, "global_pooling requires pad 0 and stride 1"),
+        ("global_pooling: true pad: 1", (1, 1, 4, 4), 1, "global_pooling requires pad 0 and stride 1"),
         ("pool: AVE kernel_size: 2", (1, 1, 4, 4), 2, "top.1: only MAX pooling has a second top"),
         ("kernel_size: 2", (1, 4, 4), 1, "bottom: pooling needs a bottom of 4 axes"),
         ("kernel_size: 5", (1, 1, 4, 4), 1, "no window of (5, 5) at stride (1, 1), pad (0, 0), fits a map of (4, 4)"),
@@ -289,7 +289,7 @@ def test_spp_of_one_level_keeps_four_axes(build) -> None:
     [
         ("", (2, 3, 9, 9), "spp_param.pyramid_height: pyramid_height must be at least 1"),
         ("pyramid_height: 3", (2, 3, 5, 9), "spp_param: pad (2, 2) must be less than the kernel (2, 3)"),
-        ("pyramid_height: 2 pool: STOCHASTIC", (2, 3, 5, 9), "STOCHASTIC pooling knows no padding"),
+        ("pyramid_height: 2 pool: STOCHASTIC", (2, 3, 5, 9), "STOCHASTIC pooling does not support padding"),
         ("pyramid_height: 2", (2, 3, 5), "SPP needs a bottom of 4 axes"),
     ],
 )

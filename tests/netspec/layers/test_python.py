@@ -171,8 +171,8 @@ def test_code_of_a_prototxt_runs_only_where_it_is_allowed_to(python) -> None:
     with pytest.raises(SpecError) as fault:
         python("TimesTen", (2, 3), allow_python=False)
     assert str(fault.value) == (
-        'net.prototxt:7:3: layer "mine" (Python): a Python layer runs code that the prototxt names; pass '
-        "--allow-python-layers where you trust it"
+        'net.prototxt:7:3: layer "mine" (Python): a Python layer runs code named in the prototxt; pass '
+        "--allow-python-layers if you trust it"
     )
     assert "layers_of_mine" not in sys.modules
 
@@ -309,7 +309,7 @@ def test_what_the_stand_in_lacks_is_named(python, tmp_path: Path, monkeypatch: p
         pycaffe_shim, "_offered", {"caffe": pycaffe_shim}
     )  # as long as nobody has imported netspec.pycaffe
     (tmp_path / "wants_more.py").write_text("import caffe\nnet = caffe.Net('a', 'b', caffe.TEST)\n")
-    with pytest.raises(SpecError, match=r"netspec's stand-in for pycaffe has no Net; it offers Layer, TRAIN and TEST"):
+    with pytest.raises(SpecError, match=r"netspec's replacement for pycaffe has no Net; it has Layer, TRAIN and TEST"):
         python("Mine", (2,), module="wants_more")
 
 
@@ -323,7 +323,7 @@ def test_what_the_stand_in_lacks_is_named(python, tmp_path: Path, monkeypatch: p
             "No module named 'nowhere'",
         ),
         ("TimesTwn", {}, 'layers_of_mine.py) has no class "TimesTwn"; did you mean "TimesTen"?'),
-        ("NoLayer", {}, "layers_of_mine.NoLayer is no caffe.Layer"),
+        ("NoLayer", {}, "layers_of_mine.NoLayer is not a caffe.Layer"),
         ("Euclidean", {}, "layers_of_mine.Euclidean.setup: Exception: Need two inputs to compute distance. ("),
         ("Count", {"param_str": "{}"}, "layers_of_mine.Count.setup: KeyError: 'size' ("),
     ],

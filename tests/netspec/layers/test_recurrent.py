@@ -187,7 +187,7 @@ def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
             text("LSTM"),
             [(T, N, 3), (N, T)],
             1,
-            "bottom.1: found cont of shape (2, 4), expected (4, 2), x being (4, 2, 3)",
+            "bottom.1: found cont of shape (2, 4), expected (4, 2) for x of shape (4, 2, 3)",
         ),
         (
             text("LSTM"),
@@ -211,7 +211,7 @@ def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
             text("RNN"),
             [(T, N, 3), (T, N), (T, 5)],
             1,
-            "bottom.2: found x_static of shape (4, 5), expected (2, ...), x being (4, 2, 3)",
+            "bottom.2: found x_static of shape (4, 5), expected (2, ...) for x of shape (4, 2, 3)",
         ),
         (text("LSTM"), [(T, N, 3), (T, N)], 3, "top: found 3 top blob(s), expected the output"),
         (

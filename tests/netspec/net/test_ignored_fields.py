@@ -65,7 +65,7 @@ def test_a_field_without_effect_is_named(net_of, warnings, text: str, field: str
 
 def test_debug_info_of_a_net_is_named(net_of, warnings) -> None:
     net_of(INPUT + "debug_info: true")
-    assert warnings() == ["net.prototxt:2:1: debug_info has no effect: only the solver's has"]
+    assert warnings() == ["net.prototxt:2:1: debug_info has no effect in a net; set it in the solver"]
 
 
 def test_the_same_field_of_many_layers_is_named_once(net_of, warnings) -> None:
@@ -73,7 +73,7 @@ def test_the_same_field_of_many_layers_is_named_once(net_of, warnings) -> None:
     net_of(INPUT + "".join(layer("InnerProduct", filler, name) for name in "abc"))
     (found,) = warnings()
     assert found.startswith('net.prototxt:2:128: layer "a" (InnerProduct): inner_product_param.weight_filler.std')
-    assert found.endswith('filler "xavier" does not read it (nor in 2 more of these layers)')
+    assert found.endswith('filler "xavier" does not read it (also in 2 more of these layers)')
 
 
 @pytest.mark.parametrize(

@@ -58,8 +58,8 @@ def test_there_is_no_limit_of_64_megabytes(tmp_path: Path) -> None:
             b"\x89HDF\r\n\x1a\n" + bytes(100),
             "expected a binary NetParameter, found an HDF5 file; its name should end in .h5",
         ),
-        (struct.pack("<BB", 10, 200), "found something else, or a part of one: is the file whole?"),
-        (b"\x68\x01", "found something else, or a part of one: is the file whole?"),
+        (struct.pack("<BB", 10, 200), "found another kind of data, or a truncated file"),
+        (b"\x68\x01", "found another kind of data, or a truncated file"),
     ],
     ids=["empty", "text", "HDF5", "cut off", "no known field"],
 )

@@ -19,7 +19,7 @@ from netspec.proto.text import parse_net_text, write_text
 PROTO = Path(schema.__file__).parent
 
 SOURCE = """
-// A made-up fork.
+// A fictional fork.
 message WarpParameter {
   enum Border { ZERO = 0; EDGE = -1; }  /* two
                                            lines */
@@ -95,7 +95,7 @@ def test_fields_of_an_active_dialect_are_read_and_written() -> None:
 def test_faults_in_a_dialects_fields_have_places() -> None:
     with pytest.raises(SpecError, match=r'^f:1:22: WarpParameter has no field "scal"; did you mean "scale"\?$'):
         parse_net_text("layer { warp_param { scal: 3 } }", "f")
-    with pytest.raises(SpecError, match=r'^f:1:22: Corner lacks "x", which it requires$'):
+    with pytest.raises(SpecError, match=r'^f:1:22: Corner lacks the required field "x"$'):
         parse_net_text("layer { warp_param { corner {} } }", "f")
 
 
@@ -138,7 +138,7 @@ def test_an_unknown_type_or_field_tells_which_known_dialects_have_it() -> None:
 REFUSED = {
     "a field that Caffe has": (
         "extend LayerParameter { optional int32 name = 990; }",
-        'bad.proto: caffe.LayerParameter has a field "name" already',
+        'bad.proto: caffe.LayerParameter already has a field "name"',
     ),
     "a number that Caffe has": ("extend LayerParameter { optional int32 x = 100; }", "do not fit Caffe's schema"),
     "an unknown type": ("extend LayerParameter { optional Thing x = 991; }", "do not fit Caffe's schema"),
@@ -169,7 +169,7 @@ def test_bad_declarations_are_refused(source: str, message: str) -> None:
 
 def test_two_dialects_with_one_field_are_not_active_together(fork: Dialect) -> None:
     rival = Dialect("rival", "extend LayerParameter { optional int32 warp_param = 950; }")
-    with pytest.raises(SpecError, match=r'^rival\.proto: caffe\.LayerParameter has a field "warp_param" already$'):
+    with pytest.raises(SpecError, match=r'^rival\.proto: caffe\.LayerParameter already has a field "warp_param"$'):
         dialect.activate(rival)
     dialect.deactivate(fork.name)
     dialect.activate(rival)

@@ -67,15 +67,15 @@ FAULTS = {
     ),
     "given twice": (
         'name: "a"\n\nname: "b"',
-        'f:3:1: "name" was given already, in line 1; it can be given once',
+        'f:3:1: "name" was already given in line 1; it can be given only once',
     ),
     "message given twice": (
         "state {}\nstate {}",
-        'f:2:1: "state" was given already, in line 1; it can be given once',
+        'f:2:1: "state" was already given in line 1; it can be given only once',
     ),
     "ceil_mode and round_mode": (
         "layer { pooling_param { round_mode: CEIL\nceil_mode: true } }",
-        'f:2:1: "round_mode" was given already, in line 1; it can be given once',
+        'f:2:1: "round_mode" was already given in line 1; it can be given only once',
     ),
     "string without quotes": ("name: net", 'f:1:7: expected a string for "name", found "net"; put it in quotes'),
     "string for an integer": (
@@ -109,7 +109,7 @@ FAULTS = {
     "list for one value": ('name: ["a"]', 'f:1:7: expected a string for "name", found "["'),
     "required field": (
         'layer {\n  name: "c"\n  clip_param {\n    min: 0\n  }\n}',
-        'f:3:3: layer "c": ClipParameter lacks "max", which it requires',
+        'f:3:3: layer "c": ClipParameter lacks the required field "max"',
     ),
     "no closing quote": ('name: "net\n', "f:1:7: string without a closing quote"),
     "no closing quote, seen at the next string": (

@@ -1,4 +1,4 @@
-"""The schema is Caffe's to the last default, its compiled form is up to date, and it disturbs nobody else."""
+"""The schema equals Caffe's to the last default, its compiled form is up to date, and it conflicts with no other."""
 
 import csv
 import subprocess

@@ -1,4 +1,4 @@
-"""pycaffe on a GPU, a pretended one: what is left on the wrong device shows, and what is not brought over."""
+"""pycaffe on a GPU, a fake one: it shows tensors on the wrong device, and missing copies."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,21 +8,21 @@ import pytest
 import torch
 
 import netspec.pycaffe as caffe
+from fake_gpu import NAME, POSSIBLE, fake_gpu
 from golden_cases import LayerCase
 from netspec.pycaffe import mode
 from paths import GOLDEN
-from pretend_gpu import NAME, POSSIBLE, pretended_gpu
 from pycaffe_cases import compute
 from pycaffe_nets import SMALL
 
-pytestmark = pytest.mark.skipif(not POSSIBLE, reason="this torch cannot pretend a GPU")
+pytestmark = pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
 LAYERS = sorted((GOLDEN / "layers").iterdir())
 
 
 @pytest.fixture(autouse=True)
 def _gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(mode, "device", lambda: torch.device(NAME))
-    with pretended_gpu():
+    with fake_gpu():
         yield
 
 

@@ -151,7 +151,8 @@ def test_settings_that_do_not_suit_the_input(transformer: Transformer) -> None:
         transformer.set_transpose("data", (1, 0))
     with pytest.raises(Exception, match="Channel swap needs to have the same number of dimensions as the input chan"):
         transformer.set_channel_swap("data", (1, 0))
-    for call in (transformer.set_raw_scale, transformer.set_mean, transformer.preprocess, transformer.deprocess):
+    calls: list[Any] = [transformer.set_raw_scale, transformer.set_mean, transformer.preprocess, transformer.deprocess]
+    for call in calls:
         with pytest.raises(Exception, match=r"image is not one of the net inputs: \['data'\]"):
             call("image", 1)  # pyright: ignore[reportArgumentType]  # refused for its name
 

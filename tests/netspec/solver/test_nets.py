@@ -90,7 +90,7 @@ def test_a_net_within_the_solver_keeps_its_places():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"^s\.prototxt: the solver names no net to train"),
+        ("", r"^s\.prototxt: the solver has no net to train"),
         (
             'net: "a.prototxt"\ntrain_net: "b.prototxt"',
             r"^s\.prototxt:2:1: found net and train_net, expected exactly one of",

@@ -239,7 +239,7 @@ def test_weights_and_a_snapshot_exclude_each_other(make):
     [
         (
             'base_lr: 0.1\nlr_policy: "fixed"',
-            r"^s\.prototxt: the solver names no net to train, expected exactly one of net",
+            r"^s\.prototxt: the solver has no net to train, expected exactly one of net",
         ),
         (SETTINGS.replace('"fixed"', '"stp"'), r'^s\.prototxt:3:1: unknown lr_policy "stp"'),
         (SETTINGS + 'type: "Adan"', r'^s\.prototxt:6:1: unknown solver type "Adan"'),
@@ -283,10 +283,12 @@ def test_gpu_mode_without_a_gpu_runs_on_the_cpu_and_warns_once(make, monkeypatch
         solver.step(1)
     assert solver.net.device.type == "cpu"
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert warnings == ["s.prototxt:4:1: solver_mode GPU, but torch finds no GPU here: running on the CPU"]
+    assert warnings == ["s.prototxt:4:1: solver_mode GPU, but torch finds no GPU: running on the CPU"]
 
 
 def test_a_gpu_that_is_not_there_is_refused(make, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(SpecError, match=r"^s\.prototxt:6:1: found device_id 3, but torch finds 1 GPU\(s\) here"):
+    with pytest.raises(
+        SpecError, match=r"^s\.prototxt:6:1: found device_id 3, but torch finds 1 GPU\(s\) on this machine"
+    ):
         make("device_id: 3", settings=SETTINGS.replace("CPU", "GPU"))

@@ -1,0 +1,68 @@
+"""cv2.dnn's interface for Caffe's files, which OpenCV 5 no longer reads; all else of cv2.dnn is passed through.
+
+    from netspec import dnn  # in place of cv2.dnn
+
+    net = dnn.readNetFromCaffe("deploy.prototxt", "x.caffemodel")
+    net.setInput(dnn.blobFromImage(image, 1.0, (300, 300), (104, 117, 123)))
+    detections = net.forward()
+
+Results, shapes, names and numbers are OpenCV 4's. What differs: docs/coming-from-opencv.md
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+from cv2 import dnn as _opencv  # held here, so that a program may say ``cv2.dnn = dnn``
+
+from netspec.dnn.errors import DnnError
+from netspec.dnn.models import ClassificationModel, DetectionModel, Model, SegmentationModel
+from netspec.dnn.net import Layer, Net
+from netspec.dnn.read import readNet, readNetFromCaffe
+
+__all__ = [
+    "ClassificationModel",
+    "DetectionModel",
+    "DnnError",
+    "Layer",
+    "Model",
+    "Net",
+    "SegmentationModel",
+    "readNet",
+    "readNetFromCaffe",
+]
+
+#: OpenCV 4's constants, some of which OpenCV 5 left out.
+DNN_BACKEND_DEFAULT = 0
+DNN_BACKEND_HALIDE = 1
+DNN_BACKEND_INFERENCE_ENGINE = 2
+DNN_BACKEND_OPENCV = 3
+DNN_BACKEND_VKCOM = 4
+DNN_BACKEND_CUDA = 5
+DNN_BACKEND_WEBNN = 6
+DNN_BACKEND_TIMVX = 7
+DNN_BACKEND_CANN = 8
+DNN_TARGET_CPU = 0
+DNN_TARGET_OPENCL = 1
+DNN_TARGET_OPENCL_FP16 = 2
+DNN_TARGET_MYRIAD = 3
+DNN_TARGET_VULKAN = 4
+DNN_TARGET_FPGA = 5
+DNN_TARGET_CUDA = 6
+DNN_TARGET_CUDA_FP16 = 7
+DNN_TARGET_HDDL = 8
+DNN_TARGET_NPU = 9
+DNN_TARGET_CPU_FP16 = 10
+
+
+def __getattr__(name: str) -> Any:
+    try:
+        return getattr(_opencv, name)
+    except AttributeError:
+        message = f"module 'netspec.dnn' has no attribute {name!r}, nor has cv2.dnn of OpenCV {cv2.__version__}"
+        raise AttributeError(message) from None
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *dir(_opencv)})

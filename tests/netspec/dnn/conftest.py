@@ -1,0 +1,22 @@
+"""The dialects that these nets switch on are off again after each file of tests."""
+
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from netspec.layers import registry
+from netspec.proto.dialect import files as dialect_files
+from netspec.proto.dialect import registry as dialect
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _leave_no_dialect() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
+        yield
+    for name in dialect.active():
+        dialect.deactivate(name)
+    own = [file.module for file in dialect_files.known_files().values()]
+    for name in [name for name in sys.modules if name in (*own, "netspec.dnn.opencv_layers")]:
+        del sys.modules[name]

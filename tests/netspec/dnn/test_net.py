@@ -1,0 +1,204 @@
+"""Net of netspec.dnn where it goes beyond OpenCV's, or answers wrong use."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import netspec
+from dnn_program import HERE
+from netspec import dnn
+
+DATA = np.random.RandomState(0).rand(1, 3, 20, 20).astype(np.float32)
+INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 dim: 8 dim: 8 } } }\n'
+
+
+def read(name: str) -> dnn.Net:
+    return dnn.readNetFromCaffe(HERE / f"{name}.prototxt", HERE / f"{name}.caffemodel")
+
+
+def made(layers: str) -> dnn.Net:
+    return dnn.readNetFromCaffe((INPUT + layers).encode())
+
+
+def test_a_fault_is_a_cv2_error_and_a_spec_error() -> None:
+    with pytest.raises(cv2.error) as caught:
+        made('layer { name: "x" type: "Powr" bottom: "data" top: "x" }')
+    fault = caught.value
+    assert isinstance(fault, netspec.SpecError)
+    assert str(fault) == fault.msg
+    assert str(fault).startswith('<prototxt>:2:19: layer "x" (Powr): unknown layer type "Powr"; did you mean "Power"?')
+    assert (fault.file, fault.line, fault.func) == ("<prototxt>", 2, "readNetFromCaffe")
+
+
+def test_a_wrong_input_name_lists_the_names() -> None:
+    with pytest.raises(dnn.DnnError, match=r'two_inputs.prototxt: no input "data" in this net; its inputs: a, b$'):
+        read("two_inputs").setInput(DATA, "data")
+
+
+def test_a_missing_input_is_named() -> None:
+    net = read("two_inputs")
+    net.setInput(np.zeros((1, 4, 6, 6)), "a")
+    with pytest.raises(dnn.DnnError, match=r'no value for input "b"; this net\'s inputs: a, b$'):
+        net.forward()
+
+
+def test_a_wrong_shape_says_both_shapes() -> None:
+    net = read("classify")
+    net.setInput(DATA[:, :2])
+    with pytest.raises(dnn.DnnError, match=r"bottom of shape \(1, 2, 20, 20\) .* made for 3 channels") as caught:
+        net.forward()
+    ending = 'input "data" has shape (1, 2, 20, 20), the prototxt declares (1, 3, 20, 20)'
+    assert str(caught.value).endswith(ending)
+
+
+def test_a_net_goes_on_after_a_fault() -> None:
+    net = read("classify")
+    net.setInput(DATA)
+    expected = net.forward()
+    net.setInput(DATA[:, :2])
+    with pytest.raises(cv2.error):
+        net.forward()
+    net.setInput(DATA)
+    np.testing.assert_array_equal(net.forward(), expected)
+
+
+def test_a_wrong_layer_name_lists_the_names() -> None:
+    with pytest.raises(
+        dnn.DnnError, match=r'no layer "scoers" in this net; did you mean "scores"\? it has: conv, bend'
+    ):
+        read("segment").forward("scoers")
+
+
+@pytest.mark.parametrize("as_content", [bytes, bytearray, lambda data: np.frombuffer(data, np.uint8), memoryview])
+def test_files_are_given_as_content(as_content: Callable[[bytes], Any]) -> None:
+    given = [as_content((HERE / f"classify.{ending}").read_bytes()) for ending in ("prototxt", "caffemodel")]
+    nets = [dnn.readNetFromCaffe(*given), read("classify"), dnn.readNet("caffe", given[1], given[0])]
+    outputs = []
+    for net in nets:
+        net.setInput(DATA)
+        outputs.append(net.forward())
+    np.testing.assert_array_equal(outputs[0], outputs[1])
+    np.testing.assert_array_equal(outputs[2], outputs[1])
+
+
+def test_weights_that_are_none_are_refused() -> None:
+    with pytest.raises(dnn.DnnError, match="<caffeModel>: expected a binary NetParameter, found text"):
+        dnn.readNetFromCaffe(HERE / "classify.prototxt", b"these are words, not weights")
+
+
+def test_other_files_go_to_opencv() -> None:
+    with pytest.raises(cv2.error, match="Cannot determine an origin framework"):
+        dnn.readNet("net.unknown")
+
+
+def test_inputs_of_any_kind_of_number() -> None:
+    net = read("classify")
+    images = (DATA * 255).astype(np.uint8)
+    net.setInput(images.astype(np.float32))
+    expected = net.forward()
+    for given in (images, images.astype(np.float64), images.astype(np.int32), cv2.UMat(images.reshape(60, 20))):
+        net.setInput(given.get().reshape(images.shape) if isinstance(given, cv2.UMat) else given)
+        np.testing.assert_array_equal(net.forward(), expected)
+
+
+def test_an_input_is_kept_apart_from_the_callers_array() -> None:
+    net, values = made('layer { name: "x" type: "Split" bottom: "data" top: "x" }'), np.ones((1, 3, 8, 8), np.float32)
+    net.setInput(values)
+    values[:] = 7
+    net.forward()[:] = 8
+    assert (net.forward() == 1).all()
+
+
+@pytest.mark.parametrize("declared", ['input: "x"', 'layer { name: "x" type: "Input" top: "x" }'])
+def test_an_input_without_a_shape_gets_the_arrays(declared: str) -> None:
+    net = dnn.readNetFromCaffe(f'{declared} layer {{ name: "y" type: "Power" bottom: "x" top: "y" }}'.encode())
+    net.setInput(DATA)
+    np.testing.assert_array_equal(net.forward(), DATA)
+
+
+def test_tops_of_layers_that_are_overwritten_in_place() -> None:
+    net = made(
+        'layer { name: "minus" type: "Power" bottom: "data" top: "x" power_param { scale: -1 } }'
+        'layer { name: "cut" type: "ReLU" bottom: "x" top: "x" }'
+    )
+    net.setInput(np.ones((1, 3, 8, 8)))
+    minus, cut = net.forward(["minus", "cut"])
+    assert (minus == -1).all()
+    assert (cut == 0).all()
+
+
+def test_all_tops_of_a_layer() -> None:
+    net = made('layer { name: "parts" type: "Slice" bottom: "data" top: "p" top: "q" slice_param { slice_point: 1 } }')
+    net.setInput(DATA[:, :, :8, :8])
+    (parts,) = net.forwardAndRetrieve(["parts"])
+    assert [part.shape for part in parts] == [(1, 1, 8, 8), (1, 2, 8, 8)]
+    np.testing.assert_array_equal(net.forward("parts"), parts[0])
+
+
+def test_the_other_forms_of_forward() -> None:
+    net = read("segment")
+    net.setInput(np.ones((1, 3, 16, 16)))
+    expected = net.forward("conv")
+    np.testing.assert_array_equal(net.forward(outputName="conv"), expected)
+    np.testing.assert_array_equal(net.forward(None, "conv"), expected)
+    np.testing.assert_array_equal(net.forward(outBlobNames=["conv"])[0], expected)
+    np.testing.assert_array_equal(net.forward("_input"), np.ones((1, 3, 16, 16)))
+
+
+def test_parameters_are_read_and_written() -> None:
+    net = read("classify")
+    net.setInput(DATA)
+    before = net.forward("conv2")
+    bias = net.getParam("conv2", 1)
+    assert bias.shape == (12, 1)
+    net.setParam("conv2", 1, bias + 1)
+    np.testing.assert_allclose(net.forward("conv2"), before + 1, rtol=0, atol=1e-5)
+    with pytest.raises(dnn.DnnError, match=r"found an array of shape \(3,\), expected \(12,\)"):
+        net.setParam("conv2", 1, [1, 2, 3])
+
+
+def test_inputs_are_renamed() -> None:
+    net = read("two_inputs")
+    net.setInputsNames(["left", "right"])
+    for name in ("left", "right"):
+        net.setInput(np.ones((1, 4, 6, 6)), name)
+    assert net.forward().shape == (1, 4, 6, 6)
+    assert net.getLayer(0).outputNameToIndex("right") == 1
+
+
+def test_shapes_of_one_layer() -> None:
+    bottoms, tops = read("segment").getLayerShapes([1, 3, 20, 28], "conv")
+    assert [tuple(shape) for shape in (*bottoms, *tops)] == [(1, 3, 20, 28), (1, 6, 10, 14)]
+
+
+def test_costs_leave_the_net_as_it_is() -> None:
+    net = read("detect")
+    net.setInput(np.ones((1, 3, 32, 32)))
+    before = net.forward()
+    net.getFLOPS([2, 3, 64, 64])
+    np.testing.assert_array_equal(net.forward(), before)
+
+
+def test_backends_and_targets_are_accepted() -> None:
+    net = read("classify")
+    net.setPreferableBackend(dnn.DNN_BACKEND_HALIDE)
+    net.setPreferableTarget(dnn.DNN_TARGET_CUDA_FP16)
+    assert not net.empty()
+    assert dnn.Net().empty()
+
+
+def test_all_else_is_cv2_dnns() -> None:
+    assert dnn.blobFromImage is cv2.dnn.blobFromImage
+    assert dnn.NMSBoxes is cv2.dnn.NMSBoxes
+    assert {"NMSBoxes", "readNetFromCaffe"} <= set(dir(dnn))
+    with pytest.raises(AttributeError, match=r"has no attribute 'readNetFromNowhere', nor has cv2.dnn of OpenCV"):
+        dnn.readNetFromNowhere  # noqa: B018
+
+
+def test_a_path_object_and_a_text_path_are_the_same() -> None:
+    assert dnn.readNetFromCaffe(str(HERE / "classify.prototxt")).getLayerNames() == read("classify").getLayerNames()
+    assert isinstance(HERE, Path)
