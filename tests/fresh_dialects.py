@@ -13,6 +13,8 @@ from netspec.proto.dialect import registry as dialect
 def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Let a test use dialects; switch them off when it is done."""
     assert dialect.active() == []
+    files.announce_known()
+    monkeypatch.setattr(dialect, "_known", dict(dialect._known))
     monkeypatch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
     yield
     for name in dialect.active():
