@@ -13,13 +13,12 @@ from netspec.proto.dialect import registry as dialect
 def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Let a test use dialects; switch them off when it is done."""
     assert dialect.active() == []
+    files.announce_known()
+    monkeypatch.setattr(dialect, "_known", dict(dialect._known))
     monkeypatch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
-    known = set(dialect._known)
     yield
     for name in dialect.active():
         dialect.deactivate(name)
-    for name in set(dialect._known) - known - set(files.known_files()):  # a test's own files
-        del dialect._known[name]
     own = [file.module for file in files.known_files().values()]
     for name in [name for name in sys.modules if name in own or name.startswith("netspec_dialect_")]:
         del sys.modules[name]

@@ -109,7 +109,7 @@ class Net:
         self._blob(entry, numParam, "getParam")
         return self._parameter(entry, numParam)
 
-    def setParam(self, layer: int | str, numParam: int, blob: Array) -> None:
+    def setParam(self, layer: int | str, numParam: int, blob: Array | Sequence[float]) -> None:
         """Write a learnable blob of a layer; the array must have as many numbers."""
         target = self._blob(self._entry(layer, "setParam"), numParam, "setParam")
         values = np.asarray(blob, np.float32)

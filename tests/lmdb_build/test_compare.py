@@ -142,7 +142,7 @@ def test_a_command_that_fails_ends_the_chain_with_its_line(
     edited("sgd_step/init.caffemodel", "nowhere.caffemodel")
     assert fault(capfd) == "nowhere.caffemodel: cannot be read: No such file or directory"
     edited('weights: "nowhere.caffemodel"', "snapshot_after_train: false", "snapshot: 5", "")
-    assert fault(capfd).startswith(f"{SOLVER}: its training left no snapshot")
+    assert fault(capfd).startswith(f"{SOLVER}: none of the snapshots of its training was found")
 
 
 def test_a_net_that_is_not_siamese(folder: Path) -> None:

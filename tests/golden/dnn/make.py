@@ -37,13 +37,16 @@ def write_weights() -> None:
 
 def write_results() -> None:
     """Write what OpenCV makes of the nets."""
+    from typing import Any
+
     import cv2
     import numpy as np
 
     from dnn_program import record
 
     assert cv2.__version__.startswith("4.12."), cv2.__version__
-    np.savez_compressed(HERE / "opencv.npz", **record(cv2.dnn))
+    results: dict[str, Any] = record(cv2.dnn)
+    np.savez_compressed(HERE / "opencv.npz", **results)
 
 
 if __name__ == "__main__":

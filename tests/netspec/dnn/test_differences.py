@@ -1,6 +1,7 @@
 """What docs/coming-from-opencv.md says of the differences from OpenCV 4."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,10 +25,11 @@ def made(layers: str) -> dnn.Net:
 
 def test_one_line_replaces_the_module(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "dnn", dnn)
-    net = cv2.dnn.readNetFromCaffe(str(HERE / "classify.prototxt"), str(HERE / "classify.caffemodel"))
-    net.setInput(cv2.dnn.blobFromImage(np.zeros((20, 20, 3), np.uint8), 1.0, (20, 20)))
+    module: Any = cv2.dnn
+    net = module.readNetFromCaffe(str(HERE / "classify.prototxt"), str(HERE / "classify.caffemodel"))
+    net.setInput(module.blobFromImage(np.zeros((20, 20, 3), np.uint8), 1.0, (20, 20)))
     assert net.forward().shape == (1, 10)
-    assert cv2.dnn.ClassificationModel(net).setInputSize((20, 20)).classify(np.zeros((9, 9, 3), np.uint8))[1] > 0
+    assert module.ClassificationModel(net).setInputSize((20, 20)).classify(np.zeros((9, 9, 3), np.uint8))[1] > 0
     assert list(cv2.dnn.NMSBoxes([[0, 0, 9, 9], [1, 1, 9, 9]], [0.9, 0.8], 0.5, 0.4)) == [0]
     with pytest.raises(cv2.error):
         cv2.dnn.readNet("net.unknown")

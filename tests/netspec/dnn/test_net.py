@@ -100,7 +100,8 @@ def test_inputs_of_any_kind_of_number() -> None:
     images = (DATA * 255).astype(np.uint8)
     net.setInput(images.astype(np.float32))
     expected = net.forward()
-    for given in (images, images.astype(np.float64), images.astype(np.int32), cv2.UMat(images.reshape(60, 20))):
+    matrix: Any = images.reshape(60, 20)
+    for given in (images, images.astype(np.float64), images.astype(np.int32), cv2.UMat(matrix)):
         net.setInput(given.get().reshape(images.shape) if isinstance(given, cv2.UMat) else given)
         np.testing.assert_array_equal(net.forward(), expected)
 
