@@ -12,7 +12,7 @@ from netspec.data.mean import write_mean
 from netspec.errors import SpecError
 from netspec.features.describer import Describer
 from netspec.features.scaling import Steps, scaling_of
-from netspec.proto.schema import LayerParameter
+from netspec.proto.schema import LayerParameter, TransformationParameter
 
 PIXEL = np.array([10, 20, 30], np.uint8).reshape(1, 3, 1, 1)  # blue, green, red
 SHAPE = (3, 1, 1)
@@ -31,7 +31,7 @@ def test_each_step_and_their_order():
 
 
 def test_given_steps_replace_the_transform_param():
-    layer = LayerParameter(name="d", transform_param={"scale": 3, "mean_value": [1]})
+    layer = LayerParameter(name="d", transform_param=TransformationParameter(scale=3, mean_value=[1]))
     assert scaled(Steps(), layer) == [27, 57, 87]
     assert scaled(Steps(scale=2.0), layer) == [20, 40, 60]
     assert str(scaling_of(Steps(scale=2.0), layer, SHAPE, "f")) == "0 to 255, times 2 (from the options)"

@@ -13,7 +13,7 @@ from netspec.errors import SpecError
 from netspec.net.recovered import recover_net
 from netspec.net.weights import net_to_proto
 from netspec.proto.binary import is_net_binary
-from netspec.proto.schema import NetParameter, V1LayerParameter
+from netspec.proto.schema import BlobProto, LayerParameter, NetParameter, V1LayerParameter
 from netspec.proto.text import write_text
 
 TRAINED = """
@@ -102,7 +102,7 @@ def test_inputs_of_old_nets_are_blobs_that_nothing_makes(tmp_path: Path):
 
 def test_what_holds_no_net(tmp_path: Path):
     path = tmp_path / "w.caffemodel"
-    path.write_bytes(NetParameter(layer=[{"name": "c", "blobs": [{"data": [0.0]}]}]).SerializeToString())
+    path.write_bytes(NetParameter(layer=[LayerParameter(name="c", blobs=[BlobProto(data=[0.0])])]).SerializeToString())
     with pytest.raises(SpecError, match="holds weights, but no net"):
         recover_net(path, {})
     path.write_text('layer { name: "c" }')

@@ -242,6 +242,6 @@ def test_a_state_with_a_history_for_each_sharer_is_that_of_their_sum(
 
 
 def test_a_second_set_follows_the_first_of_all_sharers():
-    history = [np.float32([k]) for k in (1, 10, 2, 3, 30, 4)]
+    history = [np.array([k], np.float32) for k in (1, 10, 2, 3, 30, 4)]
     assert [array.tolist() for array in merge_shared(history, [0, 1, 0])] == [[3], [10], [7], [30]]
-    assert merge_shared([np.float32([[5]]), np.float32([5])], [0, 0])[0].tolist() == [[5]]
+    assert merge_shared([np.array([[5]], np.float32), np.array([5], np.float32)], [0, 0])[0].tolist() == [[5]]
