@@ -10,6 +10,8 @@ import pytest
 
 from paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = sorted(ROOT.glob("examples/*.py"))
 
 

@@ -167,6 +167,7 @@ def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
     assert shapes == {"feat": (1, 256 + 6 * 256)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
     sorted((ROOT / "prototxt").rglob("train_val*.prototxt")),

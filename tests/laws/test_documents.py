@@ -12,6 +12,7 @@ import lmdb_build.cli
 import loopclosure.cli
 import netspec
 import netspec.cli
+from netspec.cli import run_script
 from paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("*/README.md")), *sorted((ROOT / "docs").glob("*.md"))]
@@ -54,6 +55,9 @@ def parse(words: list[str]) -> argparse.Namespace | None:
         if not door:
             return None  # a shell script
         program, arguments = door[1].replace("_", "-"), [*re.findall(r"\w+", door[2]), *arguments]
+    if (program, arguments[:1]) == ("netspec", ["run"]):
+        arguments, script = run_script.split(arguments)  # whose own words are not parsed here
+        assert script
     return PARSERS[program]().parse_args(arguments)
 
 

@@ -144,6 +144,7 @@ def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_python_m_lmdb_build() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "lmdb_build", "--help"],

@@ -14,6 +14,7 @@ from loopclosure.cli import main
 from paths import ROOT
 
 
+@pytest.mark.slow
 def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
     code = main(
         [
@@ -44,6 +45,7 @@ def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
     assert summary["command"].startswith("loopclosure evaluate --tum")
 
 
+@pytest.mark.slow
 def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
     code = main(
         [
@@ -228,9 +230,8 @@ def test_control_c_is_one_line_and_status_130(tmp_path):
     """Interrupted while it reads: a pipe that nobody writes into."""
     os.mkfifo(tmp_path / "features.npz")
     code = """
-import signal, sys
+import sys
 from loopclosure.cli import main
-signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background may have it ignored
 sys.exit(main(["similarity", "features.npz", "--out", "out.npy"]))
 """
     paths = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -11,6 +11,8 @@ from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_solver
 from paths import SHARED
 
+pytestmark = pytest.mark.slow
+
 CORPUS = SHARED / "corpus"
 FILES = sorted(str(path.relative_to(CORPUS)) for path in CORPUS.rglob("*.prototxt"))  # none where it is absent
 SOLVERS = [name for name in FILES if "solver" in Path(name).name]

@@ -13,6 +13,8 @@ from netspec import log
 from netspec.cli import main
 from paths import GOLDEN
 
+pytestmark = pytest.mark.slow
+
 TRAIN = ["train", "--solver=sgd_step/solver.prototxt", "--weights=sgd_step/init.caffemodel"]
 RESUME = ["train", "--solver=sgd_step/solver.prototxt", "--snapshot=sgd_step/ref_iter_40.solverstate"]
 TEST = ["test", "--model=sgd_step/train_val.prototxt", "--weights=sgd_step/init.caffemodel", "--iterations=4"]

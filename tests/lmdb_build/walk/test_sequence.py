@@ -15,6 +15,8 @@ from loopclosure.errors import InputError
 from loopclosure.places.same_place import same_place_matrix
 from loopclosure.places.trajectory import PosedSequence, read_groundtruth, read_tum_sequence, rotation_matrices
 
+pytestmark = pytest.mark.slow
+
 SMALL = Walk(frames=150, width=64, height=48, laps=3, seed=7)
 CAMERA = Camera(160, 120, 131.25)
 

@@ -248,6 +248,7 @@ def test_files_of_two_nets(files, laps):
         method.score(Images([Path("rgb/1.png"), Path("rgb/2.png")]), silent)
 
 
+@pytest.mark.slow
 def test_evaluate(two_laps, files, tmp_path, capsys):
     plain = f"features:{files}/laps.npz"
     white = f"{plain}:whiten={files}/other.npz,components=100"

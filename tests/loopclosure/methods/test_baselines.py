@@ -15,6 +15,8 @@ from loopclosure.progress import silent
 from loopclosure.words.word_model import WordModel
 from paths import shared
 
+pytestmark = pytest.mark.slow
+
 PLACES = 8
 WORDS = "words=200,lower_bound=0"
 

@@ -18,6 +18,8 @@ from loopclosure.report.files import measures_text
 from loopclosure.report.page import write_report
 from loopclosure.report.plots import best_true_references, decisions
 
+pytestmark = pytest.mark.slow
+
 
 class Says:
     """A method that returns given scores."""

@@ -9,6 +9,8 @@ from loopclosure.methods.base import refuse_overlap
 from loopclosure.words.vocabulary import Extractor
 from loopclosure.words.word_model import Training, WordModel, train
 
+pytestmark = pytest.mark.slow
+
 
 def write_textures(folder: Path, count: int, first_seed: int = 0) -> list[Path]:
     """Write gray images with features, the last one blank."""

@@ -30,6 +30,7 @@ Run = Callable[..., Any]  # the fixtures of conftest.py
 Edit = Callable[..., str]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exact", ["none", "small", "all", ""])
 @pytest.mark.parametrize(
     "words",
@@ -84,6 +85,7 @@ def test_train_takes_its_arguments_in_each_spelling(run: Run, edited: Edit, word
     assert Path("sgd_step/ref_iter_1.caffemodel").is_file()
 
 
+@pytest.mark.slow
 def test_the_door_tools_train(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 2")
     door = [sys.executable, str(ROOT / "tools" / "train.py"), solver]

@@ -69,6 +69,7 @@ def test_torch(net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     del sys.modules["exported_cli"]
 
 
+@pytest.mark.slow
 def test_pt2(net: Net, run: Run) -> None:
     assert run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "net.pt2").status == 0
     inputs = random_inputs(net)
@@ -173,6 +174,7 @@ def test_the_onnx_library_is_an_extra(net: Net, run: Run, monkeypatch: pytest.Mo
     assert run(*words).fault == "--to onnx needs the onnx library: pip install 'netspec-caffe[onnx]'"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "out"), [("torch", "n.py"), ("pt2", "n.pt2"), ("safetensors", "n.safetensors"), ("fold", "n")]
 )

@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 NET = "sgd_step/train_val.prototxt"
 SOLVER = "sgd_step/solver.prototxt"
 INIT = "sgd_step/init.caffemodel"

@@ -10,6 +10,8 @@ from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net
 from paths import SHARED
 
+pytestmark = pytest.mark.slow
+
 SENET = SHARED / "corpus" / "hujie-frank+SENet" / "models"
 #: Parameters as the SENet paper has them (table 2 and section 4), in millions, without the batch norms' statistics.
 PARAMETERS = {"SE-ResNet-50": 28.1, "SE-ResNet-101": 49.3, "SE-ResNet-152": 66.8, "SE-ResNeXt-50": 27.6}

@@ -11,6 +11,8 @@ import torch
 from netspec.errors import SpecError
 from netspec.layers import Layer
 
+pytestmark = pytest.mark.slow
+
 Build = Callable[..., Layer]
 Gradcheck = Callable[..., None]
 

@@ -16,6 +16,8 @@ from netspec.net.options import BuildOptions
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
 
+pytestmark = pytest.mark.slow
+
 Build = Callable[..., Layer]
 Gradcheck = Callable[..., None]
 

@@ -8,6 +8,8 @@ import pytest
 import dnn_program
 from netspec import dnn
 
+pytestmark = pytest.mark.slow
+
 OPENCV = dict(np.load(dnn_program.HERE / "opencv.npz"))
 
 

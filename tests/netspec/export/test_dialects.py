@@ -24,6 +24,8 @@ from netspec.export.shapes import find_shapes
 from netspec.export.torch import torch_module
 from netspec.net.net import Net
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("onnx", reason=ONNX_EXTRA)
 OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 Shape = tuple[int, ...]

@@ -18,6 +18,8 @@ from netspec.export.torch import torch_module
 from netspec.net.net import Net
 from paths import ROOT, shared
 
+pytestmark = pytest.mark.slow
+
 onnx: Any = pytest.importorskip("onnx", reason=ONNX_EXTRA)
 OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 IMAGE = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 dim: 12 dim: 10 } } }\n'
@@ -227,6 +229,7 @@ MODELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_real_models_compute_what_caffe_or_opencv_computed(name: str) -> None:
     folder = shared("golden", "models", name)

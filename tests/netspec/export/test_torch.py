@@ -20,6 +20,8 @@ from netspec.export.torch_code import write_program
 from netspec.net.net import Net
 from paths import GOLDEN, ROOT
 
+pytestmark = pytest.mark.slow
+
 CASES = sorted((GOLDEN / "layers").iterdir())
 REFUSED = {
     "accuracy_topk_perclass": "without the accuracy of each class",

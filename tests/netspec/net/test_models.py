@@ -8,6 +8,8 @@ import pytest
 
 from paths import shared
 
+pytestmark = pytest.mark.slow
+
 MODELS = {
     "hyperlpr_fine_v2": (),
     "mtcnn_kp_det1": (),

@@ -266,6 +266,7 @@ def prototxts() -> list[Path]:
     return [*own, *sorted((SHARED / "corpus").rglob("*.prototxt"))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", prototxts(), ids=lambda path: "/".join(path.parts[-3:]))
 def test_files_read_as_protobuf_reads_them(path: Path) -> None:
     cls = message_class(path)

@@ -60,6 +60,7 @@ def test_import_star() -> None:
     assert names["TEST"] == 1
 
 
+@pytest.mark.slow
 def test_another_caffe_proto_in_the_process_does_not_clash() -> None:
     own = schema.pool.FindFileByName("caffe.proto").serialized_pb
     file = descriptor_pool.DescriptorPool().AddSerializedFile(own)

@@ -100,6 +100,7 @@ def test_without_pydot_one_line_says_what_to_install(net, monkeypatch: pytest.Mo
         draw.get_pydot_graph(net, "LR")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(ROOT.glob("prototxt/**/*.prototxt")), ids=lambda p: str(p.relative_to(ROOT)))
 def test_every_net_of_the_project_is_drawn(path: Path) -> None:
     if "solver" in path.name:

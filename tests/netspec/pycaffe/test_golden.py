@@ -14,6 +14,8 @@ from netspec.pycaffe.solver import Solver
 from paths import GOLDEN
 from pycaffe_cases import compute
 
+pytestmark = pytest.mark.slow
+
 LAYERS = sorted((GOLDEN / "layers").iterdir())
 TRAININGS = sorted(folder.name for folder in (GOLDEN / "train").iterdir())
 EXAMPLES = sorted(folder.name for folder in (GOLDEN / "examples" / "runs").iterdir())

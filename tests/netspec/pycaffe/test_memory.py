@@ -403,6 +403,7 @@ print(resident() - before)
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads the process's size from /proc")
 def test_memory_does_not_grow(write: Callable[..., str], tmp_path: Path) -> None:
     write(PYRAMID)

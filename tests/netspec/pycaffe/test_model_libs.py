@@ -27,6 +27,8 @@ from netspec.pycaffe.net_spec import NetSpec
 from netspec.pycaffe.net_spec import layers as L
 from netspec.pycaffe.proto import caffe_pb2
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def ssd(leave_no_dialect: None) -> None:

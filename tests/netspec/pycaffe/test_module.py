@@ -15,6 +15,8 @@ from netspec.pycaffe import mode
 from paths import ROOT
 from pycaffe_nets import SMALL
 
+pytestmark = pytest.mark.slow
+
 
 def test_layer_types() -> None:
     types = caffe.layer_type_list()

@@ -11,6 +11,8 @@ import pytest
 
 import netspec.pycaffe as caffe
 
+pytestmark = pytest.mark.slow
+
 NET = """
 name: "usage" force_backward: true
 input: "data" input_shape { dim: 2 dim: 3 dim: 12 dim: 12 }

@@ -16,6 +16,8 @@ import netspec.pycaffe as pycaffe
 from netspec.dialects import use_dialect
 from netspec.scripts import finder
 
+pytestmark = pytest.mark.slow
+
 NET = """
 layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 6 } } }
 layer { name: "pool" type: "Pooling" bottom: "data" top: "prob" pooling_param { pool: AVE global_pooling: true } }

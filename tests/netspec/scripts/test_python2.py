@@ -11,6 +11,8 @@ from netspec.errors import SpecError
 from netspec.scripts import python2
 from netspec.scripts.python2 import cmp, div, idiv, is_python2, round, translated
 
+pytestmark = pytest.mark.slow
+
 ONLY_PYTHON_2 = [
     'print "x"',
     "print",

@@ -13,6 +13,8 @@ from netspec.solver.snapshot import read_state
 from netspec.solver.solver import load_solver
 from paths import GOLDEN
 
+pytestmark = pytest.mark.slow
+
 CASES = sorted(folder.name for folder in (GOLDEN / "train").iterdir())
 
 

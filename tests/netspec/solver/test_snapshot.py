@@ -13,6 +13,8 @@ from netspec.solver.snapshot import State, find_learned_net, merge_shared, read_
 from netspec.solver.solver import Solver, load_solver
 from paths import GOLDEN
 
+pytestmark = pytest.mark.slow
+
 STATES = sorted(path.relative_to(GOLDEN / "train") for path in GOLDEN.glob("train/*/*.solverstate"))
 
 
