@@ -47,6 +47,11 @@ def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
     parser.add_argument("--stage", default="", help="the NetState's stages, separated by commas")
 
 
+def add_shapes(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add ``--shape``, which may be repeated; ``what`` is its help."""
+    parser.add_argument("--shape", action="append", default=[], type=shape, metavar="BLOB=N,C,H,W", help=what)
+
+
 def add_python(parser: argparse.ArgumentParser) -> None:
     """Add ``--allow-python-layers``."""
     parser.add_argument(

@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 
 from netspec import log
-from netspec.cli.arguments import device, positive, shape
+from netspec.cli.arguments import add_shapes, device, positive
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
 from netspec.errors import SpecError
@@ -40,14 +40,7 @@ def add_to(commands: Commands) -> None:
         p.add_argument("input", metavar="IN")
         p.add_argument("output", metavar="OUT")
         if name == "upgrade_net_proto_text":
-            p.add_argument(
-                "--shape",
-                action="append",
-                default=[],
-                type=shape,
-                metavar="BLOB=N,C,H,W",
-                help="of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input",
-            )
+            add_shapes(p, "of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input")
 
     commands.add("layers", _layers, "list the layer types, each with its description", quiet=True)
 

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from netspec.cli.arguments import add_python, add_state, add_strict, shape, stages
+from netspec.cli.arguments import add_python, add_shapes, add_state, add_strict, stages
 from netspec.cli.run import Commands
 from netspec.proto.schema import PHASES
 
@@ -14,18 +14,11 @@ from netspec.proto.schema import PHASES
 def add_to(commands: Commands) -> None:
     """Add the command."""
     p = commands.add(
-        "check", _check, "build a net, or a solver's nets, and report every error; nothing is written", True
+        "check", _check, "build a net, or a solver's nets, and report every error; nothing is written", quiet=True
     )
     p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt, or a .caffemodel")
     add_state(p, phase="TEST")
-    p.add_argument(
-        "--shape",
-        action="append",
-        default=[],
-        type=shape,
-        metavar="BLOB=N,C,H,W",
-        help="the shape of a data layer's top; its data is then not opened",
-    )
+    add_shapes(p, "the shape of a data layer's top; its data is then not opened")
     p.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
     p.add_argument("--weights", help="weights that must fit the net, several separated by commas")
     p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import sys
 from pathlib import Path
 from typing import Any
 
 from netspec import log
-from netspec.cli.arguments import add_python, add_state, shape, stages
+from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
 
@@ -26,9 +25,9 @@ Layers that read data become inputs; --shape says what they read, where the prot
 
 def add_to(commands: Commands) -> None:
     """Add the commands."""
-    p = commands.add("export", _export, "write a net as ONNX, PyTorch source, a torch.export archive or safetensors")
+    summary = "write a net as ONNX, PyTorch source, a torch.export archive or safetensors"
+    p = commands.add("export", _export, summary, quiet=True)
     p.description, p.formatter_class = EXPORT, argparse.RawDescriptionHelpFormatter
-    p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
     p.add_argument("file", metavar="FILE", help="the net's prototxt")
     p.add_argument("--to", required=True, choices=("onnx", "torch", "pt2", "safetensors"), help="the form")
     p.add_argument("--weights", help="the trained weights (default: random weights)")
@@ -46,10 +45,8 @@ def add_to(commands: Commands) -> None:
     )
     p.add_argument("--scale", type=float, default=1.0, metavar="S", help="ONNX: then multiply by this")
     p.add_argument("--uint8", action="store_true", help="ONNX: images are bytes")
-    p = commands.add(
-        "fold", _fold, "write the deploy net with BatchNorm and Scale folded in: OUT.prototxt, OUT.caffemodel"
-    )
-    p.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
+    summary = "write the deploy net with BatchNorm and Scale folded in: OUT.prototxt, OUT.caffemodel"
+    p = commands.add("fold", _fold, summary, quiet=True)
     p.add_argument("file", metavar="MODEL", help="the net's prototxt; of a training net, labels and losses are removed")
     p.add_argument("--weights", required=True, help="the trained weights")
     p.add_argument("--out", required=True, type=Path, metavar="PREFIX", help="write PREFIX.prototxt and .caffemodel")
@@ -58,14 +55,7 @@ def add_to(commands: Commands) -> None:
 
 def _add_source(p: argparse.ArgumentParser) -> None:
     p.add_argument("--blob", nargs="+", action="extend", default=[], help="only the layers that compute these blobs")
-    p.add_argument(
-        "--shape",
-        action="append",
-        default=[],
-        type=shape,
-        metavar="BLOB=N,C,H,W",
-        help="the shape of an input or a data layer's top",
-    )
+    add_shapes(p, "the shape of an input or a data layer's top")
     add_state(p, phase="TEST")
     add_python(p)
 
@@ -75,7 +65,7 @@ def _source(arguments: argparse.Namespace, labels: bool) -> Any:
 
     weights = [Path(path.strip()) for path in arguments.weights.split(",")] if arguments.weights else []
     if not weights:
-        log.warning("export", "no --weights given: the weights are random")
+        log.logger.warning("no --weights given: the weights are random")
     return Source(
         Path(arguments.file),
         weights,

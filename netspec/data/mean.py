@@ -56,6 +56,12 @@ def read_mean_option(text: str) -> np.ndarray:
     return mean.astype(np.float32)
 
 
+def center(mean: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return the middle of a mean image (C, H, W) that is at least as large, as Caffe cuts images in phase TEST."""
+    top, left = (mean.shape[1] - height) // 2, (mean.shape[2] - width) // 2
+    return mean[:, top : top + height, left : left + width]
+
+
 def compute_mean(reader: Reader, where: Where) -> np.ndarray:
     """Return the mean of all records of a database, encoded or not: float32 (C, H, W).
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from netspec.data.mean import center
 from netspec.errors import SpecError
 from netspec.layers.targets import Sizes
 
@@ -55,11 +56,14 @@ class Preprocess:
         if self.mean is None:
             return None
         mean = np.asarray(self.mean, np.float32)
-        channels = shape[1]
+        _, channels, height, width = shape
         if mean.ndim == 1 and len(mean) in (1, channels):
             return mean.reshape(-1, 1, 1)
-        if mean.ndim == 3 and mean.shape[0] == channels and None not in shape[2:]:
-            return center(mean, (shape[2], shape[3]))
+        if mean.ndim == 3 and mean.shape[0] == channels and height is not None and width is not None:
+            if mean.shape[1] < height or mean.shape[2] < width:
+                found = f"found a mean of {mean.shape[1]} x {mean.shape[2]} pixels"
+                raise SpecError(f"{found}, expected at least {height} x {width}")
+            return center(mean, height, width)
         raise SpecError(
             f"--mean: found a mean of shape {mean.shape}, expected one number for each of the {channels} channels, "
             f"or an image of the size of {self.blob}, {shape[1:]}"
@@ -92,15 +96,3 @@ class Preprocess:
         size = graph.constant([shape[2], shape[3]])
         start = graph.node("Div", graph.node("Sub", graph.shape_of(value, 2, 4), size), graph.constant([2, 2]))
         return graph.node("Slice", value, start, graph.node("Add", start, size), graph.constant([2, 3]))
-
-
-def center(image: np.ndarray, size: tuple[Any, Any]) -> np.ndarray:
-    """Return the middle part of an image (C, H, W), of this height and width."""
-    if image.shape[1:] == size:
-        return image
-    top, left = ((have - want) // 2 for have, want in zip(image.shape[1:], size, strict=True))
-    if min(top, left) < 0:
-        raise SpecError(
-            f"found a mean of {image.shape[1]} x {image.shape[2]} pixels, expected at least {size[0]} x {size[1]}"
-        )
-    return image[:, top : top + size[0], left : left + size[1]]

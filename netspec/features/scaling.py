@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from netspec.data.blobs import Shape
-from netspec.data.mean import read_mean, read_mean_option
+from netspec.data.mean import center, read_mean, read_mean_option
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import LayerParameter
 
@@ -115,5 +115,4 @@ def _fitted(mean: np.ndarray, shape: Shape, name: str, where: Where) -> np.ndarr
     mean = mean[0] if mean.ndim == 4 and len(mean) == 1 else mean
     if mean.ndim != 3 or mean.shape[0] != channels or mean.shape[1] < height or mean.shape[2] < width:
         raise SpecError(f"the mean of {name} is {mean.shape}, expected at least {shape}", where)
-    top, left = (mean.shape[1] - height) // 2, (mean.shape[2] - width) // 2
-    return mean[:, top : top + height, left : left + width]
+    return center(mean, height, width)

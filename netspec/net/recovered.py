@@ -61,7 +61,7 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
         raise SpecError(f"the file does not tell the shape of its input; say {advice}", where)
     if without:
         blobs = ", ".join(name for name in inputs if name not in given)
-        log.warning("net.cpp:746", f"{path}: left out, since no --shape says what {blobs} is: {', '.join(without)}")
+        log.logger.warning(f"{path}: left out, since no --shape says what {blobs} is: {', '.join(without)}")
     return net, source.with_layers([source.net] * len(net.layer))
 
 
@@ -108,7 +108,7 @@ def _shape_of_images(reader: LayerParameter, top: str, layers: list[LayerParamet
     channels = _channels(top, layers)
     if channels and (reader.transform_param.mean_value or reader.transform_param.scale != 1):
         settings = " ".join(write_text(reader.transform_param).split())
-        log.warning("net.cpp:746", f'the net was trained with transform_param {{ {settings} }} for blob "{top}"')
+        log.logger.warning(f'the net was trained with transform_param {{ {settings} }} for blob "{top}"')
     return (1, channels, side, side)
 
 

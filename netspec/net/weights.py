@@ -107,7 +107,7 @@ def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, s
         advice = "is it the file of another net?" if nothing else "leave strict out to keep their fillers' values"
         report(SpecError(f"{fault}; {advice}", Where(files)))
     else:
-        log.warning("net.cpp:746", f"{files}: {fault}; they stay as they were filled")
+        log.logger.warning(f"{files}: {fault}; they stay as they were filled")
 
 
 def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:

@@ -25,26 +25,10 @@ def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
     return layer.canonical_axis(getattr(p, old_name), shape, param_name, old_name)
 
 
-@register("Flatten", "flatten_param")
-class Flatten(Layer):
-    """Join the axes from axis (default 1) to end_axis (default the last) into one.
-
-    bottom[0]  any shape
-    top[0]     the same numbers, shape[:axis] + (product,) + shape[end_axis + 1:]
-    Caffe: src/caffe/layers/flatten_layer.cpp
-    """
+class _OtherShape(Layer):
+    """A layer whose top has its bottom's numbers in another shape."""
 
     shares = frozenset({"data", "diff"})
-
-    @override
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        p, shape = self.param.flatten_param, bottom_shapes[0]
-        first = self.canonical_axis(p.axis, shape, "flatten_param", "axis")
-        last = self.canonical_axis(p.end_axis, shape, "flatten_param", "end_axis")
-        if first > last:
-            message = f"found axis {p.axis} after end_axis {p.end_axis} for a bottom of shape {shape}"
-            raise self.error(message, "flatten_param")
-        return [(*shape[:first], math.prod(shape[first : last + 1]), *shape[last + 1 :])]
 
     @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -59,16 +43,34 @@ class Flatten(Layer):
         return code.reshape_to_top(bottoms[0])
 
 
+@register("Flatten", "flatten_param")
+class Flatten(_OtherShape):
+    """Join the axes from axis (default 1) to end_axis (default the last) into one.
+
+    bottom[0]  any shape
+    top[0]     the same numbers, shape[:axis] + (product,) + shape[end_axis + 1:]
+    Caffe: src/caffe/layers/flatten_layer.cpp
+    """
+
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        p, shape = self.param.flatten_param, bottom_shapes[0]
+        first = self.canonical_axis(p.axis, shape, "flatten_param", "axis")
+        last = self.canonical_axis(p.end_axis, shape, "flatten_param", "end_axis")
+        if first > last:
+            message = f"found axis {p.axis} after end_axis {p.end_axis} for a bottom of shape {shape}"
+            raise self.error(message, "flatten_param")
+        return [(*shape[:first], math.prod(shape[first : last + 1]), *shape[last + 1 :])]
+
+
 @register("Reshape", "reshape_param")
-class Reshape(Layer):
+class Reshape(_OtherShape):
     """Replace num_axes axes (default all) from axis on by those of shape: 0 copies the bottom's axis, -1 is inferred.
 
     bottom[0]  any shape
     top[0]     the same numbers, shape[:axis] + reshape_param.shape + shape[axis + num_axes:]
     Caffe: src/caffe/layers/reshape_layer.cpp
     """
-
-    shares = frozenset({"data", "diff"})
 
     @override
     def setup(self) -> None:
@@ -104,18 +106,6 @@ class Reshape(Layer):
             )
             raise self.error(message, "reshape_param", "shape")
         return [tuple(top)]
-
-    @override
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x.reshape(self.top_shapes[0])
-
-    @override
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.reshape_to_top(bottoms[0])
-
-    @override
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.reshape_to_top(bottoms[0])
 
 
 @register("Concat", "concat_param")
