@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -15,7 +16,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact.accumulate import ParameterSums
-from netspec.exact.blas import Values, add_sums, array, gemm, one_thread
+from netspec.exact.blas import Values, add_sums, array, gemm, gemm_routine, one_thread
 
 Axes = tuple[int, ...]
 
@@ -127,6 +128,43 @@ class ColumnProducts(ParameterSums):
                 _gemm_by_group(filters, diff, columns_diff, ctx.group, a_t=True)
                 maps_diff[n] = ctx.sliding.spread(columns_diff, maps.shape[2:])
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None
+
+
+def prepared_columns(
+    shape: Axes, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return what :class:`ColumnProducts` computes for maps (N, C, H, W) of one shape, without gradients.
+
+    It works in memory of its own, on copies of the weights, and expects that BLAS uses one thread.
+    """
+    (count, channels, *size), (kernel, stride, dilation) = shape, (sliding.kernel, sliding.stride, sliding.dilation)
+    fits, outputs = sliding.fits(tuple(size)), len(weight)
+    frame = None
+    if any(sliding.pad):
+        frame = weight.new_zeros(count, channels, *(n + 2 * p for n, p in zip(size, sliding.pad, strict=True)))
+        inner = frame[:, :, sliding.pad[0] : sliding.pad[0] + size[0], sliding.pad[1] : sliding.pad[1] + size[1]]
+        size = list(frame.shape[2:])
+    steps = (channels * size[0] * size[1], size[0] * size[1], dilation[0] * size[1], dilation[1])
+    layout = (count, channels, *kernel, *fits), (*steps, stride[0] * size[1], stride[1])
+    columns = weight.new_empty(layout[0])
+    by_image = [image.T for image in columns.view(count, channels * math.prod(kernel), -1).numpy()]
+    filters = weight.detach().flatten(1).clone().numpy().T
+    bias = None if bias is None else bias.detach().clone().view(-1, 1, 1)
+    multiply = gemm_routine(filters)
+
+    def kernel_of_shape(maps: torch.Tensor) -> torch.Tensor:
+        if frame is None:
+            maps = maps.contiguous()
+        else:
+            inner.copy_(maps)
+            maps = frame
+        columns.copy_(maps.as_strided(*layout))
+        tops = maps.new_empty(count, outputs, *fits)
+        for image, top in zip(by_image, tops.numpy().reshape(count, outputs, -1), strict=True):
+            multiply(1.0, image, filters, 0.0, top.T, 0, 0, 1)
+        return tops if bias is None else tops.add_(bias)
+
+    return kernel_of_shape
 
 
 class SpreadProducts(ParameterSums):
@@ -261,6 +299,26 @@ class VectorProducts(ParameterSums):
             vectors_diff = torch.empty_like(vectors)
             gemm(tops_diff, weight.contiguous(), vectors_diff, b_t=ctx.transposed)
         return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
+
+
+def prepared_vectors(
+    rows: int, weight: torch.Tensor, bias: torch.Tensor | None, transposed: bool
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return what :class:`VectorProducts` computes for vectors (rows, K), without gradients.
+
+    It works on copies of the weights, and expects that BLAS uses one thread.
+    """
+    matrix = weight.detach().clone(memory_format=torch.contiguous_format).numpy().T
+    bias = None if bias is None else bias.detach().clone()
+    outputs = weight.shape[1 if transposed else 0]
+    multiply, trans = gemm_routine(matrix), int(not transposed)
+
+    def kernel(vectors: torch.Tensor) -> torch.Tensor:
+        tops = vectors.new_empty(rows, outputs)
+        multiply(1.0, matrix, vectors.contiguous().numpy().T, 0.0, tops.numpy().T, trans, 0, 1)
+        return tops if bias is None else tops.add_(bias)
+
+    return kernel
 
 
 class ChosenRows(ParameterSums):

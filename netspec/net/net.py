@@ -27,8 +27,9 @@ from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
 from netspec.net.options import BuildOptions
+from netspec.net.programs import Programs
 from netspec.net.table import table
-from netspec.proto.schema import PHASE_NAMES, NetParameter
+from netspec.proto.schema import PHASE_NAMES, TEST, NetParameter
 
 Array = np.ndarray | torch.Tensor
 
@@ -63,7 +64,7 @@ class Net(torch.nn.Module):
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
         self.device = options.device
-        self._exact = options.exact
+        self.exact = options.exact
         self.keep: str | Iterable[str] = ()
         self.blobs: dict[str, torch.Tensor] = {}
         self.shapes: dict[str, Shape] = {}
@@ -78,6 +79,13 @@ class Net(torch.nn.Module):
         ]
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
+        self._given = [v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops]
+        self._programs = Programs(self, options.passes) if self.phase == TEST and options.passes else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without what was prepared from it."""
+        prepared = self._programs and Programs(self, self._programs.passes)
+        return {**super().__getstate__(), "_programs": prepared}
 
     # Building
 
@@ -220,6 +228,8 @@ class Net(torch.nn.Module):
             known = ", ".join(self.inputs) or "none (it reads its own data)"
             raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
         kept = self._kept()
+        if self._programs and not torch.is_grad_enabled() and _is_running():
+            return self._run_prepared(inputs, kept)
         values: dict[int, torch.Tensor] = {}
         memories: dict[int, Memory] = {}
         loss: torch.Tensor | None = None
@@ -237,6 +247,18 @@ class Net(torch.nn.Module):
             for v in self._last_use[i]:
                 if v not in kept:
                     del values[v]
+        self.blobs = {self.plan.blobs[v]: values[v] for v in sorted(kept)}
+        outputs = {name: values[v] for name, v in self.plan.outputs.items()}
+        return (torch.zeros((), device=self.device) if loss is None else loss), outputs
+
+    def _run_prepared(
+        self, inputs: Mapping[str, Array], kept: set[int]
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        given = {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
+        loss, values = self._programs.run(given, frozenset(kept))
+        if not torch.is_inference_mode_enabled():
+            loss = loss.clone() if loss is not None else None
+            values = {v: x.clone() if x.is_inference() else x for v, x in values.items()}
         self.blobs = {self.plan.blobs[v]: values[v] for v in sorted(kept)}
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
@@ -261,7 +283,7 @@ class Net(torch.nn.Module):
 
     def weighted_sum(self, top: torch.Tensor, weight: float) -> torch.Tensor:
         """Return the contribution of a top to the net's loss (Caffe: Layer::Forward)."""
-        if top.numel() > 1 and applies(self._exact, top):
+        if top.numel() > 1 and applies(self.exact, top):
             return RowSums.apply(top.reshape(1, -1), weight)[0]
         return top.sum() if weight == 1 else top.sum() * weight
 
@@ -349,6 +371,11 @@ class Net(torch.nn.Module):
         """Close files and stop threads."""
         for layer in self.layers:
             layer.close()
+
+
+def _is_running() -> bool:
+    """Return whether operations are executed, and not recorded."""
+    return not (torch.compiler.is_compiling() or torch.jit.is_tracing())
 
 
 def _tops(plan: Plan, node: Node) -> list[str]:
