@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
+import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
@@ -137,34 +138,51 @@ def prepared_columns(
 
     It works in memory of its own, on copies of the weights, and expects that BLAS uses one thread.
     """
+    count, fits, outputs = shape[0], sliding.fits(shape[2:]), len(weight)
+    filters = weight.detach().flatten(1).clone().numpy().T
+    bias = None if bias is None else bias.detach().clone().view(-1, 1)
+    lay_out = _columns_of_shape(shape, weight.dtype, sliding, fits)
+    top_shape, rows = (count, outputs, *fits), (count, outputs, fits[0] * fits[1])
+    multiply, dtype = gemm_routine(filters), weight.dtype
+
+    def run(maps: torch.Tensor) -> torch.Tensor:
+        tops = torch.empty(rows, dtype=dtype)
+        for image, top in zip(lay_out(maps), tops.numpy(), strict=True):
+            multiply(1.0, image.T, filters, 0.0, top.T, 0, 0, 1)
+        if bias is not None:
+            tops.add_(bias)
+        return tops.view(top_shape)
+
+    return run
+
+
+def _columns_of_shape(
+    shape: Axes, dtype: torch.dtype, sliding: Filter, fits: Sequence[int]
+) -> Callable[[torch.Tensor], np.ndarray]:
+    """Return what :meth:`Filter.columns` gives for all maps of one shape: (N, C kernel, positions), in fixed memory."""
     (count, channels, *size), (kernel, stride, dilation) = shape, (sliding.kernel, sliding.stride, sliding.dilation)
-    fits, outputs = sliding.fits(tuple(size)), len(weight)
+    flat = (count, channels * math.prod(kernel), math.prod(fits))
+    each_pixel_once = math.prod(kernel) * flat[2] == math.prod(size)
+    if not any(sliding.pad) and each_pixel_once and (math.prod(kernel) == 1 or flat[2] == 1):
+        return lambda maps: maps.contiguous().numpy().reshape(flat)
     frame = None
     if any(sliding.pad):
-        frame = weight.new_zeros(count, channels, *(n + 2 * p for n, p in zip(size, sliding.pad, strict=True)))
+        frame = torch.zeros((count, channels, *(n + 2 * p for n, p in zip(size, sliding.pad, strict=True))), dtype=dtype)
         inner = frame[:, :, sliding.pad[0] : sliding.pad[0] + size[0], sliding.pad[1] : sliding.pad[1] + size[1]]
         size = list(frame.shape[2:])
-    steps = (channels * size[0] * size[1], size[0] * size[1], dilation[0] * size[1], dilation[1])
-    layout = (count, channels, *kernel, *fits), (*steps, stride[0] * size[1], stride[1])
-    columns = weight.new_empty(layout[0])
-    by_image = [image.T for image in columns.view(count, channels * math.prod(kernel), -1).numpy()]
-    filters = weight.detach().flatten(1).clone().numpy().T
-    bias = None if bias is None else bias.detach().clone().view(-1, 1, 1)
-    multiply = gemm_routine(filters)
+    area = size[0] * size[1]
+    strides = (channels * area, area, dilation[0] * size[1], dilation[1], stride[0] * size[1], stride[1])
+    columns = torch.empty((count, channels, *kernel, *fits), dtype=dtype)
+    layout, found = columns.shape, columns.view(flat).numpy()
 
-    def kernel_of_shape(maps: torch.Tensor) -> torch.Tensor:
-        if frame is None:
-            maps = maps.contiguous()
-        else:
+    def lay_out(maps: torch.Tensor) -> np.ndarray:
+        if frame is not None:
             inner.copy_(maps)
             maps = frame
-        columns.copy_(maps.as_strided(*layout))
-        tops = maps.new_empty(count, outputs, *fits)
-        for image, top in zip(by_image, tops.numpy().reshape(count, outputs, -1), strict=True):
-            multiply(1.0, image, filters, 0.0, top.T, 0, 0, 1)
-        return tops if bias is None else tops.add_(bias)
+        columns.copy_(maps.contiguous().as_strided(layout, strides))
+        return found
 
-    return kernel_of_shape
+    return lay_out
 
 
 class SpreadProducts(ParameterSums):

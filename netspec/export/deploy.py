@@ -76,7 +76,7 @@ def fold(net: Net) -> NetParameter:
     netspec/net/fold.py says what is folded. Blobs keep their names where they still exist, outputs always do;
     layers that share parameters share them still where folding left them equal.
     """
-    folds = find_folds(plan, net.layers)
+    folds = find_folds(net.plan, list(net.layers))
     plan = net.plan
     passes_on = [layer.passes_on for layer in net.layers]
     origin = origins(plan, passes_on)

@@ -494,10 +494,10 @@ class LRN(Layer):
         def kernel(data: torch.Tensor) -> torch.Tensor:
             side_by_side = not data.is_contiguous()
             if side_by_side not in frames:
-                frame = data.new_zeros(shape[0], channels + 2 * reach, *shape[2:])
-                frames[side_by_side] = frame.contiguous(
-                    memory_format=torch.channels_last if side_by_side else torch.contiguous_format
-                )
+                layout = torch.channels_last if side_by_side else torch.contiguous_format
+                with torch.inference_mode(False):
+                    frame = data.new_zeros(shape[0], channels + 2 * reach, *shape[2:])
+                    frames[side_by_side] = frame.contiguous(memory_format=layout)
             frame = frames[side_by_side]
             torch.mul(data, data, out=frame[:, reach : reach + channels])
             total = frame[:, :channels] + frame[:, 1 : 1 + channels] if size > 1 else frame.clone()

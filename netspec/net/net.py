@@ -66,6 +66,7 @@ class Net(torch.nn.Module):
         self.device = options.device
         self.exact = options.exact
         self.keep: str | Iterable[str] = ()
+        self._kept_of: dict[str | tuple[str, ...], frozenset[int]] = {}  # by ``keep``, as it was last
         self.blobs: dict[str, torch.Tensor] = {}
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
@@ -80,12 +81,12 @@ class Net(torch.nn.Module):
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
         self._given = [v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops]
-        self._programs = Programs(self, options.passes) if self.phase == TEST and options.passes else None
+        self.programs = Programs(self, options.passes) if self.phase == TEST and options.passes else None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what was prepared from it."""
-        prepared = self._programs and Programs(self, self._programs.passes)
-        return {**super().__getstate__(), "_programs": prepared}
+        prepared = self.programs and Programs(self, self.programs.passes)
+        return {**super().__getstate__(), "programs": prepared}
 
     # Building
 
@@ -228,7 +229,7 @@ class Net(torch.nn.Module):
             known = ", ".join(self.inputs) or "none (it reads its own data)"
             raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
         kept = self._kept()
-        if self._programs and not torch.is_grad_enabled() and _is_running():
+        if self.programs and not torch.is_grad_enabled() and _is_running():
             return self._run_prepared(inputs, kept)
         values: dict[int, torch.Tensor] = {}
         memories: dict[int, Memory] = {}
@@ -252,14 +253,12 @@ class Net(torch.nn.Module):
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
     def _run_prepared(
-        self, inputs: Mapping[str, Array], kept: set[int]
+        self, inputs: Mapping[str, Array], kept: frozenset[int]
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         given = {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
-        loss, values = self._programs.run(given, frozenset(kept))
-        if not torch.is_inference_mode_enabled():
-            loss = loss.clone() if loss is not None else None
-            values = {v: x.clone() if x.is_inference() else x for v, x in values.items()}
-        self.blobs = {self.plan.blobs[v]: values[v] for v in sorted(kept)}
+        loss, values = self.programs.run(given, kept)
+        blobs = self.plan.blobs
+        self.__dict__["blobs"] = {blobs[v]: values[v] for v in sorted(kept)}  # a module's own way of setting is slow
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
@@ -293,13 +292,14 @@ class Net(torch.nn.Module):
         dtype = self.learnable[0].parameter.dtype if self.learnable else torch.float32
         return torch.as_tensor(np.asarray(value)).to(self.device, dtype)
 
-    def _kept(self) -> set[int]:
-        current = {name: v for v, name in enumerate(self.plan.blobs)}
-        if self.keep == "all":
-            return set(current.values())
-        names = [self.keep] if isinstance(self.keep, str) else list(self.keep)
-        check_blobs(names, current, self.plan.source.file)
-        return set(self.plan.outputs.values()) | {current[name] for name in names}
+    def _kept(self) -> frozenset[int]:
+        asked = self.keep if isinstance(self.keep, str) else tuple(self.keep)
+        if asked not in self._kept_of:
+            current = {name: v for v, name in enumerate(self.plan.blobs)}
+            names = list(current) if asked == "all" else [asked] if isinstance(asked, str) else asked
+            check_blobs(names, current, self.plan.source.file)
+            self._kept_of = {asked: frozenset((*self.plan.outputs.values(), *(current[name] for name in names)))}
+        return self._kept_of[asked]
 
     # Parameters and data
 

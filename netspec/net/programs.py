@@ -30,13 +30,14 @@ if TYPE_CHECKING:
 
 PROGRAMS = 64  # kept for a net: pyramids of images need one for each size
 Values = dict[int, torch.Tensor]
+Given = tuple[int, Shape, torch.dtype]
 
 
 @dataclass
 class Program:
     """The kernels of a run in order, each with the values that it takes and makes, its losses, and what ends."""
 
-    line: list[tuple[Kernel, tuple[int, ...], tuple[int, ...], list[tuple[int, float]], tuple[int, ...]]]
+    line: list[tuple[Kernel, int, tuple[int, ...], tuple[int, ...], list[tuple[int, float]], tuple[int, ...]]]
     schedule: Schedule
     kinds: list[str]
     one_thread: bool
@@ -45,8 +46,11 @@ class Program:
 
     def is_current(self) -> bool:
         """Return whether no learned blob was written to, and none that was has come to rest."""
-        if any(stamp(blob) != before for blob, before in self.frozen):
-            return False
+        for blob, before in self.frozen:
+            if stamp(blob) != before:
+                return False
+        if not self.waiting:
+            return True
         resting = [stamp(blob) == before and not is_lent(blob) for blob, before in self.waiting]
         self.waiting = [(blob, stamp(blob)) for blob, _ in self.waiting]
         return not any(resting)
@@ -58,7 +62,9 @@ class Programs:
     def __init__(self, net: Net, passes: Collection[str]) -> None:
         self.net = net
         self.passes = frozenset(passes)
-        self._sources = [i for i, node in enumerate(net.plan.nodes) if not node.bottoms]
+        self._sources = [
+            i for i, node in enumerate(net.plan.nodes) if not node.bottoms and not net.layers[i].is_input
+        ]
         self._programs: OrderedDict[Any, Program] = OrderedDict()
         self._memos: dict[Any, tuple[tuple[Stamp, ...], Any]] = {}
         self._seen: dict[int, Stamp] = {}
@@ -68,30 +74,28 @@ class Programs:
 
         Layers without bottoms run first: data layers, whose records have the shapes that they have.
         """
-        with torch.inference_mode():
-            values: Values = dict(given)
-            loss: torch.Tensor | None = None
-            for i in self._sources:
-                layer, node = self.net.layers[i], self.net.plan.nodes[i]
-                if layer.is_input:
-                    continue
-                tops = layer.run()
-                values.update(zip(node.tops, tops, strict=False))
-                for top, weight in zip(tops, self.net.loss_weights[i], strict=True):
-                    loss = self._added(loss, top, weight) if weight else loss
-            program = self.program({v: (tuple(x.shape), x.dtype) for v, x in values.items()}, kept)
-            with one_thread() if program.one_thread else nullcontext():
-                loss = self._run(program, values, loss)
-            origin = program.schedule.origin
-            return loss, {v: values[origin[v]] for v in kept}
+        values: Values = dict(given)
+        loss: torch.Tensor | None = None
+        for i in self._sources:
+            layer, node = self.net.layers[i], self.net.plan.nodes[i]
+            tops = layer.run()
+            values.update(zip(node.tops, tops, strict=False))
+            for top, weight in zip(tops, self.net.loss_weights[i], strict=True):
+                loss = self._added(loss, top, weight) if weight else loss
+        program = self.program(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
+        with one_thread() if program.one_thread else nullcontext():
+            loss = self._run(program, values, loss)
+        origin = program.schedule.origin
+        return loss, {v: values[origin[v]].contiguous() for v in kept}
 
     def _run(self, program: Program, values: Values, loss: torch.Tensor | None) -> torch.Tensor | None:
-        for kernel, bottoms, tops, losses, ends in program.line:
-            made = kernel(*[values[v] for v in bottoms])
+        for kernel, bottom, bottoms, tops, losses, ends in program.line:
+            made = kernel(values[bottom]) if bottom >= 0 else kernel(*[values[v] for v in bottoms])
             if not isinstance(made, tuple):
-                made = (made,)
-            for v, top in zip(tops, made, strict=False):
-                values[v] = top
+                values[tops[0]] = made
+                made = (made,) if losses else ()
+            else:
+                values.update(zip(tops, made, strict=False))
             for j, weight in losses:
                 loss = self._added(loss, made[j], weight)
             for v in ends:
@@ -102,23 +106,24 @@ class Programs:
         term = self.net.weighted_sum(top, weight)
         return term if loss is None else loss + term
 
-    def program(self, given: Mapping[int, tuple[Shape, torch.dtype]], kept: frozenset[int]) -> Program:
+    def program(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
         """Return the program for values of these shapes and types, made now or before."""
-        key = (tuple(given.items()), kept)
+        key = (given, kept)
         program = self._programs.get(key)
         if program is None or not program.is_current():
-            program = self._programs[key] = self._make(given, kept)
+            with torch.inference_mode(False), torch.no_grad():
+                program = self._programs[key] = self._make(given, kept)
         self._programs.move_to_end(key)
         if len(self._programs) > PROGRAMS:
             self._programs.popitem(last=False)
         return program
 
-    def _make(self, given: Mapping[int, tuple[Shape, torch.dtype]], kept: frozenset[int]) -> Program:
+    def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
         net, plan = self.net, self.net.plan
         fitted = self._fitted(given)
         layers = [found or layer for found, layer in zip(fitted, net.layers, strict=True)]
         changing = self._changing()
-        probe = torch.empty(1, dtype=next((dtype for _, dtype in given.values()), torch.float32), device=net.device)
+        probe = torch.empty(1, dtype=next((dtype for *_, dtype in given), torch.float32), device=net.device)
         exact = [found is not None and found.is_exact(probe, found.small) for found in fitted]
         as_is = [found is None or bool(changing & _ids(found)) for found in fitted]
         roles = roles_of(plan, layers)
@@ -133,7 +138,7 @@ class Programs:
             ),
             finishes=[found is not None and found.finishing() is not None for found in fitted],
             fresh=[found is not None and found.fresh for found in fitted],
-            given=given,
+            given=[v for v, *_ in given],
             kept=kept | {v for i, node in enumerate(plan.nodes) if any(net.loss_weights[i]) for v in node.tops},
             passes=self.passes,
         )
@@ -142,7 +147,8 @@ class Programs:
             kernel, kind = self._kernel(step, layers, fitted[step.node] is None, as_is[step.node])
             kinds.append("exact" if exact[step.node] else kind)
             losses = [(j, weight) for j, weight in enumerate(net.loss_weights[step.node]) if weight]
-            line.append((kernel, step.bottoms, step.tops, losses, step.ends))
+            single = step.bottoms[0] if len(step.bottoms) == 1 else -1
+            line.append((kernel, single, step.bottoms, step.tops, losses, step.ends))
         blobs = {id(blob): blob for layer in net.layers for blob in layer.blobs}
         return Program(
             line,
@@ -182,12 +188,12 @@ class Programs:
             kernel = lambda *bottoms: inner(*(bottom.contiguous() for bottom in bottoms))  # noqa: E731
         return kernel, "as is" if as_is else "packed" if len(uses) > bool(step.chain) else "prepared"
 
-    def _fitted(self, given: Mapping[int, tuple[Shape, torch.dtype]]) -> list[Layer | None]:
+    def _fitted(self, given: tuple[Given, ...]) -> list[Layer | None]:
         """Return copies of the layers, fitted to these shapes; None where the shapes follow only from values.
 
         Layers that remember something are no copies, and what follows on them is not prepared either.
         """
-        shapes: dict[int, Shape] = {v: shape for v, (shape, _) in given.items()}
+        shapes: dict[int, Shape] = {v: tuple(shape) for v, shape, _ in given}
         found: list[Layer | None] = []
         for node, layer in zip(self.net.plan.nodes, self.net.layers, strict=True):
             known = bool(node.bottoms) and all(v in shapes for v in node.bottoms)

@@ -256,6 +256,8 @@ class Softmax(Layer):
     """
 
     gradient_reads = frozenset({"top"})
+    fresh = True
+    any_layout = True
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
