@@ -167,7 +167,9 @@ def _columns_of_shape(
         return lambda maps: maps.contiguous().numpy().reshape(flat)
     frame = None
     if any(sliding.pad):
-        frame = torch.zeros((count, channels, *(n + 2 * p for n, p in zip(size, sliding.pad, strict=True))), dtype=dtype)
+        frame = torch.zeros(
+            (count, channels, *(n + 2 * p for n, p in zip(size, sliding.pad, strict=True))), dtype=dtype
+        )
         inner = frame[:, :, sliding.pad[0] : sliding.pad[0] + size[0], sliding.pad[1] : sliding.pad[1] + size[1]]
         size = list(frame.shape[2:])
     area = size[0] * size[1]

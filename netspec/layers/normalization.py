@@ -346,7 +346,10 @@ class Scale(_Affine):
         scale, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         axes = (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
         if self.is_exact(scale, self.small):
-            factors, shift = values_of(scale).clone().view(axes), None if bias is None else values_of(bias).clone().view(axes)
+            factors, shift = (
+                values_of(scale).clone().view(axes),
+                None if bias is None else values_of(bias).clone().view(axes),
+            )
             if shift is None:
                 return finished(lambda data: data * factors, how.finish)
             return finished(lambda data: (data * factors).add_(shift), how.finish)

@@ -19,7 +19,7 @@ from typing_extensions import override
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.exact.sums import RowSums
-from netspec.exact.switch import applies
+from netspec.exact.switch import applies, is_recorded
 from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, unknown_type
@@ -80,7 +80,9 @@ class Net(torch.nn.Module):
         ]
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
-        self._given = [v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops]
+        self._given = [
+            v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
+        ]
         self.programs = Programs(self, options.passes) if self.phase == TEST and options.passes else None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -229,8 +231,8 @@ class Net(torch.nn.Module):
             known = ", ".join(self.inputs) or "none (it reads its own data)"
             raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
         kept = self._kept()
-        if self.programs and not torch.is_grad_enabled() and _is_running():
-            return self._run_prepared(inputs, kept)
+        if self.programs and not torch.is_grad_enabled() and not is_recorded():
+            return self._run_prepared(self.programs, inputs, kept)
         values: dict[int, torch.Tensor] = {}
         memories: dict[int, Memory] = {}
         loss: torch.Tensor | None = None
@@ -253,10 +255,10 @@ class Net(torch.nn.Module):
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
     def _run_prepared(
-        self, inputs: Mapping[str, Array], kept: frozenset[int]
+        self, programs: Programs, inputs: Mapping[str, Array], kept: frozenset[int]
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         given = {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
-        loss, values = self.programs.run(given, kept)
+        loss, values = programs.run(given, kept)
         blobs = self.plan.blobs
         self.__dict__["blobs"] = {blobs[v]: values[v] for v in sorted(kept)}  # a module's own way of setting is slow
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
@@ -371,11 +373,6 @@ class Net(torch.nn.Module):
         """Close files and stop threads."""
         for layer in self.layers:
             layer.close()
-
-
-def _is_running() -> bool:
-    """Return whether operations are executed, and not recorded."""
-    return not (torch.compiler.is_compiling() or torch.jit.is_tracing())
 
 
 def _tops(plan: Plan, node: Node) -> list[str]:

@@ -41,13 +41,13 @@ class Program:
     schedule: Schedule
     kinds: list[str]
     one_thread: bool
-    frozen: list[tuple[torch.Tensor, Stamp]]
+    frozen: list[tuple[dict[str, Any], str, torch.Tensor, Stamp]]
     waiting: list[tuple[torch.Tensor, Stamp]]
 
     def is_current(self) -> bool:
-        """Return whether no learned blob was written to, and none that was has come to rest."""
-        for blob, before in self.frozen:
-            if stamp(blob) != before:
+        """Return whether no learned blob was written to or replaced, and none that was has come to rest."""
+        for owner, name, blob, before in self.frozen:
+            if owner[name] is not blob or stamp(blob) != before:
                 return False
         if not self.waiting:
             return True
@@ -62,10 +62,8 @@ class Programs:
     def __init__(self, net: Net, passes: Collection[str]) -> None:
         self.net = net
         self.passes = frozenset(passes)
-        self._sources = [
-            i for i, node in enumerate(net.plan.nodes) if not node.bottoms and not net.layers[i].is_input
-        ]
-        self._programs: OrderedDict[Any, Program] = OrderedDict()
+        self._sources = [i for i, node in enumerate(net.plan.nodes) if not node.bottoms and not net.layers[i].is_input]
+        self.made: OrderedDict[Any, Program] = OrderedDict()
         self._memos: dict[Any, tuple[tuple[Stamp, ...], Any]] = {}
         self._seen: dict[int, Stamp] = {}
 
@@ -109,13 +107,13 @@ class Programs:
     def program(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
         """Return the program for values of these shapes and types, made now or before."""
         key = (given, kept)
-        program = self._programs.get(key)
+        program = self.made.get(key)
         if program is None or not program.is_current():
             with torch.inference_mode(False), torch.no_grad():
-                program = self._programs[key] = self._make(given, kept)
-        self._programs.move_to_end(key)
-        if len(self._programs) > PROGRAMS:
-            self._programs.popitem(last=False)
+                program = self.made[key] = self._make(given, kept)
+        self.made.move_to_end(key)
+        if len(self.made) > PROGRAMS:
+            self.made.popitem(last=False)
         return program
 
     def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
@@ -149,14 +147,16 @@ class Programs:
             losses = [(j, weight) for j, weight in enumerate(net.loss_weights[step.node]) if weight]
             single = step.bottoms[0] if len(step.bottoms) == 1 else -1
             line.append((kernel, single, step.bottoms, step.tops, losses, step.ends))
-        blobs = {id(blob): blob for layer in net.layers for blob in layer.blobs}
+        blobs = [
+            (owner, *each) for owner in (layer.blobs._parameters for layer in net.layers) for each in owner.items()
+        ]
         return Program(
             line,
             order,
             kinds,
             any(exact),
-            [(blob, stamp(blob)) for key, blob in blobs.items() if key not in changing],
-            [(blob, stamp(blob)) for key, blob in blobs.items() if key in changing],
+            [(owner, name, blob, stamp(blob)) for owner, name, blob in blobs if id(blob) not in changing],
+            [(blob, stamp(blob)) for _, _, blob in blobs if id(blob) in changing],
         )
 
     def _kernel(self, step: Step, layers: Sequence[Layer], unknown: bool, as_is: bool) -> tuple[Kernel, str]:

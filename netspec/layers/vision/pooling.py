@@ -315,11 +315,13 @@ class Pooling(_PoolingBase):
             return super().prepare(how)
         geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
         if self.method == AVE:
-            return finished(lambda maps: torch._C._nn.avg_pool2d(maps, *geometry, ceil, True), how.finish)
+            return finished(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.finish)
 
         def kernel(maps: torch.Tensor) -> torch.Tensor:
             values = torch.max_pool2d(maps, *geometry, 1, ceil)
-            return values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]  # as there: torch lets NaN win
+            return (
+                values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]
+            )  # as there: torch lets NaN win
 
         return finished(kernel, how.finish)
 
