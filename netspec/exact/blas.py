@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg import blas
-from threadpoolctl import ThreadpoolController
 
 Values = torch.Tensor | np.ndarray  # a loop over images is faster on arrays, which it makes once
 
@@ -31,6 +29,8 @@ def array(values: Values) -> np.ndarray:
 
 
 def _routine(name: str, values: np.ndarray) -> Callable[..., Any]:
+    from scipy.linalg import blas  # half a second, for which nets without exact sums need not wait
+
     return getattr(blas, values.dtype.char.replace("f", "s") + name)
 
 
@@ -110,5 +110,8 @@ def one_thread() -> Iterator[None]:
 @cache
 def _pools() -> list[Any]:
     """Return the OpenBLAS that SciPy brings, or every one there is where SciPy's has no place of its own."""
+    import scipy.linalg  # noqa: F401  so that its OpenBLAS is there
+    from threadpoolctl import ThreadpoolController
+
     pools = ThreadpoolController().select(internal_api="openblas").lib_controllers
     return [pool for pool in pools if "scipy.libs" in pool.filepath] or pools

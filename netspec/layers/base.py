@@ -42,7 +42,7 @@ Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (
 
 @dataclass(frozen=True)
 class Absorbed:
-    """A layer that also does what another did: its LayerParameter and its learned blobs, in double."""
+    """A layer that also does what another did: its LayerParameter and its learned blobs."""
 
     param: Any
     blobs: tuple[torch.Tensor, ...]
@@ -263,7 +263,7 @@ class Layer(torch.nn.Module):
         return False
 
     def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        """Return the layer that scales and shifts the channels of its top, axis 1, as well."""
+        """Return the layer that scales and shifts the channels of its top, axis 1, as well; in their precision."""
         raise NotImplementedError
 
     def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
@@ -274,11 +274,16 @@ class Layer(torch.nn.Module):
         """Return a copy of a learned blob in double precision, on the CPU."""
         return values_of(self.blob(index)).cpu().double()
 
+    def blob_like(self, index: int, other: torch.Tensor) -> torch.Tensor:
+        """Return a learned blob with the precision of another tensor, on its device."""
+        return values_of(self.blob(index)).to(other)
+
     def absorbing(self, absorbed: Absorbed) -> Layer:
         """Return a copy of the layer with this LayerParameter and these blobs, at its present shapes."""
         made = copy.copy(self)
         made.param = absorbed.param
-        made._modules = {**self._modules, "blobs": torch.nn.ParameterList(absorbed.blobs)}
+        blobs = torch.nn.ParameterList([torch.nn.Parameter(blob, False) for blob in absorbed.blobs])
+        made._modules = {**self._modules, "blobs": blobs}
         made.blob_shapes = [tuple(blob.shape) for blob in absorbed.blobs]
         return made
 
@@ -316,16 +321,17 @@ class Layer(torch.nn.Module):
 
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
         """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""
-        data = torch.full(self.possible(shape), value, device=self.context.device)
+        axes, device = self.possible(shape), self.context.device
+        data: torch.Tensor | None = None
         if filler is not None:
             try:
-                if data.is_meta:
-                    fillers.check(filler, tuple(shape))
+                if device.type == "meta":
+                    fillers.check(filler, axes)
                 else:
-                    data.copy_(fillers.fill(filler, tuple(shape), self.context.random.on("cpu")))
+                    data = fillers.fill(filler, axes, self.context.random.on("cpu")).to(device)
             except ValueError as fault:
                 self.context.report(self.error(str(fault), *self._path_to(filler)))
-        self.blobs.append(Learned(data))
+        self.blobs.append(Learned(fillers.constant(axes, value, device) if data is None else data))
         self.blob_shapes.append(tuple(shape))
 
     def blob(self, index: int) -> torch.Tensor:

@@ -114,10 +114,10 @@ class InnerProduct(Layer):
         param = copy_of(self.param)
         param.inner_product_param.bias_term = True
         outputs = param.inner_product_param.num_output
-        bias = self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros(outputs, dtype=torch.double)
+        bias = self.blob_like(1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
         factors = scale.expand(outputs)
         factors = factors if param.inner_product_param.transpose else factors[:, None]
-        return Absorbed(param, (self.blob_in_double(0) * factors, scale * bias + shift))
+        return Absorbed(param, (self.blob_like(0, scale) * factors, scale * bias + shift))
 
     @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:

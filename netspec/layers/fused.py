@@ -58,8 +58,7 @@ def convolution(
 
 
 def _laid_out(weight: torch.Tensor, geometry: Sequence[Any]) -> torch.Tensor:
-    weight = weight.contiguous(memory_format=torch.channels_last)
-    return _ops()._reorder_convolution_weight(weight, *geometry, [])
+    return _ops()._reorder_convolution_weight(weight.contiguous(), *geometry, [])
 
 
 def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernel:

@@ -379,7 +379,8 @@ class Scale(_Affine):
         assert own is not None
         param = copy_of(self.param)
         param.scale_param.bias_term = True
-        return Absorbed(param, (own[0] * scale, own[0] * shift + own[1]))
+        factor, offset = (values.to(scale) for values in own)
+        return Absorbed(param, (factor * scale, factor * shift + offset))
 
     @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:

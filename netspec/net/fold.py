@@ -43,10 +43,15 @@ def find_folds(plan: Plan, layers: Sequence[Layer]) -> list[Fold]:
     return [Fold(chain, absorbed_by(chain, layers)) for chain in find_chains(plan, roles_of(plan, layers))]
 
 
-def absorbed_by(chain: Chain, layers: Sequence[Layer]) -> Absorbed:
-    """Return what a chain's keeper has to be to do the work of all."""
+def absorbed_by(chain: Chain, layers: Sequence[Layer], like: torch.Tensor | None = None) -> Absorbed:
+    """Return what a chain's keeper has to be to do the work of all, in double or in the precision of ``like``.
+
+    What scales and shifts is composed in double in any case.
+    """
     keeper = layers[chain.keeper]
     scale, shift = composed([layers[i].as_affine() for i in chain.folded])
+    if like is not None:
+        scale, shift = scale.to(like), shift.to(like)
     return (keeper.absorb if chain.keeper < chain.folded[0] else keeper.absorb_before)(scale, shift)
 
 

@@ -21,7 +21,7 @@ from netspec.exact import ALL
 from netspec.exact.blas import one_thread
 from netspec.graph.fold import Roles
 from netspec.graph.steps import PACK, Schedule, Step, schedule
-from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape
+from netspec.layers.base import Kernel, Layer, Preparation, Shape
 from netspec.layers.learned import Stamp, is_lent, stamp
 from netspec.net.fold import absorbed_by, roles_of
 
@@ -179,7 +179,7 @@ class Programs:
 
         if step.chain:
             chain = step.chain
-            layer = layer.absorbing(memo("fold", lambda: _in_type_of(layer, absorbed_by(chain, layers))))
+            layer = layer.absorbing(memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
         finish = layers[step.finish].finishing() if step.finish is not None else None
         how = Preparation(finish, step.reuse, memo, PACK in self.passes)
         kernel = Layer.prepare(layer, how) if as_is else layer.prepare(how)
@@ -225,10 +225,3 @@ def _ids(layer: Layer) -> set[int]:
 
 def _both(these: Sequence[bool], those: Sequence[bool]) -> list[bool]:
     return [a and b for a, b in zip(these, those, strict=True)]
-
-
-def _in_type_of(layer: Layer, absorbed: Absorbed) -> Absorbed:
-    """Return the blobs as parameters of a layer's precision, on its device."""
-    like = layer.blobs[0]
-    blobs = (torch.nn.Parameter(blob.to(like.device, like.dtype), False) for blob in absorbed.blobs)
-    return Absorbed(absorbed.param, tuple(blobs))

@@ -296,12 +296,12 @@ class Convolution(_SlidingFilter):
     def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         param = copy_of(self.param)
         param.convolution_param.bias_term = True
-        bias = self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros(self.num_output, dtype=torch.double)
+        bias = self.blob_like(1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
         return Absorbed(param, (self.scaled_filters(scale.expand(self.num_output)), scale * bias + shift))
 
     def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
-        """Return blobs[0], in double, with the filters of each output channel multiplied by a number of their own."""
-        filters = self.blob_in_double(0)
+        """Return blobs[0] with the filters of each output channel multiplied by a number of their own."""
+        filters = self.blob_like(0, scale)
         return filters * scale.reshape(-1, *(1,) * (filters.dim() - 1))
 
     torch_module: ClassVar[str] = "Conv"
@@ -378,7 +378,7 @@ class Deconvolution(Convolution):
 
     @override
     def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
-        filters = self.blob_in_double(0)
+        filters = self.blob_like(0, scale)
         grouped = filters.reshape(self.group, -1, *filters.shape[1:])
         factors = scale.reshape(self.group, 1, -1, *(1,) * self.spatial_axes)
         return (grouped * factors).reshape(filters.shape)
