@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from netspec.solver.solver import Solver, load_solver
 
 # How idle OpenMP threads wait, which is read when torch is loaded: asleep. GNU's runtime has them spin for a while, and
-# that takes the cores from a second training on the machine (tools/benchmark_side_by_side.py). A user's choice stays.
+# that takes the cores from a second training on the machine (tools/bench waiting). A user's choice stays.
 _WAITS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 if "torch" not in sys.modules and not any(name in os.environ for name in _WAITS):
     os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
