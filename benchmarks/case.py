@@ -74,11 +74,13 @@ def forward_case(
         net = netspec.load_net(case.prototxt, "TEST", weights, seed=0)
         if weights is None:
             randomize(net)
+        random = np.random.default_rng(0)
+        inputs = {blob: random.standard_normal(net.shapes[blob], np.float32) for blob in net.inputs}
+        if weights is None:
+            calm(net, inputs)
         netspec.save_weights(net, case.caffemodel)
         if onnx:
             export_onnx(net, case.onnx)
-        random = np.random.default_rng(0)
-        inputs = {blob: random.standard_normal(net.shapes[blob], np.float32) for blob in net.inputs}
         np.savez(case.inputs, allow_pickle=False, **inputs)
         yield case
 
@@ -174,3 +176,18 @@ def randomize(net: Any) -> None:
             for blob in layer.blobs:
                 if not blob.any():
                     blob.normal_(0, (2 / blob[0].numel()) ** 0.5 if blob.dim() > 1 else 0.1)
+
+
+def calm(net: Any, inputs: dict[str, np.ndarray]) -> None:
+    """Scale the last layer that learns, so that its values are of the size of 1: a softmax then tells differences."""
+    import torch
+
+    last = [layer for layer in net.layers if len(layer.blobs)][-1:]
+    for layer in last:
+        net.keep = list(layer.param.top)
+        with torch.no_grad():
+            net(**inputs)
+            size = net.blobs[layer.param.top[0]].std()
+            for blob in layer.blobs:
+                blob /= size
+    net.keep = ()

@@ -101,7 +101,7 @@ def onnxruntime(task: Task) -> Run:
 
 def openvino(task: Task) -> Run:
     """Run the exported model in OpenVINO itself, in the precision of the task."""
-    import openvino  # type: ignore[import-not-found]
+    import openvino
 
     core = openvino.Core()
     model = core.read_model(task["onnx"])

@@ -16,7 +16,7 @@ from netspec.proto.dialect.folders import FOLDERS
 
 if TYPE_CHECKING:
     from netspec.dialects import use_dialect
-    from netspec.net.build import load_net
+    from netspec.engines.net import load_net
     from netspec.net.net import Net
     from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights
@@ -32,7 +32,7 @@ _HOMES = {
     "use_dialect": "netspec.dialects",
     "Net": "netspec.net.net",
     "layer": "netspec.net.one_layer",
-    "load_net": "netspec.net.build",
+    "load_net": "netspec.engines.net",
     "Solver": "netspec.solver.solver",
     "load_solver": "netspec.solver.solver",
     "load_weights": "netspec.net.weights",

@@ -10,14 +10,17 @@ from typing import Any
 from netspec import log
 from netspec.cli.arguments import (
     add_device,
+    add_engine,
     add_exact,
     add_python,
     add_state,
     add_strict,
     bar,
+    choice,
     device,
     load_weights,
     positive,
+    run_by,
     shape,
     split_paths,
     stages,
@@ -72,6 +75,7 @@ def add_to(commands: Commands) -> None:
     add_python(p)
     add_exact(p)
     add_strict(p)
+    add_engine(p)
 
 
 def _extract(arguments: argparse.Namespace) -> None:
@@ -102,9 +106,19 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     weights = split_paths(arguments.weights) if arguments.weights else []
     given = arguments.shape[1] if arguments.shape else None
     (blob,) = arguments.blob
-    zooms, chosen = arguments.zooms or (1.0,), device(arguments.gpu)
+    chosen = device(arguments.gpu) if arguments.gpu else "cpu"  # without torch, where the engine needs none
     net = ImageNet(
-        arguments.model, weights, blob, arguments.input, chosen, given, zooms, arguments.exact, arguments.strict, steps
+        arguments.model,
+        weights,
+        blob,
+        arguments.input,
+        chosen,
+        given,
+        arguments.zooms or (1.0,),
+        arguments.exact,
+        arguments.strict,
+        steps,
+        choice(arguments),
     )
     size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "RGB" if net.scaling.swap else "BGR"
     print(f"{arguments.model}: {blob} of {len(images.paths)} images from {arguments.images}")
@@ -130,6 +144,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     options = BuildOptions(device(arguments.gpu), allow_python=python, exact=exact)
     net = build_net(stated, source, options)
     load_weights(net, arguments.weights, arguments.strict)
+    net = run_by(net, arguments, arguments.weights)
     arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))
     net.close()
     print(f"{arguments.model}: {', '.join(arguments.blob)} of {len(arrays['keys'])} records")
