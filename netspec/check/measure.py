@@ -54,6 +54,28 @@ def time_net(net: Net, iterations: int) -> None:
     info("caffe.cpp:415", "*** Benchmark ends ***")
 
 
+def time_forward(net: Net, iterations: int) -> None:
+    """Run ``iterations`` forward passes of a net that an engine runs as a whole, and log their milliseconds.
+
+    The inputs of the net are zeros.
+    """
+    inputs = {name: torch.zeros(net.shapes[name]) for name in net.inputs}
+    with torch.no_grad():
+        info("caffe.cpp:351", "Performing Forward")
+        info("caffe.cpp:356", f"Initial loss: {number(float(net.forward_loss(**inputs)[0]))}")
+        info("caffe.cpp:365", "*** Benchmark begins ***")
+        info("caffe.cpp:366", f"Testing for {iterations} iterations.")
+        began = time.perf_counter()
+        for k in range(1, iterations + 1):
+            start = time.perf_counter()
+            net(**inputs)
+            info("caffe.cpp:394", f"Iteration: {k} forward time: {number((time.perf_counter() - start) * 1e3)} ms.")
+    total = (time.perf_counter() - began) * 1e3
+    info("caffe.cpp:408", f"Average Forward pass: {number(total / iterations)} ms.")
+    info("caffe.cpp:414", f"Total Time: {number(total)} ms.")
+    info("caffe.cpp:415", "*** Benchmark ends ***")
+
+
 def _pass(net: Net, forward: list[float], backward: list[float]) -> float:
     """Run each layer forward, then each layer backward on its own graph; add the seconds; return the loss.
 
