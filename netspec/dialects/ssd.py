@@ -1,8 +1,6 @@
 """SSD, the single shot detector: weiliu89/caffe, branch ssd.
 
-Not here are its layers AnnotatedData (databases of images with boxes, and their augmentation) and DetectionEvaluate;
-their messages are, and the solver's fields for them, so that scripts can write such files. To train, bring images and
-boxes by other layers: MultiBoxLoss says which rows it takes.
+A database for its layer AnnotatedData is what the fork's convert_annoset writes: records of AnnotatedDatum.
 """
 
 from __future__ import annotations
@@ -15,6 +13,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from netspec.dialects._annotated import AnnotatedData
 from netspec.dialects._boxes import (
     CENTER_SIZE,
     Array,
@@ -24,6 +23,7 @@ from netspec.dialects._boxes import (
     onnx_decode,
     suppress,
 )
+from netspec.dialects._evaluate import DetectionEvaluate
 from netspec.dialects._multibox import MultiBoxLoss
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape, rounded
@@ -239,6 +239,19 @@ extend LayerParameter {
 """
 
 register("MultiBoxLoss", "multibox_loss_param", "loss_param")(MultiBoxLoss)
+register(
+    "AnnotatedData",
+    "annotated_data_param",
+    "data_param",
+    "transform_param",
+    "transform_param.resize_param",
+    "transform_param.emit_constraint",
+    "transform_param.crop_h",
+    "transform_param.crop_w",
+    "transform_param.distort_param",
+    "transform_param.expand_param",
+)(AnnotatedData)
+register("DetectionEvaluate", "detection_evaluate_param")(DetectionEvaluate)
 
 
 @register("Permute", "permute_param")

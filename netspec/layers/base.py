@@ -136,6 +136,8 @@ class Layer(torch.nn.Module):
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
     reads_data: ClassVar[bool] = False  # its tops are records; exported nets take them as inputs
     counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
+    gathers: ClassVar[bool] = False  # in a test its top is not averaged over the batches: see ``score``
+    solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
     not_exported: ClassVar[str] = "its class does not define it"  # the reason, where it cannot be exported
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
@@ -185,6 +187,13 @@ class Layer(torch.nn.Module):
 
     def restart(self) -> None:
         """Return to the first record, where the layer reads any."""
+
+    def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
+        """Return what the tops of all batches of a test say together; for layers that gather.
+
+        ``solver`` is the SolverParameter, None where there is no solver.
+        """
+        raise NotImplementedError
 
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""
