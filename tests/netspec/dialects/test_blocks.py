@@ -344,7 +344,7 @@ def test_bn_refuses_two_forks_at_once(build: Build) -> None:
 
 
 def test_every_layer_says_what_it_takes_and_gives() -> None:
-    for name in ("ssd", "rcnn", "blocks", "layout", "yolo"):
+    for name in ("ssd", "rcnn", "blocks", "layout", "yolo", "ristretto"):
         before = set(layer_types())
         use_dialect(name)
         for kind in set(layer_types()) - before:

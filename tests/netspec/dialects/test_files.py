@@ -94,7 +94,7 @@ FAULTS = {
     "nothing like it": (
         None,
         "x" * 20,
-        f'unknown dialect "{"x" * 20}"; expected one of: blocks, layout, rcnn, ssd, yolo, or the path',
+        f'unknown dialect "{"x" * 20}"; expected one of: blocks, filters, layout, nvidia, rcnn, ristretto, ssd,',
     ),
     "no such file": (None, "{path}", "{path}: cannot be read: No such file or directory"),
     "not text": (b"\xff\xfe", "{path}", "{path}: cannot be read: 'utf-8' codec can't decode"),
