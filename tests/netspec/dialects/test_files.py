@@ -285,3 +285,9 @@ def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None
 
 def test_what_no_dialect_has_is_left_to_the_reader(files_afresh: None) -> None:
     assert use_dialects_of('layer { type: "NoSuchType" no_such_param { } }', "x.prototxt") == []
+
+
+def test_the_readme_names_every_dialect() -> None:
+    table = re.findall(r"^\| `(\w+)` \|", (ROOT / "netspec" / "README.md").read_text(), re.MULTILINE)
+    own = {path.stem for path in (ROOT / "netspec" / "dialects").glob("[!_]*.py")}
+    assert own <= set(table)
