@@ -8,22 +8,23 @@ import torch
 
 from netspec.log import info, number
 from netspec.net.net import Net
-from netspec.solver.tally import Outputs, Tally, score_lines
+from netspec.solver.tally import Outputs, Tally, score_lines, scorers
 
 
 def test_net(net: Net, iterations: int) -> Outputs:
     """Run ``iterations`` batches; log each batch's outputs and their means, and return the means by output blob."""
     info("caffe.cpp:281", f"Running for {iterations} iterations.")
-    tally = Tally()
+    tally = Tally(scorers(net))
     with torch.no_grad():
         for batch in range(iterations):
             for name, values in tally.add(*net.forward_loss()).items():
                 for value in values:
                     info("caffe.cpp:304", f"Batch {batch}, {name} = {number(value)}")
     info("caffe.cpp:309", f"Loss: {number(tally.loss)}")
-    for line in score_lines(tally.scores, net.output_loss_weights):
+    scores = tally.scores
+    for line in score_lines(scores, net.output_loss_weights):
         info("caffe.cpp:321", line)
-    return tally.scores
+    return scores
 
 
 def time_net(net: Net, iterations: int) -> None:
