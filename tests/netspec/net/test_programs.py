@@ -7,9 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from typing_extensions import override
 
 from exported import trained
 from netspec.graph.steps import PASSES
+from netspec.layers.activation import ReLU
+from netspec.layers.base import Layer
+from netspec.layers.vision.convolution import Convolution
 from netspec.net import programs
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, write_binary
@@ -279,3 +283,20 @@ def test_inference_mode_and_no_grad_may_take_turns(net_of: Callable[..., Net]) -
     for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
         with mode():
             assert_same(net(data=images()), expected)
+
+
+def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> None:
+    class Halved(Convolution):
+        @override
+        def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return tuple(top / 2 for top in super().forward(*bottoms))
+
+    class Named(Convolution):
+        """The same forward pass."""
+
+    assert Halved.prepare is Layer.prepare
+    assert Halved.absorbs is Layer.absorbs
+    assert not Halved.fresh
+    assert Named.prepare is Convolution.prepare
+    assert Named.fresh
+    assert ReLU.fresh
