@@ -84,6 +84,16 @@ def test_what_only_hands_on_is_not_run_and_sums_are_made_in_place(net_of: Callab
     assert steps[-1].reuse
 
 
+@pytest.mark.parametrize("how", ["num_output: 12", "num_output: 8 group: 8", "num_output: 8 group: 8 dilation: 2"])
+def test_deconvolutions_are_laid_out_too(how: str, net_of: Callable[..., Net]) -> None:
+    layer = f'type: "Deconvolution" convolution_param {{ kernel_size: 4 stride: 2 pad: 1 {how} {FILLERS} }}'
+    text = INPUT + f'layer {{ name: "conv" bottom: "data" top: "conv" {layer} }}' + NORM
+    net = trained(net_of(text.replace('type: "ReLU"', 'type: "ReLU" relu_param { negative_slope: 0.1 }')))
+    x = images(1, 8, 80, 80)
+    assert_same(quickly(net, data=x), slowly(net, data=x))
+    assert last_program(net).kinds == ["packed"]
+
+
 @pytest.mark.parametrize("passes", [(), *((name,) for name in PASSES), PASSES], ids="-".join)
 def test_each_pass_can_be_switched(passes: tuple[str, ...], net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED, passes=passes))
