@@ -12,13 +12,13 @@ from benchmarks.report import Row
 from netspec.command_line import Commands, run
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
-FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe")
+FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
 TRAINING = ("netspec", "pytorch", "pycaffe")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit statuses are those of netspec."""
-    return run(parser(), list(sys.argv[1:] if argv is None else argv))
+    return run(parser(), list(sys.argv[1:] if argv is None else argv), (RuntimeError,))  # a worker that ended
 
 
 def parser() -> argparse.ArgumentParser:
