@@ -24,7 +24,7 @@ from netspec.net.weights import load_weights, write_binary, write_hdf5
 from netspec.proto.schema import PhaseValue
 from netspec.proto.text import parse_net
 from netspec.pycaffe import mode
-from netspec.pycaffe.errors import original_errors
+from netspec.pycaffe.errors import caffes_errors
 from netspec.pycaffe.named import Named
 from netspec.pycaffe.passes import Passes
 
@@ -64,7 +64,7 @@ class Net:
         for path in (network_file, *([] if weights is None else [weights])):
             if not Path(path).is_file():
                 raise RuntimeError(f"Could not open file {path}")
-        with original_errors():
+        with caffes_errors():
             net, source = parse_net(network_file)
             self._hold(
                 build_net(with_state(net, PhaseValue(phase), level or 0, stages or ()), source, mode.build_options())
@@ -152,7 +152,8 @@ class Net:
         return {name: self.blobs[name].diff for name in dict.fromkeys(wanted)}
 
     def _forward(self, start: int, end: int) -> float:
-        return self.passes.forward(start, end).item()
+        with caffes_errors():
+            return self.passes.forward(start, end).item()
 
     def _backward(self, start: int, end: int) -> None:
         self.passes.backward(start, end)
@@ -226,7 +227,8 @@ class Net:
 
     def reshape(self) -> None:
         """Give every blob the shape that follows from those of the inputs."""
-        self.passes.reshape()
+        with caffes_errors():
+            self.passes.reshape()
 
     def clear_param_diffs(self) -> None:
         """Set the gradients of the learnable blobs to 0; :meth:`backward` adds to them."""
@@ -266,7 +268,8 @@ class Net:
         if not Path(weights).is_file():
             raise RuntimeError(f"Could not open file {weights}")
         self.passes.upload()
-        load_weights(self.passes.net, weights)
+        with caffes_errors():
+            load_weights(self.passes.net, weights)
 
     def load_hdf5(self, weights: FilePath) -> None:
         """Copy the weights of an HDF5 file into the layers of the same names."""
