@@ -263,6 +263,44 @@ class VectorProducts(ParameterSums):
         return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
 
 
+class SummedProducts(ParameterSums):
+    """What :class:`VectorProducts` computes, by torch's kernels, on any device.
+
+    Unlike torch's own function it adds the weights' gradient to the sum at once: in fully connected layers it is the
+    largest of all tensors, and fresh memory for it takes longer to get than the product itself.
+    """
+
+    @staticmethod
+    @override
+    def forward(
+        ctx: Any,
+        vectors: torch.Tensor,
+        weight: torch.Tensor,
+        bias: torch.Tensor | None,
+        transposed: bool,
+        in_place: bool,
+    ) -> torch.Tensor:
+        ParameterSums.keep(ctx, vectors, (weight, bias), in_place)
+        ctx.transposed = transposed
+        return F.linear(vectors, weight.t() if transposed else weight, bias)
+
+    @staticmethod
+    @once_differentiable
+    @override
+    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
+        """Return the gradients of vectors, weight and bias, where they are asked for."""
+        vectors, weight, _ = ctx.saved_tensors
+        weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
+        if weight_sums is not None:
+            weight_sums.addmm_(*((vectors.t(), tops_diff) if ctx.transposed else (tops_diff.t(), vectors)))
+        if bias_sums is not None:
+            bias_sums += tops_diff.sum(0)
+        vectors_diff = None
+        if ctx.needs_input_grad[0]:
+            vectors_diff = tops_diff @ (weight.t() if ctx.transposed else weight)
+        return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
+
+
 class ChosenRows(ParameterSums):
     """Look up rows.
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import torch
 
 from netspec.net.net import Net
+from netspec.solver import update
 
 
 class Replicas:
@@ -46,8 +47,7 @@ class Replicas:
     def clear(self) -> None:
         """Clear the gradients of the last iteration."""
         for net in self.nets:
-            for learnable in net.learnable:
-                learnable.parameter.grad = None
+            update.clear(item.parameter for item in net.learnable)
 
     @torch.no_grad()
     def update(self) -> None:

@@ -301,8 +301,7 @@ class Solver:
 
     def clear_gradients(self) -> None:
         """Clear the gradients, before an iteration sums them up."""
-        for learnable in self.net.learnable:
-            learnable.parameter.grad = None
+        update.clear(item.parameter for item in self.net.learnable)
 
     def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the training net forward and backward; return its loss and outputs."""
@@ -337,12 +336,9 @@ class Solver:
             limit = log.number(self.param.clip_gradients)
             message = f"Gradient clipping: scaling down gradients (L2 norm {norm} > {limit}) by scale factor {factor}"
             log.info("sgd_solver.cpp:99", message)
-        update.normalize(diffs, self.param.iter_size)
         decays = [self.param.weight_decay * item.decay_mult for item in learnable]
-        update.regularize(diffs, weights, decays, self.param.regularization_type)
         rates = [rate * item.lr_mult for item in learnable]
-        self._rule.compute(self.param, diffs, rates, self.history, self.iteration)
-        update.subtract(weights, diffs)
+        update.move(self._rule, self.param, weights, diffs, self.history, rates, decays, self.iteration)
         self.replicas.update()
         self.iteration += 1
 
