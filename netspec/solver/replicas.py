@@ -37,6 +37,8 @@ class Replicas:
     @torch.no_grad()
     def reduce(self) -> None:
         """Make the root's gradients the mean over all devices."""
+        if not self.nets:
+            return
         for own, *theirs in zip(*(net.learnable for net in (self._root, *self.nets)), strict=True):
             if own.parameter.grad is None:
                 continue

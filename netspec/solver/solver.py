@@ -31,6 +31,7 @@ from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
 from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
 from netspec.solver.debug import debug_info
+from netspec.solver.heap import keep_freed_memory
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
@@ -251,6 +252,7 @@ class Solver:
         Raises SpecError if a net has inputs: a solver cannot fill them.
         """
         self.check_inputs()
+        keep_freed_memory()
         self.stopped = False
         self.replicas.begin()
         self._losses.clear()
