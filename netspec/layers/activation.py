@@ -78,6 +78,10 @@ class ReLU(Activation):
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
     @override
+    def run_in_place(self, top: torch.Tensor) -> torch.Tensor | None:
+        return None if self.slope else F.relu_(top)
+
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope)
 
