@@ -11,6 +11,7 @@ from typing import Any
 from netspec import log
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
+from netspec.graph.steps import PASSES
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +36,26 @@ def add_exact(parser: argparse.ArgumentParser) -> None:
         default=SMALL,
         help=f"which sums equal Caffe's in every bit, on the CPU; all is slower (default: {SMALL})",
     )
+
+
+def add_passes(parser: argparse.ArgumentParser) -> None:
+    """Add ``--passes``."""
+    parser.add_argument(
+        "--passes",
+        type=_passes,
+        default=PASSES,
+        metavar="NAMES",
+        help=f"what may speed up a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
+    )
+
+
+def _passes(text: str) -> tuple[str, ...]:
+    """Read the names of passes."""
+    names = () if text == "none" else tuple(text.split(","))
+    for name in names:
+        if name not in PASSES:
+            raise argparse.ArgumentTypeError(f"found {name!r}, expected none, or some of {','.join(PASSES)}")
+    return names
 
 
 def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
@@ -130,6 +151,7 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
         device=chosen,
         allow_python=arguments.allow_python_layers,
         exact=arguments.exact,
+        passes=arguments.passes,
     )
 
 

@@ -11,6 +11,7 @@ from netspec import log
 from netspec.cli.arguments import (
     add_device,
     add_exact,
+    add_passes,
     add_python,
     add_state,
     add_strict,
@@ -71,6 +72,7 @@ def add_to(commands: Commands) -> None:
     add_state(p, phase="TEST")
     add_python(p)
     add_exact(p)
+    add_passes(p)
     add_strict(p)
 
 
@@ -104,7 +106,17 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     (blob,) = arguments.blob
     zooms, chosen = arguments.zooms or (1.0,), device(arguments.gpu)
     net = ImageNet(
-        arguments.model, weights, blob, arguments.input, chosen, given, zooms, arguments.exact, arguments.strict, steps
+        arguments.model,
+        weights,
+        blob,
+        arguments.input,
+        chosen,
+        given,
+        zooms,
+        arguments.exact,
+        arguments.strict,
+        steps,
+        arguments.passes,
     )
     size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "RGB" if net.scaling.swap else "BGR"
     print(f"{arguments.model}: {blob} of {len(images.paths)} images from {arguments.images}")
@@ -127,7 +139,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
     stated = with_sources(stated, source, dict(arguments.source))
     python, exact = arguments.allow_python_layers, arguments.exact
-    options = BuildOptions(device(arguments.gpu), allow_python=python, exact=exact)
+    options = BuildOptions(device(arguments.gpu), allow_python=python, exact=exact, passes=arguments.passes)
     net = build_net(stated, source, options)
     load_weights(net, arguments.weights, arguments.strict)
     arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))

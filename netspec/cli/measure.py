@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import argparse
 
-from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, load, load_weights, positive
+from netspec.cli.arguments import (
+    add_device,
+    add_exact,
+    add_passes,
+    add_python,
+    add_state,
+    add_strict,
+    load,
+    load_weights,
+    positive,
+)
 from netspec.cli.run import Commands
 from netspec.scores import Score, Scores
 
@@ -20,6 +30,7 @@ def add_to(commands: Commands) -> None:
     add_state(p, phase=None)
     add_python(p)
     add_exact(p)
+    add_passes(p)
     add_strict(p)
 
     p = commands.add("time", _time, "measure the forward and backward time of each layer (caffe time)")
@@ -29,6 +40,7 @@ def add_to(commands: Commands) -> None:
     add_state(p, phase="TRAIN")
     add_python(p)
     add_exact(p)
+    p.set_defaults(passes=())  # each layer is timed by itself
 
 
 def _test(arguments: argparse.Namespace) -> None:

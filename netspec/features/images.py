@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import cv2
@@ -22,6 +22,7 @@ from netspec.features.scaling import Steps, scaling_of
 from netspec.features.views import middle
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
+from netspec.graph.steps import PASSES
 from netspec.lfs import pointer_fault_at
 from netspec.net.build import build_filtered
 from netspec.net.options import BuildOptions
@@ -56,6 +57,7 @@ class ImageNet:
         exact: str = SMALL,
         strict: bool = False,
         steps: Steps | None = None,
+        passes: Collection[str] = PASSES,
     ) -> None:
         net, source = parse_net(model)
         net, source = filter_net(with_state(net, TEST), source)
@@ -71,7 +73,7 @@ class ImageNet:
         steps = steps or Steps()
         self.scaling = scaling_of(steps, transforming[0] if transforming else None, self.shape, source.file)
         after, after_source = prune(net, source, [blob], {input_blob: shape})
-        options = BuildOptions(device or torch.device("cpu"), seed=0, exact=exact)
+        options = BuildOptions(device or torch.device("cpu"), seed=0, exact=exact, passes=passes)
         self.net = build_filtered(after, after_source, options)
         self.net.keep = [blob]
         if weights:

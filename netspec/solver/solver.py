@@ -207,6 +207,7 @@ class Solver:
             ranks=ranks,
             exact=self._exact,
             accumulate_in_place=True,
+            passes=(),
         )
         net = build_net(described.net, described.source, options)
         files = [path.strip() for paths in self.param.weights for path in paths.split(",")]
