@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from netspec import log
+from netspec.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
 from netspec.graph.steps import PASSES
@@ -56,6 +57,23 @@ def _passes(text: str) -> tuple[str, ...]:
         if name not in PASSES:
             raise argparse.ArgumentTypeError(f"found {name!r}, expected none, or some of {','.join(PASSES)}")
     return names
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add ``--engine``, ``--precision``, ``--cache`` and ``--no-cache``."""
+    parser.add_argument("--engine", choices=ENGINES, default=TORCH, help=f"what runs the net (default: {TORCH})")
+    parser.add_argument(
+        "--precision", choices=PRECISIONS, default=FP32, help=f"of the engine's arithmetic (default: {FP32})"
+    )
+    parser.add_argument(
+        "--cache", metavar="DIR", help="keep nets exported for an engine here (default: the user's cache folder)"
+    )
+    parser.add_argument("--no-cache", action="store_true", help="export the net anew, and do not keep it")
+
+
+def choice(arguments: argparse.Namespace) -> Choice:
+    """Return the engine that is asked for."""
+    return Choice.of(arguments.engine, arguments.precision, False if arguments.no_cache else arguments.cache)
 
 
 def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
@@ -161,6 +179,17 @@ def load_weights(net: Any, paths: str | None, strict: bool) -> None:
 
     if paths:
         weights.load_weights(net, split_paths(paths), strict, some=True)
+
+
+def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:
+    """Return the net of ``--model`` as the chosen engine runs it; ``weights`` are those that were loaded."""
+    chosen = choice(arguments)
+    if (chosen.engine, chosen.precision) == (TORCH, FP32):
+        return net
+    from netspec.engines.net import with_engine
+
+    paths = split_paths(weights) if weights else []
+    return with_engine(net, chosen, arguments.model, paths, arguments.level, arguments.stage.split(","))
 
 
 def split_paths(paths: str) -> list[str]:

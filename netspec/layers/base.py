@@ -170,6 +170,8 @@ class Layer(torch.nn.Module):
     fresh: ClassVar[bool] = False  # its one top is memory of its own, not a bottom's
     any_layout: ClassVar[bool] = False  # its kernel takes bottoms whose channels lie side by side (channels_last)
     remembers: ClassVar[bool] = False  # a pass changes more than its tops: it cannot be prepared
+    gathers: ClassVar[bool] = False  # in a test its top is not averaged over the batches: see ``score``
+    solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
     not_exported: ClassVar[str] = "its class does not define it"  # the reason, where it cannot be exported
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
@@ -224,6 +226,13 @@ class Layer(torch.nn.Module):
 
     def restart(self) -> None:
         """Return to the first record, where the layer reads any."""
+
+    def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
+        """Return what the tops of all batches of a test say together; for layers that gather.
+
+        ``solver`` is the SolverParameter, None where there is no solver.
+        """
+        raise NotImplementedError
 
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""

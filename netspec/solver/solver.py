@@ -35,7 +35,7 @@ from netspec.solver.heap import keep_freed_memory
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
-from netspec.solver.tally import Outputs, Tally, as_scores, score_lines
+from netspec.solver.tally import Outputs, Tally, as_scores, score_lines, scorers
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
@@ -145,8 +145,6 @@ class Solver:
         node = node or Place(Where("<solver>"))
         log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
         check_settings(param, node)
-        for line in fields_without_effect(param, node):
-            log.warning("solver.cpp:45", line)
         if param.snapshot:
             check_prefix(param, node)
         self.param = param
@@ -186,6 +184,9 @@ class Solver:
         for i, test in enumerate(tests):
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
             self.test_nets.append(self._build(test, test.label, self._device))
+        read = frozenset[str]().union(*(layer.solver_reads for net in self.test_nets for layer in net.layers))
+        for line in fields_without_effect(param, node, read):
+            log.warning("solver.cpp:45", line)
         log.info("solver.cpp:57", "Solver scaffolding done.")
         self.history = [
             torch.zeros_like(learnable.parameter.detach())
@@ -374,7 +375,7 @@ class Solver:
         log.info("solver.cpp:347", f"Iteration {self.iteration}, Testing net (#{i})")
         net, batches = self.test_nets[i], self.param.test_iter[i]
         net.share_weights_with(self.net)
-        tally = Tally()
+        tally = Tally(scorers(net, self.param))
         for _ in range(batches):
             while request := self.action():
                 if request == "snapshot":
