@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -20,6 +21,7 @@ from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import add_sums, gemm, gemm_routine, one_thread
 
 Axes = tuple[int, ...]
+FEW = 64  # vectors; a product of fewer takes less time than to round the weights to another precision
 COLUMNS = 2**20  # numbers, 4 MB: the columns of some images, which stay in a CPU's cache
 
 
@@ -349,9 +351,13 @@ class SummedProducts(ParameterSums):
         transposed: bool,
         in_place: bool,
     ) -> torch.Tensor:
+        """Return the product; of few vectors in the weights' precision, whatever autocast asks for."""
+        few, ctx.kind = len(vectors) < FEW, vectors.dtype
+        vectors = vectors.to(weight.dtype) if few else vectors
         ParameterSums.keep(ctx, vectors, (weight, bias), in_place)
         ctx.transposed = transposed
-        return F.linear(vectors, weight.t() if transposed else weight, bias)
+        with torch.autocast(weight.device.type, enabled=False) if few else nullcontext():
+            return F.linear(vectors, weight.t() if transposed else weight, bias)
 
     @staticmethod
     @once_differentiable
@@ -360,13 +366,19 @@ class SummedProducts(ParameterSums):
         """Return the gradients of vectors, weight and bias, where they are asked for."""
         vectors, weight, _ = ctx.saved_tensors
         weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
+        kind = tops_diff.dtype  # of the product, which autocast may have chosen
+        vectors = vectors.to(kind)
         if weight_sums is not None:
-            weight_sums.addmm_(*((vectors.t(), tops_diff) if ctx.transposed else (tops_diff.t(), vectors)))
+            factors = (vectors.t(), tops_diff) if ctx.transposed else (tops_diff.t(), vectors)
+            if weight_sums.dtype == kind:
+                weight_sums.addmm_(*factors)
+            else:
+                weight_sums += factors[0] @ factors[1]
         if bias_sums is not None:
             bias_sums += tops_diff.sum(0)
         vectors_diff = None
         if ctx.needs_input_grad[0]:
-            vectors_diff = tops_diff @ (weight.t() if ctx.transposed else weight)
+            vectors_diff = (tops_diff @ (weight.t() if ctx.transposed else weight).to(kind)).to(ctx.kind)
         return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
 
 

@@ -225,7 +225,8 @@ def _normalize(
 
     The statistics come out exact as that kernel's running ones, all weight on the present batch.
     """
-    mean, variance = data.new_zeros(2, data.shape[1]).unbind()
+    exact_enough = torch.promote_types(data.dtype, torch.float32)
+    mean, variance = data.new_zeros(2, data.shape[1], dtype=exact_enough).unbind()
     top = torch.batch_norm(data, factors, bias, mean, variance, True, 1.0, eps, torch.backends.cudnn.enabled)
     return top, mean, variance
 

@@ -304,7 +304,9 @@ class Net(torch.nn.Module):
         bottoms = []
         for v, blocked in zip(node.bottoms, node.blocked, strict=True):
             stop = blocked and not self.param.force_backward
-            bottoms.append(values[v].detach() if stop else values[v])
+            bottom = values[v].detach() if stop else values[v]
+            half = layer.is_loss and bottom.dtype in (torch.bfloat16, torch.float16)
+            bottoms.append(bottom.float() if half else bottom)  # losses are float32 in every precision
         if memory is not None and torch.is_grad_enabled():
             return run_overwritten(layer, bottoms[0], memory, node.in_place[0])
         return layer.run(*bottoms)

@@ -14,6 +14,7 @@ import torch
 
 from netspec.net.net import Net
 from netspec.solver import update
+from netspec.solver.precision import FP32, computing
 
 
 class Replicas:
@@ -27,9 +28,12 @@ class Replicas:
         """Copy the root's parameters, including BatchNorm's statistics, to every replica."""
         self._copy(everything=True)
 
-    def backward(self) -> None:
+    def backward(self, precision: str = FP32) -> None:
         """Add the gradients of one pass to each replica's own. The devices run in parallel."""
-        losses = [net.forward_loss()[0] for net in self.nets]
+        losses = []
+        for net in self.nets:
+            with computing(precision, net.device):
+                losses.append(net.forward_loss()[0])
         for loss in losses:
             if loss.requires_grad:
                 loss.backward()
