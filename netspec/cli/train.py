@@ -36,6 +36,13 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="what SIGHUP does (default: snapshot)")
     add_python(p)
     add_exact(p)
+    p.add_argument(
+        "--precision",
+        choices=("fp32", "tf32", "bf16"),
+        default="fp32",
+        help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, and rounds more "
+        "(default: fp32)",
+    )
     add_strict(p)
 
 
@@ -62,6 +69,7 @@ def _train(arguments: argparse.Namespace) -> None:
             action=action,
             exact=arguments.exact,
             strict=arguments.strict,
+            precision=arguments.precision,
         )
         if arguments.scores:
             _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))

@@ -327,6 +327,14 @@ class Layer(torch.nn.Module):
         tops = self(*bottoms)
         return tops if isinstance(tops, tuple) else (tops,)
 
+    def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
+        """Run this layer and, where one kernel does their work too, some of those that follow.
+
+        Each of ``following`` has one bottom, the top of the layer before it, which nobody else reads. Returns how many
+        of them were run, and the tops of the last.
+        """
+        return 0, self.run(*bottoms)
+
     def fit(self, bottom_shapes: list[Shape]) -> None:
         """Reshape for bottoms of these shapes, if they are others than before."""
         if bottom_shapes != self.bottom_shapes:

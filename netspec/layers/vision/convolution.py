@@ -17,6 +17,7 @@ from netspec.layers import fused
 from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.vision.layout import channels_side_by_side
 
 _CONVOLVE = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
 _DECONVOLVE = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
@@ -220,6 +221,8 @@ class Convolution(_SlidingFilter):
         if self.is_exact(maps, self.small):
             sliding, in_place = Filter(weight.shape[2:], *geometry), self.context.accumulate_in_place
             return ColumnProducts.apply(maps, weight, bias, sliding, self.group, in_place)
+        if torch.is_grad_enabled():  # else weights would be laid out anew for each product: this pays for large maps
+            maps = channels_side_by_side(maps) if maps.numel() > 2 * weight.numel() else maps.contiguous()
         return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
 
     @property
