@@ -24,6 +24,7 @@ from loopclosure.descriptors.similarity import check_metric, squared_distances
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.precision_recall import PrecisionRecall, curve
+from loopclosure.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
 FIRST_CAPACITY = 256  # frames; doubled when full
@@ -245,12 +246,8 @@ class LoopDetector:
             arrays["descriptors"] = np.concatenate(
                 [np.zeros((0, 128), np.uint8), *(f.descriptors for f in frames.local)]
             )
-        path = Path(path)
-        try:
-            with path.open("wb") as stream:
-                np.savez(stream, about=np.array(json.dumps(about)), **arrays)
-        except OSError as error:
-            raise InputError(f"cannot be written ({error.strerror})", path) from error
+        with whole_file(path) as unfinished, unfinished.open("wb") as stream:
+            np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
     @classmethod
     def load(cls, path: str | Path, describe: Describe | None = None) -> LoopDetector:

@@ -16,6 +16,7 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
+from loopclosure.whole_file import whole_file
 from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
 
@@ -49,7 +50,7 @@ class WordModel:
     def save(self, path: Path) -> None:
         """Write the model to ``path``, a .npz file."""
         settings = {"format": FORMAT, "extractor": asdict(self.vocabulary.extractor), "made": self.vocabulary.made}
-        with open(path, "wb") as file:
+        with whole_file(path) as unfinished, unfinished.open("wb") as file:
             np.savez_compressed(
                 file,
                 settings=json.dumps(settings),

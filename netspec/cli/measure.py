@@ -45,6 +45,6 @@ def _test(arguments: argparse.Namespace) -> None:
 def _time(arguments: argparse.Namespace) -> None:
     from netspec.check.measure import time_net
 
-    net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343")
+    net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343", write_files=False)
     time_net(net, arguments.iterations)
     net.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,7 +33,9 @@ def add_to(commands: Commands) -> None:
     )
     add_device(p)
     add_state(p, phase=None)
-    p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
+    p.add_argument(
+        "--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C and SIGTERM do (default: stop)"
+    )
     p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="what SIGHUP does (default: snapshot)")
     add_python(p)
     add_exact(p)
@@ -49,7 +52,9 @@ def _train(arguments: argparse.Namespace) -> None:
         raise WrongUsage("need one solver definition: netspec train solver.prototxt")
     if arguments.snapshot and arguments.weights:
         raise WrongUsage("give a snapshot to resume training or weights to fine-tune, not both")
-    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGHUP: arguments.sighup_effect}
+    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: arguments.sigint_effect}
+    if hasattr(signal, "SIGHUP"):  # Windows has none
+        effects[signal.SIGHUP] = arguments.sighup_effect
     with signals(effects) as action:
         solver = load_solver(
             path,
@@ -67,11 +72,24 @@ def _train(arguments: argparse.Namespace) -> None:
             _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
         log.info("caffe.cpp:239", "Starting Optimization")
         total, first, hidden = solver.param.max_iter, solver.iteration, not sys.stderr.isatty()
-        with tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False) as bar:
+        bar = tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False)
+        with _sole_writer(solver), bar:
             solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
             solver.solve()
         solver.close()
     log.info("caffe.cpp:250", "Optimization Done.")
+
+
+def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
+    """Refuse a second training that would write snapshots of the same names."""
+    from netspec.solver.checks import check_prefix
+    from netspec.whole_file import only_one
+
+    if not (solver.param.snapshot or solver.param.snapshot_after_train):
+        return nullcontext()
+    check_prefix(solver.param, solver.node)
+    prefix = solver.param.snapshot_prefix
+    return only_one(f"{prefix}.lock", f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
 
 
 def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:

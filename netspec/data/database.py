@@ -8,11 +8,11 @@ Caffe: src/caffe/util/db_lmdb.cpp, src/caffe/util/db_leveldb.cpp
 from __future__ import annotations
 
 import os
-import shutil
 import threading
 import time
 import weakref
 from abc import ABC, abstractmethod
+from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType, TracebackType
 
@@ -21,6 +21,7 @@ import lmdb
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault_at
+from netspec.whole_file import whole_folder
 
 BACKENDS = ("lmdb", "leveldb")
 _SCAN = 4096  # keys listed ahead of the requested one
@@ -188,18 +189,20 @@ class Writer:
         if backend.lower() not in BACKENDS:
             raise SpecError(f'unknown backend "{backend}"; expected one of: {", ".join(BACKENDS)}', Where(path))
         self._backend = backend.lower()
-        folder, name = os.path.split(self.path)
-        self._partial = os.path.join(folder, f".{name}.{os.getpid()}.partial")
+        self._end = ExitStack()
         self._store: _LmdbStore | _LevelDbStore | None = None
 
     def __enter__(self) -> Writer:
         if os.path.lexists(self.path):
             raise SpecError("already exists; remove it or choose another name for the database", Where(self.path))
         try:
-            os.makedirs(self._partial)
-            self._store = (_LmdbStore if self._backend == "lmdb" else _LevelDbStore)(self._partial)
+            os.makedirs(os.path.dirname(self.path) or ".", exist_ok=True)
+            with ExitStack() as stack:
+                unfinished = stack.enter_context(whole_folder(self.path))
+                self._store = (_LmdbStore if self._backend == "lmdb" else _LevelDbStore)(str(unfinished))
+                stack.callback(self._store.close)
+                self._end = stack.pop_all()
         except (OSError, ValueError, lmdb.Error) as fault:
-            shutil.rmtree(self._partial, ignore_errors=True)
             raise SpecError(f"cannot write a database here ({fault})", Where(self.path)) from None
         _log_opened(self._backend, self.path)
         return self
@@ -224,18 +227,16 @@ class Writer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        assert self._store is not None
         try:
             if kind is None:
                 self.commit()
-            self._store.close()
-            if kind is None:
-                os.rename(self._partial, self.path)
+            self._store = None
+            self._end.__exit__(kind, error, trace)
         except (lmdb.Error, OSError) as fault:
             raise SpecError(f"cannot rename the finished database to its path ({fault})", Where(self.path)) from None
-        finally:
-            self._store = None
-            shutil.rmtree(self._partial, ignore_errors=True)
+        except SpecError as fault:
+            self._end.__exit__(type(fault), fault, None)
+            raise
 
 
 class _LmdbStore:
@@ -271,7 +272,6 @@ class _LmdbStore:
                 self._env.set_mapsize(2 * self._env.info()["map_size"])
 
     def close(self) -> None:
-        self._env.sync(True)
         self._env.close()
 
 

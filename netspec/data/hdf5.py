@@ -6,8 +6,11 @@ Caffe: src/caffe/layers/hdf5_data_layer.cpp, src/caffe/layers/hdf5_output_layer.
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,6 +20,7 @@ from netspec.data.images import list_lines
 from netspec.data.random_words import permutation
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
+from netspec.hdf5_file import new_hdf5
 from netspec.lfs import pointer_fault_at
 
 _FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may span two
@@ -134,37 +138,73 @@ def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list
 class Hdf5Sink:
     """A new HDF5 file with the growing datasets ``data`` and ``label``, both 4-D as Caffe writes them.
 
-    Caffe stops at the second batch, because its datasets then exist; here batches are appended. The file is readable
-    after each call. Raises SpecError if the file cannot be written or a batch has another shape than those before it.
+    Caffe stops at the second batch, because its datasets then exist; here batches are appended. The file appears when
+    the sink is closed, or is no longer used; without a batch there is none. Raises SpecError, and leaves an older file
+    as it was, if the file cannot be written or a batch has another shape than those before it.
     """
 
     NAMES = ("data", "label")
 
     def __init__(self, path: str, where: Where | None = None) -> None:
         self._path, self._where = path, where
-        try:
-            self._file = h5py.File(path, "w")
-        except OSError as fault:
-            raise SpecError(f'HDF5 file "{path}" cannot be written: {fault}', where) from None
+        self._writing: AbstractContextManager[h5py.File] | None = None
+        self._unused: Any = None
 
     def append(self, data: np.ndarray, label: np.ndarray) -> None:
         """Add the rows of a batch."""
         log.info("hdf5_output_layer.cpp:31", f"Saving HDF5 file {self._path}")
-        for name, values in zip(self.NAMES, (data, label), strict=True):
-            rows = values.reshape(values.shape + (1,) * (4 - values.ndim)).astype(np.float32)
-            if name not in self._file:
-                self._file.create_dataset(name, data=rows, maxshape=(None, *rows.shape[1:]), chunks=True)
-                continue
-            dataset = self._file[name]
-            assert isinstance(dataset, h5py.Dataset)
-            if dataset.shape[1:] != rows.shape[1:]:
-                message = f'rows of "{name}" had shape {dataset.shape[1:]} in earlier batches, found {rows.shape[1:]}'
-                raise SpecError(message, self._where)
-            dataset.resize(len(dataset) + len(rows), axis=0)
-            dataset[-len(rows) :] = rows
-        self._file.flush()
+        if self._writing is None:
+            self._open()
+        try:
+            for name, values in zip(self.NAMES, (data, label), strict=True):
+                self._append(name, values.reshape(values.shape + (1,) * (4 - values.ndim)).astype(np.float32))
+        except SpecError as fault:
+            self._end(fault)
+            raise
         log.info("hdf5_output_layer.cpp:36", f"Successfully saved {len(data)} rows")
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Make the file appear."""
+        self._end()
+
+    def _open(self) -> None:
+        writing = new_hdf5(self._path)
+        with self._said_here():
+            self._file = writing.__enter__()
+        self._writing = writing
+        self._unused = weakref.finalize(self, _end_unused, writing)
+
+    def _append(self, name: str, rows: np.ndarray) -> None:
+        if name not in self._file:
+            self._file.create_dataset(name, data=rows, maxshape=(None, *rows.shape[1:]), chunks=True)
+            return
+        dataset = self._file[name]
+        assert isinstance(dataset, h5py.Dataset)
+        if dataset.shape[1:] != rows.shape[1:]:
+            message = f'rows of "{name}" had shape {dataset.shape[1:]} in earlier batches, found {rows.shape[1:]}'
+            raise SpecError(message, self._where)
+        dataset.resize(len(dataset) + len(rows), axis=0)
+        dataset[-len(rows) :] = rows
+
+    def _end(self, fault: SpecError | None = None) -> None:
+        """End the file that is being written: it appears, or after a fault it is removed."""
+        writing, self._writing = self._writing, None
+        if writing is not None:
+            self._unused.detach()
+            with self._said_here():
+                writing.__exit__(None if fault is None else type(fault), fault, None)
+
+    @contextmanager
+    def _said_here(self) -> Iterator[None]:
+        """Give a fault the place in the prototxt that names the file."""
+        try:
+            yield
+        except SpecError as fault:
+            raise SpecError(f'HDF5 file "{self._path}" {fault.message}', self._where) from None
+
+
+def _end_unused(writing: AbstractContextManager[h5py.File]) -> None:
+    try:
+        writing.__exit__(None, None, None)
+    except SpecError as fault:
+        log.logger.warning(fault)

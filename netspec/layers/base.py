@@ -87,12 +87,12 @@ class Context:
 
     ``at(*path)`` is the place in the prototxt of a field of this layer; ``report`` gets the faults after which building
     can go on (the default raises the first). ``device`` is where blobs are made; on ``meta`` they have shapes and no
-    values, and no file is written. Where ``open_data`` is false, a layer that reads files must not: its tops'
-    shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``. Of ``ranks`` nets
-    that train side by side the layer's net is number ``rank``. ``random`` is this net's own; from ``data_seed``, which
-    is the same for all ranks, follow the draws of the layers that read records. ``exact`` says which sums are to be
-    Caffe's to the last bit (netspec/exact); with ``accumulate_in_place``, layers that sum up their parameters'
-    gradients themselves add them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
+    values. No file is written there, nor where ``write_files`` is false. Where ``open_data`` is false, a layer that
+    reads files must not: its tops' shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks
+    for ``--shape``. Of ``ranks`` nets that train side by side the layer's net is number ``rank``. ``random`` is this
+    net's own; from ``data_seed``, which is the same for all ranks, follow the draws of the layers that read records.
+    ``exact`` says which sums are to be Caffe's to the last bit (netspec/exact); with ``accumulate_in_place``, layers
+    that sum up their parameters' gradients themselves add them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
     """
 
     phase: int = TEST
@@ -102,6 +102,7 @@ class Context:
     report: Report = raise_fault
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     open_data: bool = True
+    write_files: bool = True
     given_shapes: Mapping[str, Shape] = field(default_factory=dict)
     allow_python: bool = False
     rank: int = 0

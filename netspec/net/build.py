@@ -35,16 +35,17 @@ def load_net(
     allow_python: bool = False,
     exact: str = SMALL,
     strict: bool = False,
+    write_files: bool = True,
 ) -> Net:
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
 
     A warning names the layers that the weights lack; with ``strict`` that is an error.
     ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
-    Raises SpecError for every fault of the files.
+    Without ``write_files`` no layer writes one. Raises SpecError for every fault of the files.
     """
     net, source = parse_net(path)
     number = PHASES[phase] if isinstance(phase, str) else PhaseValue(phase)
-    options = BuildOptions(torch.device(device), seed, allow_python=allow_python, exact=exact)
+    options = BuildOptions(torch.device(device), seed, allow_python=allow_python, exact=exact, write_files=write_files)
     built = build_net(with_state(net, number, level, stages), source, options)
     if weights is not None:
         load_weights(built, weights, strict)

@@ -5,6 +5,7 @@ Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from netspec import log
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
 from netspec.graph import Report, raise_fault
+from netspec.hdf5_file import new_hdf5
 from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.proto.binary import read_net_binary
@@ -25,6 +27,7 @@ from netspec.proto.schema import NetParameter
 from netspec.whole_file import whole_file
 
 MOST_NAMES = 20  # layers that a warning names
+MOST_BYTES = 2**31 - 1  # of a protobuf message
 Copies = list[tuple[Layer, int, np.ndarray]]  # the layer, the blob's number in it, the values
 
 
@@ -121,14 +124,39 @@ def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
 
 def write_binary(net: Net, path: str | Path, diff: bool = False) -> None:
     """Do what :func:`save_weights` does in Caffe's binary form, whatever the file's name."""
+    if (size := binary_bytes(net, diff)) > MOST_BYTES:
+        raise SpecError(f"cannot be written: {too_large(size)}", Where(str(path)))
     with whole_file(path) as unfinished:
         unfinished.write_bytes(net_to_proto(net, diff).SerializeToString(deterministic=True))
 
 
+def binary_bytes(net: Net, diff: bool = False) -> int:
+    """Return about how many bytes the weights take in Caffe's binary form: those of their numbers."""
+    numbers = sum(math.prod(shape) for layer in net.layers for shape in layer.blob_shapes)
+    return (2 if diff else 1) * np.dtype(np.float32).itemsize * numbers
+
+
+def too_large(size: int) -> str:
+    """Return what is wrong with a binary file of so many bytes, and the remedy."""
+    return f"{size / 2**30:.2f} GiB are more than the 2 GiB of a binary file; set snapshot_format: HDF5"
+
+
 def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
     """Do what :func:`save_weights` does in HDF5, whatever the file's name."""
-    with whole_file(path) as unfinished:
-        _to_hdf5(net, unfinished, diff)
+    shared = _shared(net)
+    with new_hdf5(path) as file:
+        data = file.create_group("data")
+        diffs = file.create_group("diff") if diff else None
+        for layer in net.layers:
+            name = layer.param.name
+            group = data.require_group(name)
+            for j in range(len(layer.blobs)):
+                if (name, j) not in shared:
+                    group.create_dataset(str(j), data=_values(layer, j))
+            if diffs is not None:
+                group = diffs.require_group(name)
+                for j in range(len(layer.blobs)):
+                    group.create_dataset(str(j), data=_gradient(layer, j))
 
 
 def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
@@ -218,23 +246,6 @@ def _layer_groups(data: h5py.Group, prefix: str = "") -> Iterator[tuple[str, dic
             if arrays or not len(group):
                 yield prefix + name, arrays
             yield from _layer_groups(group, f"{prefix}{name}/")
-
-
-def _to_hdf5(net: Net, path: Path, diff: bool) -> None:
-    shared = _shared(net)
-    with h5py.File(path, "w") as file:
-        data = file.create_group("data")
-        diffs = file.create_group("diff") if diff else None
-        for layer in net.layers:
-            name = layer.param.name
-            group = data.require_group(name)
-            for j in range(len(layer.blobs)):
-                if (name, j) not in shared:
-                    group.create_dataset(str(j), data=_values(layer, j))
-            if diffs is not None:
-                group = diffs.require_group(name)
-                for j in range(len(layer.blobs)):
-                    group.create_dataset(str(j), data=_gradient(layer, j))
 
 
 # The net's side

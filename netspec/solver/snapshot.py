@@ -15,6 +15,7 @@ import numpy as np
 
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
+from netspec.hdf5_file import new_hdf5
 from netspec.proto.binary import read_binary
 from netspec.proto.schema import SolverState
 from netspec.whole_file import whole_file
@@ -79,12 +80,12 @@ def merge_shared(history: list[np.ndarray], owners: Sequence[int]) -> list[np.nd
 
 def write_state(path: str | Path, state: State) -> None:
     """Write the state atomically. Raises SpecError if it cannot be written."""
+    if str(path).endswith(".h5"):
+        _write_hdf5(path, state)
+        return
+    proto = SolverState(iter=state.iteration, learned_net=state.learned_net, current_step=state.current_step)
+    proto.history.extend(blobs.from_array(array) for array in state.history)
     with whole_file(path) as unfinished:
-        if str(path).endswith(".h5"):
-            _write_hdf5(unfinished, state)
-            return
-        proto = SolverState(iter=state.iteration, learned_net=state.learned_net, current_step=state.current_step)
-        proto.history.extend(blobs.from_array(array) for array in state.history)
         unfinished.write_bytes(proto.SerializeToString(deterministic=True))
 
 
@@ -112,9 +113,9 @@ def _read_hdf5(path: str | Path) -> State:
         return State(int(file["iter"][0]), learned_net, int(file["current_step"][0]), arrays)
 
 
-def _write_hdf5(path: Path, state: State) -> None:
+def _write_hdf5(path: str | Path, state: State) -> None:
     learned_net = state.learned_net.encode()
-    with h5py.File(path, "w") as file:
+    with new_hdf5(path) as file:
         file.create_dataset("iter", data=np.array([state.iteration], np.int32))
         file.create_dataset("learned_net", data=np.array(learned_net, f"S{len(learned_net) + 1}"))
         file.create_dataset("current_step", data=np.array([state.current_step], np.int32))

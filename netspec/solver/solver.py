@@ -24,7 +24,7 @@ from netspec.graph.filter import with_train_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
-from netspec.net.weights import load_weights, save_weights
+from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, save_weights, too_large
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
@@ -185,6 +185,7 @@ class Solver:
         for i, test in enumerate(tests):
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
             self.test_nets.append(self._build(test, test.label, self._device))
+        self._check_size()
         log.info("solver.cpp:57", "Solver scaffolding done.")
         self.history = [
             torch.zeros_like(learnable.parameter.detach())
@@ -214,6 +215,17 @@ class Solver:
         if files:
             load_weights(net, files, self._strict)
         return net
+
+    def _check_size(self) -> None:
+        """Raise SpecError now, not after days, where a snapshot could not be written."""
+        writes = self.param.snapshot or self.param.snapshot_after_train
+        if not writes or self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5"):
+            return
+        history = self._rule.sets * sum(item.parameter.nbytes for item in self.net.learnable)
+        size = max(binary_bytes(self.net, self.param.snapshot_diff), history)
+        if size > MOST_BYTES:
+            message = f"a snapshot cannot be written: {too_large(size)}"
+            raise SpecError(message, self.node.find("snapshot_format"))
 
     @property
     def loss(self) -> float:

@@ -402,7 +402,7 @@ class HDF5Output(Layer):
         if reason := why_unwritable(name):
             raise self.error(f'HDF5 file "{name}" cannot be written: {reason}', *place)
         self._sink = None
-        if self.context.open_data and self.context.device.type != "meta":
+        if self.context.write_files and self.context.device.type != "meta":
             from netspec.data.hdf5 import Hdf5Sink
 
             self._sink = Hdf5Sink(name, self.context.at(*place))
@@ -423,7 +423,7 @@ class HDF5Output(Layer):
 
     @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        assert self._sink is not None, "built without opening data"
-        data, label = (bottom.detach().cpu().numpy() for bottom in bottoms)
-        self._sink.append(data, label)
+        if self._sink is not None:
+            data, label = (bottom.detach().cpu().numpy() for bottom in bottoms)
+            self._sink.append(data, label)
         return ()
