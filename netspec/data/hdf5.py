@@ -20,8 +20,7 @@ from netspec.data.images import list_lines
 from netspec.data.random_words import permutation
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
-from netspec.hdf5_file import new_hdf5
-from netspec.lfs import pointer_fault_at
+from netspec.hdf5_file import new_hdf5, open_hdf5
 
 _FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may span two
 
@@ -52,6 +51,7 @@ class Hdf5Source:
             raise SpecError(f'the list "{list_file}" names no HDF5 file', where or Where(list_file))
         self._tops = tuple(tops)
         self._files = [name for name, _ in named]
+        self._places = [place for _, place in named]
         self._row_shapes = _row_shapes(*named[0], self._tops)[1]
         counts = [self._rows_of(name, place) for name, place in named]
         self._starts = np.cumsum([0, *counts])
@@ -102,8 +102,12 @@ class Hdf5Source:
         return np.concatenate(rows)
 
     def _load_file(self, file: int) -> Arrays:
-        with h5py.File(self._files[file]) as opened:
-            return tuple(np.asarray(opened[top], np.float32) for top in self._tops)
+        with open_hdf5(self._files[file], self._places[file]) as opened:
+            arrays = tuple(opened.values(top).astype(np.float32) for top in self._tops)
+            rows = int(self._starts[file + 1] - self._starts[file])
+            if any(array.shape != (rows, *shape) for array, shape in zip(arrays, self._row_shapes, strict=True)):
+                raise SpecError("was changed by another program while it was read")
+            return arrays
 
     def _rows_of(self, name: str, place: Where) -> int:
         count, shapes = _row_shapes(name, place, self._tops)
@@ -115,24 +119,20 @@ class Hdf5Source:
 
 def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list[Shape]]:
     """Return the number of rows and the shape of a row of each dataset."""
-    try:
-        with h5py.File(name) as file:
-            datasets: list[h5py.Dataset] = []
-            for top in tops:
-                dataset = file.get(top)
-                if not isinstance(dataset, h5py.Dataset):
-                    found = ", ".join(f'"{key}"' for key in file) or "nothing"
-                    message = f'HDF5 file "{name}" has no dataset "{top}", the name of a top; it has {found}'
-                    raise SpecError(message, place)
-                datasets.append(dataset)
-                if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
-                    raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', place)
-            counts = [len(dataset) for dataset in datasets]
-            if min(counts) != max(counts) or not counts[0]:
-                raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', place)
-            return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
-    except OSError as fault:
-        raise SpecError(f'HDF5 file "{name}" {pointer_fault_at(name) or f"cannot be read: {fault}"}', place) from None
+    with open_hdf5(name, place) as file:
+        datasets: list[h5py.Dataset] = []
+        for top in tops:
+            dataset = file.dataset(top)
+            if dataset is None:
+                found = ", ".join(f'"{key}"' for key in file.names()) or "nothing"
+                raise SpecError(f'has no dataset "{top}", the name of a top; it has {found}')
+            datasets.append(dataset)
+            if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
+                raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', place)
+        counts = [len(dataset) for dataset in datasets]
+        if min(counts) != max(counts) or not counts[0]:
+            raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', place)
+        return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
 
 
 class Hdf5Sink:

@@ -6,6 +6,7 @@ Caffe: src/caffe/data_transformer.cpp, tools/compute_image_mean.cpp
 from __future__ import annotations
 
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -50,10 +51,10 @@ def read_mean_option(text: str) -> np.ndarray:
     if not text.endswith(".npy"):
         return read_mean(text, Where("--mean"))
     try:
-        mean = np.load(text, allow_pickle=False)
-    except (OSError, ValueError) as fault:
-        raise SpecError(f"cannot be read as an array: {fault}", Where(text)) from None
-    return mean.astype(np.float32)
+        mapped = np.load(text, mmap_mode="r", allow_pickle=False)  # the size of the file limits that of the array
+        return np.array(mapped, np.float32)
+    except (OSError, ValueError, TypeError, EOFError, SyntaxError, OverflowError, TokenError) as fault:
+        raise SpecError(f"cannot be read as an array: {' '.join(str(fault).split())}", Where(text)) from None
 
 
 def center(mean: np.ndarray, height: int, width: int) -> np.ndarray:

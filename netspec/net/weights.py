@@ -19,7 +19,7 @@ from netspec import log
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
 from netspec.graph import Report, raise_fault
-from netspec.hdf5_file import new_hdf5
+from netspec.hdf5_file import Hdf5Group, new_hdf5, open_hdf5
 from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.proto.binary import read_net_binary
@@ -205,10 +205,10 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
     targets = _layers_by_name(net)
     shared = _shared(net)
     copies: Copies = []
-    with _opened(path) as file:
-        data = file.get("data")
-        if not isinstance(data, h5py.Group):
-            raise SpecError("this is not a weights file: the HDF5 file has no group /data", Where(str(path)))
+    with open_hdf5(path) as file:
+        data = file.group("data")
+        if data is None:
+            raise SpecError("this is not a weights file: the HDF5 file has no group /data")
         for name, arrays in _layer_groups(data):
             target = targets.get(name)
             if target is None:
@@ -227,23 +227,18 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
                 if array.shape != target.blob_shapes[j]:
                     report(_wrong_shape(path, name, j, array.shape, target.blob_shapes[j]))
                     continue
-                copies.append((target, j, array[()]))
+                copies.append((target, j, array[()].astype(np.float32)))
     return copies
 
 
-def _opened(path: Path) -> h5py.File:
-    try:
-        return h5py.File(path, "r")
-    except OSError as fault:  # it begins like an HDF5 file
-        raise SpecError(f"cannot be read: {fault}", Where(str(path))) from None
-
-
-def _layer_groups(data: h5py.Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
+def _layer_groups(data: Hdf5Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
     """Yield the layers, in Caffe's (alphabetical) order; a layer with a slash in its name is a group within a group."""
-    for name, group in data.items():
-        if isinstance(group, h5py.Group):
-            arrays = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
-            if arrays or not len(group):
+    for name in data.names():
+        group = data.group(name)
+        if group is not None:
+            found = {key: group.dataset(key) for key in group.names()}
+            arrays = {key: dataset for key, dataset in found.items() if dataset is not None}
+            if arrays or not found:
                 yield prefix + name, arrays
             yield from _layer_groups(group, f"{prefix}{name}/")
 

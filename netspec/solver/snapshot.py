@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
-from netspec.hdf5_file import new_hdf5
+from netspec.hdf5_file import Hdf5Group, new_hdf5, open_hdf5
 from netspec.proto.binary import read_binary
 from netspec.proto.schema import SolverState
 from netspec.whole_file import whole_file
@@ -102,15 +101,28 @@ def find_learned_net(state: State, path: str | Path) -> Path | None:
 
 
 def _read_hdf5(path: str | Path) -> State:
-    with h5py.File(path, "r") as opened:
-        file: Any = opened
+    with open_hdf5(path) as file:
         for name in ("iter", "current_step", "history"):
-            if name not in file:
-                raise SpecError(f"this is not a solver state: the HDF5 file has no /{name}", Where(str(path)))
-        history = file["history"]
-        learned_net = file["learned_net"][()].decode() if "learned_net" in file else ""
-        arrays = [history[str(i)][()] for i in range(len(history))]
-        return State(int(file["iter"][0]), learned_net, int(file["current_step"][0]), arrays)
+            if name not in file.names():
+                raise SpecError(f"this is not a solver state: the HDF5 file has no /{name}")
+        history = file.group("history")
+        if history is None:
+            raise SpecError("this is not a solver state: /history is not a group")
+        learned_net = bytes(file.values("learned_net").item()).decode() if "learned_net" in file.names() else ""
+        arrays = [_floats(history, str(i)) for i in range(len(history.names()))]
+        iteration, step = (_whole_number(file, name) for name in ("iter", "current_step"))
+        return State(iteration, learned_net, step, arrays)
+
+
+def _floats(group: Hdf5Group, name: str) -> np.ndarray:
+    return group.values(name).astype(np.float32)
+
+
+def _whole_number(group: Hdf5Group, name: str) -> int:
+    values = group.values(name)
+    if values.size != 1 or values.dtype.kind not in "iu":
+        raise SpecError(f"/{name} is not one whole number")
+    return int(values.item())
 
 
 def _write_hdf5(path: str | Path, state: State) -> None:
