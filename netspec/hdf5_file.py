@@ -17,7 +17,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from h5py import h5o
+from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]
 
 from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault_at
@@ -119,7 +119,14 @@ def _one_line(fault: BaseException) -> str:
 @contextmanager
 def new_hdf5(path: str | Path) -> Iterator[h5py.File]:
     """Yield a new HDF5 file, which appears at ``path`` at the end of the block; see :func:`whole_file`."""
-    with whole_file(path) as unfinished, _Patient(unfinished) as stream:
+    with whole_file(path) as unfinished, hdf5_in(unfinished) as file:
+        yield file
+
+
+@contextmanager
+def hdf5_in(unfinished: Path) -> Iterator[h5py.File]:
+    """Yield an HDF5 file to fill, in a file that is there for it. Raises OSError if it cannot be written."""
+    with _Patient(unfinished) as stream:
         with h5py.File(stream, "w") as file:
             yield file
         stream.check()

@@ -27,6 +27,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
     p.add_argument("--solver", help="the solver's prototxt")
     p.add_argument("--snapshot", help="a .solverstate to resume from")
+    p.add_argument("--resume", action="store_true", help="resume from the newest whole snapshot, if there is any")
     p.add_argument("--weights", help="weights to start from, several separated by commas")
     p.add_argument(
         "--scores", metavar="F.json", help="write the scores of each test and the snapshots taken to this file"
@@ -52,6 +53,10 @@ def _train(arguments: argparse.Namespace) -> None:
         raise WrongUsage("need one solver definition: netspec train solver.prototxt")
     if arguments.snapshot and arguments.weights:
         raise WrongUsage("give a snapshot to resume training or weights to fine-tune, not both")
+    if arguments.resume and arguments.snapshot:
+        raise WrongUsage("--resume looks for the snapshot; leave out --snapshot")
+    if arguments.resume and (found := _newest(path)):
+        arguments.snapshot, arguments.weights = str(found), None
     effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: arguments.sigint_effect}
     if hasattr(signal, "SIGHUP"):  # Windows has none
         effects[signal.SIGHUP] = arguments.sighup_effect
@@ -78,6 +83,18 @@ def _train(arguments: argparse.Namespace) -> None:
             solver.solve()
         solver.close()
     log.info("caffe.cpp:250", "Optimization Done.")
+
+
+def _newest(solver: str) -> Path | None:
+    """Return the newest whole snapshot of a solver, or None, which is said."""
+    from netspec.proto.text import read_solver
+    from netspec.solver.extra import newest_pair
+
+    prefix = read_solver(solver).snapshot_prefix
+    found = newest_pair(prefix)
+    if found is None:
+        log.logger.info(f'no snapshot to resume from with the prefix "{prefix}": the training starts')
+    return found
 
 
 def _sole_writer(solver: Solver) -> AbstractContextManager[None]:

@@ -20,6 +20,7 @@ import torch
 from typing_extensions import override
 
 from netspec.data.blobs import Shape
+from netspec.data.random_words import derived
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL, switch
 from netspec.graph import Report, raise_fault
@@ -66,14 +67,19 @@ class Random:
 
     def restart(self, seed: int) -> None:
         """Begin anew, from another seed."""
-        self.seed = seed
+        self.seed = self._now = seed
         self._generators: dict[str, torch.Generator] = {}
+
+    def begin(self, what: str) -> None:
+        """Go on with draws that follow from the seed and the name of a part of a run, whatever was drawn before."""
+        self._now = derived(self.seed, what)
+        self._generators.clear()
 
     def on(self, device: torch.device | str = "cpu") -> torch.Generator:
         """Return the generator of ``device`` (made at its first use)."""
         key = str(device)
         if key not in self._generators:
-            self._generators[key] = torch.Generator(device).manual_seed(self.seed)
+            self._generators[key] = torch.Generator(device).manual_seed(self._now)
         return self._generators[key]
 
 
@@ -186,6 +192,17 @@ class Layer(torch.nn.Module):
 
     def restart(self) -> None:
         """Return to the first record, where the layer reads any."""
+
+    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+        """Return what the layer remembers from one pass to the next, besides its blobs."""
+        return {}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Remember what :meth:`running_state` returned. Raises SpecError if that does not fit."""
+        if set(state) != set(self.running_state()):
+            raise self.error(
+                f"found {', '.join(state)} to remember, expected {', '.join(self.running_state()) or 'nothing'}"
+            )
 
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""

@@ -31,6 +31,17 @@ from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
 from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
 from netspec.solver.debug import debug_info
+from netspec.solver.extra import (
+    Extra,
+    Stamp,
+    check_pair,
+    path_beside,
+    read_extra,
+    resume,
+    running_state,
+    stamp_of,
+    write_extra,
+)
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
@@ -79,11 +90,13 @@ def load_solver(
         log.info("caffe.cpp:197", "Use CPU.")
     else:
         log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in chosen))
+    extra = None if snapshot is None else read_extra(snapshot)
     solver = Solver(
         param,
         node,
         device=chosen[0],
         others=chosen[1:],
+        seed=None if extra is None else extra.seed,
         allow_python=allow_python,
         exact=exact,
         strict=strict,
@@ -162,6 +175,8 @@ class Solver:
         self.scores: list[Outputs] = []
         self.stopped = False
         self._losses: deque[float] = deque(maxlen=param.average_loss)
+        self._losses_before: list[float] = []  # of a training that is resumed
+        self._states_before_test: list[dict[str, Any]] = []
         self._displayed = (clock(), 0)
         rule = update.find_rule(param.type)
         assert rule is not None, "check_settings refuses unknown types"
@@ -258,7 +273,7 @@ class Solver:
         log.info("solver.cpp:332", "Optimization Done.")
 
     def step(self, iterations: int) -> None:
-        """Run some iterations. The window of the averaged loss starts again.
+        """Run some iterations. The window of the averaged loss starts again, unless the training was just resumed.
 
         Raises SpecError if a net has inputs: a solver cannot fill them.
         """
@@ -266,12 +281,16 @@ class Solver:
         self.stopped = False
         self.replicas.begin()
         self._losses.clear()
+        self._losses.extend(self._losses_before)
+        self._losses_before = []
         self._displayed = (self.clock(), self.iteration)
         for _ in range(iterations):
             if self._is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
                 self.test_all()
                 if self.stopped:
                     return
+            for net in (self.net, *self.replicas.nets):
+                net.random.begin(f"iteration {self.iteration}")
             self.on_start()
             loss, outputs = self._forward_backward()
             self._losses.append(loss)
@@ -378,15 +397,18 @@ class Solver:
     def test_all(self) -> None:
         """Run every test net for its test_iter batches with the current weights."""
         self.scores = [{} for _ in self.test_nets]
+        self._states_before_test = [running_state(net) for net in self.test_nets]
         for i in range(len(self.test_nets)):
             if not self.stopped:
                 self._test(i)
+        self._states_before_test = []
 
     @torch.no_grad()
     def _test(self, i: int) -> None:
         log.info("solver.cpp:347", f"Iteration {self.iteration}, Testing net (#{i})")
         net, batches = self.test_nets[i], self.param.test_iter[i]
         net.share_weights_with(self.net)
+        net.random.begin(f"test at iteration {self.iteration}")
         tally = Tally()
         for _ in range(batches):
             while request := self.action():
@@ -420,17 +442,30 @@ class Solver:
         site = "sgd_solver.cpp:296" if hdf5 else "sgd_solver.cpp:284"
         log.info(site, f"Snapshotting solver state to {form} file {state}")
         history = [values.cpu().numpy() for values in self.history]
-        write_state(state, State(self.iteration, model, self.current_step, history))
+        weights = stamp_of(model)
+        write_state(
+            state,
+            State(self.iteration, model, self.current_step, history),
+            before=lambda unfinished: write_extra(path_beside(state), self._extra(weights, stamp_of(unfinished))),
+        )
         self.on_snapshot(model)
         return model, state
+
+    def _extra(self, weights: Stamp, state: Stamp) -> Extra:
+        """Return what Caffe's state lacks. During a test, it is as before: the test is run again after a resume."""
+        training = [running_state(net) for net in (self.net, *self.replicas.nets)]
+        testing = self._states_before_test or [running_state(net) for net in self.test_nets]
+        return Extra(self._seed, list(self._losses), training + testing, weights, state)
 
     def restore(self, path: str | Path) -> None:
         """Resume from a .solverstate or .solverstate.h5, of Caffe or of netspec, and from its weights.
 
-        As in Caffe the data layers start again at their first record. Raises SpecError, and changes nothing, if the
-        state does not fit this solver's type and net.
+        With the file ``X.solverstate.extra`` beside it the training goes on as if it had never stopped; without it, as
+        in Caffe, the data layers start again at their first record. Raises SpecError, and changes nothing, if the state
+        does not fit this solver's type and net.
         """
         where = Where(str(path))
+        extra = read_extra(path)
         state = self._of_today(read_state(path), where)
         if len(state.history) != len(self.history):
             found, expected = len(state.history), len(self.history)
@@ -442,8 +477,9 @@ class Solver:
             if not _same_shape(tuple(mine.shape), theirs.shape):
                 raise SpecError(f"history blob {i} has shape {theirs.shape}, expected {tuple(mine.shape)}", where)
         learned_net = find_learned_net(state, path)
-        if learned_net is not None:
-            load_weights(self.net, learned_net)
+        if extra is not None:
+            check_pair(path, learned_net, extra)
+        load_weights(self.net, learned_net, strict=True)
         log.info("sgd_solver.cpp:336", "SGDSolver: restoring history")
         for mine, theirs in zip(self.history, state.history, strict=True):
             mine.copy_(torch.tensor(theirs).view(mine.shape))
@@ -452,6 +488,27 @@ class Solver:
         for net in (self.net, *self.test_nets):
             net.restart_data()
         self.replicas.restart_data()
+        if extra is None:
+            log.logger.info(f"{path} is Caffe's: the data starts again at its first record, with other random numbers")
+        else:
+            self._go_on(extra, Where(str(path_beside(path))))
+
+    def _go_on(self, extra: Extra, where: Where) -> None:
+        """Go on in the data where a training stopped, with the losses of its average."""
+        nets = (self.net, *self.replicas.nets, *self.test_nets)
+        if len(extra.nets) != len(nets):
+            log.logger.warning(f"{where}: is of {len(extra.nets)} nets, not {len(nets)}: the data starts again")
+            return
+        try:
+            for net, states in zip(nets, extra.nets, strict=True):
+                resume(net, states)
+        except SpecError as fault:
+            raise SpecError(fault.message, where) from None
+        self._losses_before = extra.losses
+        if extra.seed == self._seed:
+            log.logger.info(f"{where}: the training goes on as if it had never stopped")
+        else:
+            log.logger.warning(f"{where}: random_seed was {extra.seed}: the random numbers are others from here on")
 
     def _of_today(self, state: State, where: Where) -> State:
         """Return a state in today's form, where it has a history for each layer that shares a parameter."""

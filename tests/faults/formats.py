@@ -40,6 +40,7 @@ from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text
 from netspec.scores import Score, Scores, Snapshot, read_scores
+from netspec.solver.extra import Extra, Stamp, read_extra, write_extra
 from netspec.solver.snapshot import State, read_state, write_state
 
 NET = """
@@ -77,6 +78,11 @@ def numbers(*shape: int) -> np.ndarray:
 
 def state(path: Path) -> None:
     write_state(path, State(7, "x.caffemodel", 1, [numbers(3, 2), numbers(3)]))
+
+
+def extra(path: Path) -> None:
+    carried = {"0": {"iteration": 7}, "3": {"state": [{"shape": [1, 2], "float32": "AACAPwAAAEA="}]}}
+    write_extra(path, Extra(1, [0.5, 0.25], [carried, {}], Stamp(3, "ab"), Stamp(4, "cd")))
 
 
 def database(path: Path) -> None:
@@ -167,6 +173,7 @@ FORMATS = {
     ),
     "solverstate": Format(".solverstate", state, read_state),
     "solverstate.h5": Format(".solverstate.h5", state, read_state),
+    "solverstate.extra": Format(".extra", extra, lambda path: read_extra(path.with_suffix(""))),
     "hdf5 data": Format(".h5", rows, all_rows),
     "lmdb": Format("", database, all_records, inside="data.mdb"),
     "mean": Format(

@@ -9,7 +9,7 @@ Caffe: src/caffe/layers/base_data_layer.cpp
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 
@@ -137,6 +137,15 @@ class ReadingLayer(Layer):
             self._feed.restart(iteration)
 
     @override
+    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+        return {"iteration": self.iteration}
+
+    @override
+    def resume(self, state: Mapping[str, Any]) -> None:
+        super().resume(state)
+        self.restart(_position(self, state["iteration"]))
+
+    @override
     def close(self) -> None:
         if self._feed:
             self._feed.close()
@@ -183,6 +192,12 @@ class ReadingLayer(Layer):
     def log_size(self, source: Source, site: str) -> None:
         """Log the shape of a batch."""
         log.info(site, "output data size: " + ",".join(map(str, source.shapes[0])))
+
+
+def _position(layer: Layer, value: object) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise layer.error(f"found iteration {value!r} to go on from, expected a whole number")
+    return value
 
 
 def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:
