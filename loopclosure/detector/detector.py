@@ -91,6 +91,8 @@ class DetectorSettings:
         ):
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; expected {least} or more")
+        if self.threshold is not None and np.isnan(self.threshold):
+            raise InputError("threshold is nan; expected a number")
         if self.consistency_window < 0:
             raise InputError(f"consistency_window is {self.consistency_window}; expected 0 or more")
 

@@ -18,6 +18,7 @@ from netspec.scores import Score, Scores, Snapshot, read_scores
 if TYPE_CHECKING:
     from netspec.solver.solver import Solver
 
+NAN = ("stop", "warn")
 EFFECTS = ("stop", "snapshot", "none")
 
 
@@ -32,6 +33,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument(
         "--scores", metavar="F.json", help="write the scores of each test and the snapshots taken to this file"
     )
+    p.add_argument("--nan", choices=NAN, default="stop", help="what a loss of NaN or infinity does (default: stop)")
     add_device(p)
     add_state(p, phase=None)
     p.add_argument(
@@ -72,6 +74,7 @@ def _train(arguments: argparse.Namespace) -> None:
             action=action,
             exact=arguments.exact,
             strict=arguments.strict,
+            nan=arguments.nan,
         )
         if arguments.scores:
             _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))

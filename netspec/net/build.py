@@ -61,7 +61,7 @@ def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None
 def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
     """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
-        log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered).rstrip("\n"))
+        log.dump("net.cpp:53", "Initializing net from parameters: ", write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source, options.report)
     built = Net(make_plan(split, source, options.report), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])

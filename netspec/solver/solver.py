@@ -5,6 +5,7 @@ Caffe: src/caffe/solver.cpp; the sites in the log calls are the lines of that fi
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import deque
@@ -43,6 +44,7 @@ from netspec.solver.extra import (
     write_extra,
 )
 from netspec.solver.lr_policy import learning_rate, next_step
+from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.tally import Outputs, Tally, as_scores, score_lines
@@ -66,13 +68,14 @@ def load_solver(
     action: Callable[[], str | None] | None = None,
     exact: str = SMALL,
     strict: bool = False,
+    nan: str = "stop",
 ) -> Solver:
     """Build the solver of a prototxt and its nets, ready to run.
 
     ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
     ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
-    ``stages`` go to the training net. Several devices train side by side, the first being the root. For ``device`` and
-    ``action`` see :class:`Solver`. Raises SpecError for every fault of the files.
+    ``stages`` go to the training net. Several devices train side by side, the first being the root. For ``device``,
+    ``action`` and ``nan`` see :class:`Solver`. Raises SpecError for every fault of the files.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
@@ -101,6 +104,7 @@ def load_solver(
         exact=exact,
         strict=strict,
         action=action,
+        nan=nan,
     )
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
@@ -146,16 +150,18 @@ class Solver:
         seed: int | None = None,
         strict: bool = False,
         action: Callable[[], str | None] | None = None,
+        nan: str = "stop",
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError.
 
         ``device`` overrides solver_mode and device_id; replicas of the training net run on ``others``. ``seed`` is used
         if there is no random_seed; without it one is drawn. ``action`` is called between iterations, also those of a
-        test: "stop" ends the training, "snapshot" takes one. ``clock`` gives the seconds for "iter/s".
+        test: "stop" ends the training, "snapshot" takes one. ``nan`` says what a loss of
+        NaN or infinity does: "stop" raises SpecError, "warn" warns once. ``clock`` gives the seconds for "iter/s".
         """
         node = node or Place(Where("<solver>"))
-        log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
+        log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         check_settings(param, node)
         for line in fields_without_effect(param, node):
             log.warning("solver.cpp:45", line)
@@ -176,6 +182,8 @@ class Solver:
         self.stopped = False
         self._losses: deque[float] = deque(maxlen=param.average_loss)
         self._losses_before: list[float] = []  # of a training that is resumed
+        self._nan, self._told_nan = nan, False
+        self._last_snapshot = ""
         self._states_before_test: list[dict[str, Any]] = []
         self._displayed = (clock(), 0)
         rule = update.find_rule(param.type)
@@ -294,6 +302,8 @@ class Solver:
             self.on_start()
             loss, outputs = self._forward_backward()
             self._losses.append(loss)
+            if not math.isfinite(loss):
+                self._tell_nan(f"the loss is {loss}")
             if self._is_due(self.param.display):
                 self._display(outputs)
             self.on_gradients()
@@ -305,6 +315,20 @@ class Solver:
             if request == "stop":
                 self.stopped = True
                 return
+
+    def _tell_nan(self, what: str) -> None:
+        """Stop, or warn, and say where the NaN or infinity is."""
+        found = bad_parameter(self.net)
+        if not found and self._nan == "stop":
+            found = bad_top(self.net, self.param.iter_size, f"iteration {self.iteration}")
+        first = f"; the first NaN or infinity is in {found}" if found else ""
+        message = f"Iteration {self.iteration}: {what}{first}"
+        if self._nan == "stop":
+            kept = f"; the last good snapshot is {self._last_snapshot}" if self._last_snapshot else ""
+            raise SpecError(f"{message}{kept}; lower base_lr, or go on with --nan warn", self.node.where)
+        if not self._told_nan:
+            log.logger.warning(f"{message}; the training goes on")
+        self._told_nan = True
 
     def check_inputs(self) -> None:
         """Raise SpecError where a net has inputs: nobody would fill them."""
@@ -433,6 +457,8 @@ class Solver:
 
         With ``snapshot_format: HDF5`` both end in ``.h5``. Raises SpecError if they cannot be written.
         """
+        if self._nan == "stop" and bad_parameter(self.net):
+            self._tell_nan("the weights cannot be saved")
         hdf5 = self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5")
         form, ending = ("HDF5", ".h5") if hdf5 else ("binary proto", "")
         stem = f"{self.param.snapshot_prefix}_iter_{self.iteration}"
@@ -448,6 +474,7 @@ class Solver:
             State(self.iteration, model, self.current_step, history),
             before=lambda unfinished: write_extra(path_beside(state), self._extra(weights, stamp_of(unfinished))),
         )
+        self._last_snapshot = state
         self.on_snapshot(model)
         return model, state
 
