@@ -16,14 +16,14 @@ from netspec.proto.dialect.folders import FOLDERS
 
 if TYPE_CHECKING:
     from netspec.dialects import use_dialect
-    from netspec.net.build import load_net
+    from netspec.engines.net import load_net
     from netspec.net.net import Net
     from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights
     from netspec.solver.solver import Solver, load_solver
 
 # How idle OpenMP threads wait, which is read when torch is loaded: asleep. GNU's runtime has them spin for a while, and
-# that takes the cores from a second training on the machine (tools/benchmark_side_by_side.py). A user's choice stays.
+# that takes the cores from a second training on the machine (tools/bench waiting). A user's choice stays.
 _WAITS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 if "torch" not in sys.modules and not any(name in os.environ for name in _WAITS):
     os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
@@ -35,7 +35,7 @@ _HOMES = {
     "use_dialect": "netspec.dialects",
     "Net": "netspec.net.net",
     "layer": "netspec.net.one_layer",
-    "load_net": "netspec.net.build",
+    "load_net": "netspec.engines.net",
     "Solver": "netspec.solver.solver",
     "load_solver": "netspec.solver.solver",
     "load_weights": "netspec.net.weights",

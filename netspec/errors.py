@@ -62,10 +62,14 @@ class ForkFault(SpecError):
     """A field or a layer type that Caffe does not have.
 
     ``what`` says which of the two it is, ``name`` is its name, and ``dialects`` are the known dialects that have it.
+    ``owner`` is the message that lacks a field, e.g. "PoolingParameter".
     """
 
-    def __init__(self, message: str, where: Where | None, what: str, name: str, dialects: tuple[str, ...]) -> None:
+    def __init__(
+        self, message: str, where: Where | None, what: str, name: str, dialects: tuple[str, ...], owner: str = ""
+    ) -> None:
         super().__init__(message, where)
+        self.owner = owner
         self.what = what
         self.name = name
         self.dialects = dialects

@@ -98,6 +98,19 @@ class LayerCase:
             found.update(self._gradients(built, inputs, outputs))
         return {**found, **parameters(built, self.golden, "param_after/")}
 
+    def outputs(self, exact: str = "small", device: str = "cpu") -> dict[str, np.ndarray]:
+        """Return the outputs of a run without gradients, for which nets of phase TEST are prepared."""
+        net, source = parse_net(self.folder / "net.prototxt")
+        built = build_net(
+            with_state(net, PHASES[self.meta["phase"]]), source, BuildOptions(torch.device(device), exact=exact)
+        )
+        set_parameters(built, self.golden, "param_init/")
+        inputs = {name: torch.from_numpy(self.golden[f"in/{name}"]).to(device) for name in built.inputs}
+        with torch.no_grad():
+            for _ in range(self.meta["warmup"] + 1):
+                found = built(**inputs)
+        return {f"out/{name}": blob.cpu().numpy() for name, blob in found.items()}
+
     def _gradients(
         self, net: Net, inputs: Mapping[str, torch.Tensor], outputs: Mapping[str, torch.Tensor]
     ) -> dict[str, np.ndarray]:

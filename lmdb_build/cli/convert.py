@@ -1,6 +1,6 @@
-"""``lmdb-build convert``, ``imageset`` and ``mean``: the flags, arguments and log of Caffe's tools.
+"""``lmdb-build convert``, ``imageset``, ``mean``, ``mnist`` and ``cifar``: arguments and log of Caffe's tools.
 
-Caffe: tools/convert_imageset.cpp, tools/compute_image_mean.cpp
+Caffe: tools/convert_imageset.cpp, tools/compute_image_mean.cpp, examples/mnist, examples/cifar10
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from lmdb_build.databases import (
     shuffled,
     write_databases,
 )
+from lmdb_build.datasets import convert_cifar, convert_mnist
 from netspec import log
 from netspec.command_line import Commands, WrongUsage
 from netspec.data.database import BACKENDS, open_reader
@@ -45,6 +46,17 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: lmdb)")
     p.add_argument("INPUT_DB")
     p.add_argument("OUTPUT_FILE", nargs="?", help="where to write the mean, as .binaryproto")
+
+    p = commands.add("mnist", _mnist, "write the files of MNIST into a database (convert_mnist_data)")
+    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: lmdb)")
+    p.add_argument("IMAGES", help="the file of images, unpacked: train-images-idx3-ubyte")
+    p.add_argument("LABELS", help="the file of labels, unpacked: train-labels-idx1-ubyte")
+    p.add_argument("DB_NAME", help="the database to write; it must not exist")
+
+    p = commands.add("cifar", _cifar, "write the files of CIFAR-10 into two databases (convert_cifar_data)")
+    p.add_argument("INPUT_FOLDER", help="the folder of data_batch_1.bin to data_batch_5.bin and test_batch.bin")
+    p.add_argument("OUTPUT_FOLDER", help="where cifar10_train_DB_TYPE and cifar10_test_DB_TYPE are written")
+    p.add_argument("DB_TYPE", choices=BACKENDS)
 
 
 def _add_flags(p: argparse.ArgumentParser) -> None:
@@ -120,3 +132,11 @@ def _mean(arguments: argparse.Namespace) -> None:
     if arguments.OUTPUT_FILE:
         write_mean(arguments.OUTPUT_FILE, mean)
     channel_means(mean)
+
+
+def _mnist(arguments: argparse.Namespace) -> None:
+    convert_mnist(arguments.IMAGES, arguments.LABELS, arguments.DB_NAME.rstrip("/"), arguments.backend, bar)
+
+
+def _cifar(arguments: argparse.Namespace) -> None:
+    convert_cifar(arguments.INPUT_FOLDER, arguments.OUTPUT_FOLDER, arguments.DB_TYPE, bar)

@@ -7,7 +7,7 @@ faults of its text the first is reported, of one layer's own settings too.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -52,6 +52,7 @@ class _Manner:
     open_data: bool
     allow_python: bool
     strict: bool
+    passes: Collection[str] | None
 
 
 def check_file(
@@ -64,6 +65,7 @@ def check_file(
     weights: str | None = None,
     allow_python: bool = False,
     strict: bool = False,
+    passes: Collection[str] | None = None,
 ) -> list[Checked]:
     """Check a net for a phase, level and stages; or a solver and all its nets, where the training net gets these.
 
@@ -71,9 +73,10 @@ def check_file(
 
     ``shapes`` are those of data layers' tops; the data of the others is opened with ``open_data``. ``weights``, paths
     separated by commas, are what a training would begin with, in the place of a solver's own; with ``strict`` they
-    must have every layer. A file that cannot be read comes alone, without a net.
+    must have every layer. A file that cannot be read comes alone, without a net. With ``passes`` a net gets memory, so
+    that :func:`netspec.check.plan.plan_text` can tell how it runs with them.
     """
-    manner = _Manner(shapes or {}, open_data, allow_python, strict)
+    manner = _Manner(shapes or {}, open_data, allow_python, strict, passes)
     given = [weights] if weights else []
     if is_net_binary(path):
         return [_check_weights(path, manner)]
@@ -122,12 +125,13 @@ def _check_net(
     """Build a net (its ``state`` set) without memory, check weights against it, and collect the errors."""
     faults: list[SpecError] = []
     options = BuildOptions(
-        torch.device("meta"),
+        torch.device("meta" if manner.passes is None else "cpu"),
         seed,
         open_data=manner.open_data,
         given_shapes=manner.shapes,
         report=faults.append,
         allow_python=manner.allow_python,
+        passes=manner.passes or (),
     )
     built = build_net(net, source, options)
     if files := [path.strip() for paths in weights for path in paths.split(",")]:

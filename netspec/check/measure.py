@@ -8,22 +8,23 @@ import torch
 
 from netspec.log import info, number
 from netspec.net.net import Net
-from netspec.solver.tally import Outputs, Tally, score_lines
+from netspec.solver.tally import Outputs, Tally, score_lines, scorers
 
 
 def test_net(net: Net, iterations: int) -> Outputs:
     """Run ``iterations`` batches; log each batch's outputs and their means, and return the means by output blob."""
     info("caffe.cpp:281", f"Running for {iterations} iterations.")
-    tally = Tally()
+    tally = Tally(scorers(net))
     with torch.no_grad():
         for batch in range(iterations):
             for name, values in tally.add(*net.forward_loss()).items():
                 for value in values:
                     info("caffe.cpp:304", f"Batch {batch}, {name} = {number(value)}")
     info("caffe.cpp:309", f"Loss: {number(tally.loss)}")
-    for line in score_lines(tally.scores, net.output_loss_weights):
+    scores = tally.scores
+    for line in score_lines(scores, net.output_loss_weights):
         info("caffe.cpp:321", line)
-    return tally.scores
+    return scores
 
 
 def time_net(net: Net, iterations: int) -> None:
@@ -50,6 +51,28 @@ def time_net(net: Net, iterations: int) -> None:
     info("caffe.cpp:408", f"Average Forward pass: {number(sum(forward) * 1e3 / iterations)} ms.")
     info("caffe.cpp:410", f"Average Backward pass: {number(sum(backward) * 1e3 / iterations)} ms.")
     info("caffe.cpp:412", f"Average Forward-Backward: {number(total / iterations)} ms.")
+    info("caffe.cpp:414", f"Total Time: {number(total)} ms.")
+    info("caffe.cpp:415", "*** Benchmark ends ***")
+
+
+def time_forward(net: Net, iterations: int) -> None:
+    """Run ``iterations`` forward passes of a net that an engine runs as a whole, and log their milliseconds.
+
+    The inputs of the net are zeros.
+    """
+    inputs = {name: torch.zeros(net.shapes[name]) for name in net.inputs}
+    with torch.no_grad():
+        info("caffe.cpp:351", "Performing Forward")
+        info("caffe.cpp:356", f"Initial loss: {number(float(net.forward_loss(**inputs)[0]))}")
+        info("caffe.cpp:365", "*** Benchmark begins ***")
+        info("caffe.cpp:366", f"Testing for {iterations} iterations.")
+        began = time.perf_counter()
+        for k in range(1, iterations + 1):
+            start = time.perf_counter()
+            net(**inputs)
+            info("caffe.cpp:394", f"Iteration: {k} forward time: {number((time.perf_counter() - start) * 1e3)} ms.")
+    total = (time.perf_counter() - began) * 1e3
+    info("caffe.cpp:408", f"Average Forward pass: {number(total / iterations)} ms.")
     info("caffe.cpp:414", f"Total Time: {number(total)} ms.")
     info("caffe.cpp:415", "*** Benchmark ends ***")
 

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from typing import Any
 
 from netspec import log
+from netspec.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
+from netspec.graph.steps import PASSES
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +37,43 @@ def add_exact(parser: argparse.ArgumentParser) -> None:
         default=SMALL,
         help=f"which sums equal Caffe's in every bit, on the CPU; all is slower (default: {SMALL})",
     )
+
+
+def add_passes(parser: argparse.ArgumentParser) -> None:
+    """Add ``--passes``."""
+    parser.add_argument(
+        "--passes",
+        type=_passes,
+        default=PASSES,
+        metavar="NAMES",
+        help=f"what may speed up a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
+    )
+
+
+def _passes(text: str) -> tuple[str, ...]:
+    """Read the names of passes."""
+    names = () if text == "none" else tuple(text.split(","))
+    for name in names:
+        if name not in PASSES:
+            raise argparse.ArgumentTypeError(f"found {name!r}, expected none, or some of {','.join(PASSES)}")
+    return names
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add ``--engine``, ``--precision``, ``--cache`` and ``--no-cache``."""
+    parser.add_argument("--engine", choices=ENGINES, default=TORCH, help=f"what runs the net (default: {TORCH})")
+    parser.add_argument(
+        "--precision", choices=PRECISIONS, default=FP32, help=f"of the engine's arithmetic (default: {FP32})"
+    )
+    parser.add_argument(
+        "--cache", metavar="DIR", help="keep nets exported for an engine here (default: the user's cache folder)"
+    )
+    parser.add_argument("--no-cache", action="store_true", help="export the net anew, and do not keep it")
+
+
+def choice(arguments: argparse.Namespace) -> Choice:
+    """Return the engine that is asked for."""
+    return Choice.of(arguments.engine, arguments.precision, False if arguments.no_cache else arguments.cache)
 
 
 def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
@@ -131,6 +170,7 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
         allow_python=arguments.allow_python_layers,
         exact=arguments.exact,
         write_files=write_files,
+        passes=arguments.passes,
     )
 
 
@@ -140,6 +180,17 @@ def load_weights(net: Any, paths: str | None, strict: bool) -> None:
 
     if paths:
         weights.load_weights(net, split_paths(paths), strict, some=True)
+
+
+def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:
+    """Return the net of ``--model`` as the chosen engine runs it; ``weights`` are those that were loaded."""
+    chosen = choice(arguments)
+    if (chosen.engine, chosen.precision) == (TORCH, FP32):
+        return net
+    from netspec.engines.net import with_engine
+
+    paths = split_paths(weights) if weights else []
+    return with_engine(net, chosen, arguments.model, paths, arguments.level, arguments.stage.split(","))
 
 
 def split_paths(paths: str) -> list[str]:

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from netspec.cli.arguments import add_python, add_shapes, add_state, add_strict, stages
+from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, stages
 from netspec.cli.run import Commands
 from netspec.errors import printable
 from netspec.proto.schema import PHASES
@@ -22,6 +22,8 @@ def add_to(commands: Commands) -> None:
     add_shapes(p, "the shape of a data layer's top; its data is then not opened")
     p.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
     p.add_argument("--weights", help="weights that must fit the net, several separated by commas")
+    p.add_argument("--plan", action="store_true", help="print how the net runs without gradients; needs its memory")
+    add_passes(p)
     p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")
     add_strict(p)
     add_python(p)
@@ -29,6 +31,7 @@ def add_to(commands: Commands) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.check.check import check_file
+    from netspec.check.plan import plan_text
     from netspec.net.table import as_json, table
 
     checked = check_file(
@@ -41,6 +44,7 @@ def _check(arguments: argparse.Namespace) -> int:
         weights=arguments.weights,
         strict=arguments.strict,
         allow_python=arguments.allow_python_layers,
+        passes=arguments.passes if arguments.plan else None,
     )
     for line in dict.fromkeys(line for part in checked for line in part.advice):
         print(f"warning: {printable(line)}", file=sys.stderr)
@@ -55,4 +59,6 @@ def _check(arguments: argparse.Namespace) -> int:
         return 0
     for label, net in nets:
         print(f"{label}: {printable(net.name) or 'a net without a name'}\n{table(net)}\n")
+        if arguments.plan:
+            print(plan_text(net) + "\n")
     return 0

@@ -10,14 +10,18 @@ from typing import Any
 from netspec import log
 from netspec.cli.arguments import (
     add_device,
+    add_engine,
     add_exact,
+    add_passes,
     add_python,
     add_state,
     add_strict,
     bar,
+    choice,
     device,
     load_weights,
     positive,
+    run_by,
     shape,
     split_paths,
     stages,
@@ -71,7 +75,9 @@ def add_to(commands: Commands) -> None:
     add_state(p, phase="TEST")
     add_python(p)
     add_exact(p)
+    add_passes(p)
     add_strict(p)
+    add_engine(p)
 
 
 def _extract(arguments: argparse.Namespace) -> None:
@@ -102,9 +108,20 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     weights = split_paths(arguments.weights) if arguments.weights else []
     given = arguments.shape[1] if arguments.shape else None
     (blob,) = arguments.blob
-    zooms, chosen = arguments.zooms or (1.0,), device(arguments.gpu)
+    chosen = device(arguments.gpu) if arguments.gpu else "cpu"  # without torch, where the engine needs none
     net = ImageNet(
-        arguments.model, weights, blob, arguments.input, chosen, given, zooms, arguments.exact, arguments.strict, steps
+        arguments.model,
+        weights,
+        blob,
+        arguments.input,
+        chosen,
+        given,
+        arguments.zooms or (1.0,),
+        arguments.exact,
+        arguments.strict,
+        steps,
+        choice(arguments),
+        arguments.passes,
     )
     size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "RGB" if net.scaling.swap else "BGR"
     print(f"{arguments.model}: {blob} of {len(images.paths)} images from {arguments.images}")
@@ -127,9 +144,10 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
     stated = with_sources(stated, source, dict(arguments.source))
     python, exact = arguments.allow_python_layers, arguments.exact
-    options = BuildOptions(device(arguments.gpu), allow_python=python, exact=exact)
+    options = BuildOptions(device(arguments.gpu), allow_python=python, exact=exact, passes=arguments.passes)
     net = build_net(stated, source, options)
     load_weights(net, arguments.weights, arguments.strict)
+    net = run_by(net, arguments, arguments.weights)
     arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))
     net.close()
     print(f"{arguments.model}: {', '.join(arguments.blob)} of {len(arrays['keys'])} records")

@@ -4,7 +4,19 @@ from __future__ import annotations
 
 import argparse
 
-from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, load, load_weights, positive
+from netspec.cli.arguments import (
+    add_device,
+    add_engine,
+    add_exact,
+    add_passes,
+    add_python,
+    add_state,
+    add_strict,
+    load,
+    load_weights,
+    positive,
+    run_by,
+)
 from netspec.cli.run import Commands
 from netspec.scores import Score, Scores
 
@@ -20,7 +32,9 @@ def add_to(commands: Commands) -> None:
     add_state(p, phase=None)
     add_python(p)
     add_exact(p)
+    add_passes(p)
     add_strict(p)
+    add_engine(p)
 
     p = commands.add("time", _time, "measure the forward and backward time of each layer (caffe time)")
     p.add_argument("--model", required=True, help="the net's prototxt")
@@ -29,6 +43,8 @@ def add_to(commands: Commands) -> None:
     add_state(p, phase="TRAIN")
     add_python(p)
     add_exact(p)
+    p.set_defaults(passes=())  # each layer is timed by itself
+    add_engine(p)
 
 
 def _test(arguments: argparse.Namespace) -> None:
@@ -36,6 +52,7 @@ def _test(arguments: argparse.Namespace) -> None:
 
     net = load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
     load_weights(net, arguments.weights, arguments.strict)
+    net = run_by(net, arguments, arguments.weights)
     means = test_net(net, arguments.iterations)
     net.close()
     if arguments.scores:
@@ -43,8 +60,12 @@ def _test(arguments: argparse.Namespace) -> None:
 
 
 def _time(arguments: argparse.Namespace) -> None:
-    from netspec.check.measure import time_net
+    from netspec.check.measure import time_forward, time_net
 
     net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343", write_files=False)
-    time_net(net, arguments.iterations)
+    engine = run_by(net, arguments, None)
+    if engine is net:
+        time_net(net, arguments.iterations)
+    else:
+        time_forward(engine, arguments.iterations)
     net.close()

@@ -28,7 +28,9 @@ def add_to(commands: Commands) -> None:
         "install-caffe", _install, "put a package `caffe` and Caffe's commands into this Python environment"
     )
     p.add_argument("--replace", action="store_true", help="move a real Caffe that is in the way aside")
-    commands.add("remove-caffe", _remove, "undo install-caffe")
+    p.add_argument("--build", type=Path, metavar="FOLDER", help="only make FOLDER/tools/caffe and so on, for scripts")
+    p = commands.add("remove-caffe", _remove, "undo install-caffe")
+    p.add_argument("--build", type=Path, metavar="FOLDER", help="undo install-caffe --build FOLDER")
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -58,14 +60,14 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _install(arguments: argparse.Namespace) -> None:
-    from netspec.scripts.environment import install_caffe
+    from netspec.scripts.environment import install_caffe, make_build_folder
 
-    for path in install_caffe(arguments.replace):
+    for path in make_build_folder(arguments.build) if arguments.build else install_caffe(arguments.replace):
         print(path)
 
 
 def _remove(arguments: argparse.Namespace) -> None:
-    from netspec.scripts.environment import remove_caffe
+    from netspec.scripts.environment import remove_build_folder, remove_caffe
 
-    for path in remove_caffe():
+    for path in remove_build_folder(arguments.build) if arguments.build else remove_caffe():
         print(path)

@@ -72,6 +72,14 @@ def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
     return proto
 
 
+def in_half_precision(values: np.ndarray) -> Any:
+    """Return a BlobProto of the values, rounded to half precision, as NVIDIA Caffe and OpenCV write them: raw_data."""
+    runs = _Runs(raw_data_type=_RAW_DTYPES.index("<f2"), raw_data=values.astype("<f2").tobytes())
+    proto = BlobProto(shape=BlobShape(dim=values.shape))
+    proto.MergeFromString(runs.SerializeToString())
+    return proto
+
+
 def _values(proto: Any, names: tuple[str, str]) -> np.ndarray:
     single, double = names
     name, dtype = (double, "<f8") if len(getattr(proto, double)) else (single, "<f4")

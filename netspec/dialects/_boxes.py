@@ -50,14 +50,26 @@ def sizes(boxes: Array) -> Array:
     return np.where((width < 0) | (height < 0), np.float32(0), width * height)
 
 
-def overlaps(first: Array, second: Array) -> Array:
-    """Return intersection over union of each pair of boxes (..., 4), broadcast against each other."""
+def shared(first: Array, second: Array) -> Array:
+    """Return the areas that each pair of boxes (..., 4), broadcast against each other, has in common."""
     low = np.maximum(first[..., :2], second[..., :2])
     high = np.minimum(first[..., 2:], second[..., 2:])
     width, height = high[..., 0] - low[..., 0], high[..., 1] - low[..., 1]
-    shared = np.where((width > 0) & (height > 0), width * height, np.float32(0))
-    union = sizes(first) + sizes(second) - shared
-    return np.divide(shared, union, out=np.zeros_like(shared), where=shared > 0)
+    return np.where((width > 0) & (height > 0), width * height, np.float32(0))
+
+
+def overlaps(first: Array, second: Array) -> Array:
+    """Return intersection over union of each pair of boxes (..., 4), broadcast against each other."""
+    common = shared(first, second)
+    union = sizes(first) + sizes(second) - common
+    return np.divide(common, union, out=np.zeros_like(common), where=common > 0)
+
+
+def coverage(first: Array, second: Array) -> Array:
+    """Return which part of the first box of each pair (..., 4) lies in the second."""
+    common = shared(first, second)
+    area = np.broadcast_to(sizes(first), common.shape)
+    return np.divide(common, area, out=np.zeros_like(common), where=common > 0)
 
 
 def encode(boxes: Array, priors: Array, variances: Array | None, code: int) -> Array:

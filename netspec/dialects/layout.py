@@ -1,4 +1,4 @@
-"""Layers of forks that only move numbers: Transpose (OCR nets), Reorg (YOLO v2), MergeCrop (U-Net)."""
+"""Layers of forks that only move numbers: Transpose (OCR), Reorg (YOLO v2), MergeCrop (U-Net), CropCenter (waifu2x)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ message MergeCropParameter {
   repeated bool backward = 2;
   optional MergeOp operation = 3 [default = STACK];
 }
+message CropCenterParameter {
+  repeated uint32 crop_size = 1;
+}
 extend LayerParameter {
+  optional CropCenterParameter crop_center_param = 1148;
   optional TransposeParameter transpose_param = 1149;
   optional ReorgParameter reorg_param = 1155;
   optional MergeCropParameter mergecrop_param = 1156;
@@ -159,3 +163,40 @@ class MergeCrop(Layer):
             part = part if learns else part.detach()
             parts.append(part if copied else torch.zeros_like(part))
         return torch.cat(parts, 1) if self.stacks else parts[0] + parts[1]
+
+
+@register("CropCenter", "crop_center_param")
+class CropCenter(Layer):
+    """Cut as much off both ends of each axis as ``crop_size`` says, one number for each axis.
+
+    bottom[0]  any shape
+    top[0]     as many axes; axis i is shorter by 2 crop_size[i]
+    Fork: lltcggie/caffe, src/caffe/layers/crop_center_layer.cpp
+    """
+
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        shape, cuts = bottom_shapes[0], list(value(self.param, "crop_center_param").crop_size)
+        if len(cuts) != len(shape) or any(size <= 2 * cut for size, cut in zip(shape, cuts, strict=False)):
+            message = f"found crop_size {cuts}, expected one for each axis of {shape}, less than half of it"
+            raise self.error(message, "crop_center_param", "crop_size")
+        self.window = tuple(slice(cut, size - cut) for size, cut in zip(shape, cuts, strict=True))
+        return [tuple(size - 2 * cut for size, cut in zip(shape, cuts, strict=True))]
+
+    @override
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return data[self.window].clone()
+
+    @override
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        cuts = [part.start for part in self.window]
+        axes = [axis for axis, cut in enumerate(cuts) if cut]
+        if not axes:
+            return graph.node("Identity", bottoms[0])
+        starts, ends = (graph.constant([sign * cuts[axis] for axis in axes]) for sign in (1, -1))
+        return graph.node("Slice", bottoms[0], starts, ends, graph.constant(axes))
+
+    @override
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        parts = [f"{part.start}:-{part.start}" if part.start else ":" for part in self.window]
+        return code.call(f"{{x}}[{', '.join(parts)}]", x=bottoms[0])

@@ -1,8 +1,6 @@
 """SSD, the single shot detector: weiliu89/caffe, branch ssd.
 
-Not here are its layers AnnotatedData (databases of images with boxes, and their augmentation) and DetectionEvaluate;
-their messages are, and the solver's fields for them, so that scripts can write such files. To train, bring images and
-boxes by other layers: MultiBoxLoss says which rows it takes.
+A database for its layer AnnotatedData is what the fork's convert_annoset writes: records of AnnotatedDatum.
 """
 
 from __future__ import annotations
@@ -15,6 +13,8 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from netspec import log
+from netspec.dialects._annotated import AnnotatedData
 from netspec.dialects._boxes import (
     CENTER_SIZE,
     Array,
@@ -24,6 +24,7 @@ from netspec.dialects._boxes import (
     onnx_decode,
     suppress,
 )
+from netspec.dialects._evaluate import DetectionEvaluate
 from netspec.dialects._multibox import MultiBoxLoss
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape, rounded
@@ -239,6 +240,19 @@ extend LayerParameter {
 """
 
 register("MultiBoxLoss", "multibox_loss_param", "loss_param")(MultiBoxLoss)
+register(
+    "AnnotatedData",
+    "annotated_data_param",
+    "data_param",
+    "transform_param",
+    "transform_param.resize_param",
+    "transform_param.emit_constraint",
+    "transform_param.crop_h",
+    "transform_param.crop_w",
+    "transform_param.distort_param",
+    "transform_param.expand_param",
+)(AnnotatedData)
+register("DetectionEvaluate", "detection_evaluate_param")(DetectionEvaluate)
 
 
 @register("Permute", "permute_param")
@@ -367,6 +381,7 @@ class PriorBox(Layer):
             raise self.error("variance must be one number or four, each above 0", "prior_box_param", "variance")
         self.variances = np.array(list(param.variance) or [0.1], np.float32) * np.ones(4, np.float32)
         self.sizes = self._sizes(param)
+        self._warn_of_cut_sizes(param)
         self.image = self._pair(param, "img_size", "img_h", "img_w")
         self.step = self._pair(param, "step", "step_h", "step_w")
         if self.image is None and len(self.bottom_shapes) < 2:
@@ -388,6 +403,16 @@ class PriorBox(Layer):
                 sizes.append((math.sqrt(small * self.pixels(param.max_size[i])),) * 2)
             sizes += [(small * math.sqrt(ratio), small / math.sqrt(ratio)) for ratio in ratios[1:]]
         return np.array(sizes, np.float32)
+
+    def _warn_of_cut_sizes(self, param: Any) -> None:
+        """Say which sizes are cut: other forks and OpenCV keep them, and nets trained there find other boxes here."""
+        for name in ("min_size", "max_size"):
+            sizes = getattr(param, name)
+            cut = [f"{rounded(size):g} to {self.pixels(size):g}" for size in sizes if self.pixels(size) != size]
+            if cut:
+                place = self.context.at("prior_box_param", name, 0)
+                found = f"{place}: {name} is cut to whole pixels, as in SSD: {', '.join(cut)}"
+                log.logger.warning(f"{found}; OpenCV and some forks keep it, so a net trained there gives other boxes")
 
     def pixels(self, size: float) -> float:
         """Return the size that a box gets for a given ``min_size`` or ``max_size``."""

@@ -20,6 +20,7 @@ from netspec.dnn.errors import DnnError
 from netspec.dnn.models import ClassificationModel, DetectionModel, Model, SegmentationModel
 from netspec.dnn.net import Layer, Net
 from netspec.dnn.read import readNet, readNetFromCaffe
+from netspec.dnn.shrink import shrinkCaffeModel
 
 __all__ = [
     "ClassificationModel",
@@ -31,6 +32,7 @@ __all__ = [
     "SegmentationModel",
     "readNet",
     "readNetFromCaffe",
+    "shrinkCaffeModel",
 ]
 
 #: OpenCV 4's constants, some of which OpenCV 5 left out.
@@ -57,8 +59,9 @@ DNN_TARGET_CPU_FP16 = 10
 
 
 def __getattr__(name: str) -> Any:
+    place = cv2 if name.startswith("DNN_LAYOUT_") else _opencv  # OpenCV 5 moved these
     try:
-        return getattr(_opencv, name)
+        return getattr(place, name)
     except AttributeError:
         message = f"module 'netspec.dnn' has no attribute {name!r}, nor has cv2.dnn of OpenCV {cv2.__version__}"
         raise AttributeError(message) from None

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from netspec import log
 from netspec.dialects import use_dialects_of
-from netspec.errors import SpecError, Where
+from netspec.errors import ForkFault, SpecError, Where
 from netspec.exact import NONE
 from netspec.graph.filter import filter_net, with_state
 from netspec.layers.base import Shape
@@ -28,6 +29,7 @@ from netspec.proto.upgrade.current import upgrade_net
 
 FileOrBytes = str | os.PathLike[str] | bytes | bytearray | memoryview | np.ndarray
 
+_NOT_SKIPPED = ("ConvolutionParameter", "PoolingParameter")  # another field may change their windows
 PROTOTXT, WEIGHTS = "<prototxt>", "<caffeModel>"  # what errors call files that were given as bytes
 
 
@@ -56,7 +58,8 @@ class CaffeFiles:
         SSD's layers are OpenCV's (netspec/dnn/opencv_layers.py).
         """
         options = BuildOptions(torch.device(device), exact=NONE)
-        net = build_filtered(self._reshaped(shapes), self.source, options)
+        with log.silent():  # of what has no effect; OpenCV says nothing of it
+            net = build_filtered(self._reshaped(shapes), self.source, options)
         for i, layer in enumerate(net.layers):
             if layer.type in ("PriorBox", "DetectionOutput"):
                 from netspec.dnn.opencv_layers import LAYERS  # it registers SSD's layers, for nets that have them
@@ -99,12 +102,20 @@ def read_files(prototxt: FileOrBytes, weights: FileOrBytes | None) -> CaffeFiles
         file, data = PROTOTXT, bytes_of(prototxt)
     text = data.removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")
     use_dialects_of(text, file)
-    net, source = parse_net_text(text, file, upgrade=False)
+    net, source = parse_net_text(text, file, upgrade=False, report=_skip)
     if not net.input_shape and not net.input_dim:
         for _ in net.input:  # Caffe leaves out an input without a shape; for OpenCV it gets one from setInput
             net.input_shape.add()
-    net, source = upgrade_net(net, source)
+    with log.silent():  # of older formats
+        net, source = upgrade_net(net, source)
     return CaffeFiles(*filter_net(with_state(net, TEST), source), weights=weights)
+
+
+def _skip(fault: SpecError) -> None:
+    """Skip an unknown field, with a warning; raise the fault where OpenCV's importer fails too."""
+    if not isinstance(fault, ForkFault) or fault.owner in _NOT_SKIPPED:
+        raise fault
+    log.logger.warning(f"{fault.where}: skipped: {fault.message}")
 
 
 def bytes_of(data: Any) -> bytes:

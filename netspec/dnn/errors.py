@@ -10,7 +10,7 @@ import cv2
 from netspec.errors import SpecError, Where
 
 # Codes of cv::Error (opencv2/core/base.hpp)
-UNSPECIFIED, BAD_ARGUMENT, NOT_FOUND = -2, -5, -204
+UNSPECIFIED, BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED = -2, -5, -204, -213
 
 
 class DnnError(cv2.error, SpecError):

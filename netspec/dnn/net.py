@@ -17,12 +17,13 @@ import torch
 
 from netspec.dnn.caffe_files import CaffeFiles
 from netspec.dnn.costs import operations
-from netspec.dnn.errors import BAD_ARGUMENT, NOT_FOUND, DnnError, as_dnn_error
-from netspec.dnn.table import INPUT, Entry, make_table, nodes_of, unconnected
+from netspec.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, DnnError, as_dnn_error
+from netspec.dnn.table import INPUT, Entry, graph_of, make_table, nodes_of, unconnected
 from netspec.errors import Where, did_you_mean
 from netspec.layers.base import Layer as CaffeLayer
 from netspec.layers.base import Shape
 from netspec.net.net import Net as CaffeNet
+from netspec.whole_file import whole_file
 
 Array = np.ndarray
 Shapes = list[Shape]
@@ -146,6 +147,9 @@ class Net:
     def enableWinograd(self, useWinograd: bool) -> None:
         """Accept the switch; it changes no result."""
 
+    def setHalideScheduler(self, scheduler: str) -> None:
+        """Accept a schedule; it changes no result."""
+
     def setInputsNames(self, inputBlobNames: Sequence[str]) -> None:
         """Give the inputs other names, in their order."""
         self._shown = dict(zip(self._declared, inputBlobNames, strict=False))
@@ -208,6 +212,64 @@ class Net:
             if entry.top in (-1, 0):
                 ticks[number] = seconds[self._nodes[entry.layer]] * cv2.getTickFrequency()
         return int(ticks.sum()), ticks
+
+    def forwardAsync(self, outputName: str = "") -> Any:
+        """Refuse, as OpenCV does without Intel's Inference Engine."""
+        message = "forwardAsync needs a backend that is not here; use forward"
+        raise DnnError(message, code=NOT_IMPLEMENTED, func="forwardAsync")
+
+    # Other nets than the prototxt's
+
+    def addLayer(self, name: str, type: str, *settings: Any) -> int:
+        """Refuse: a net is what its prototxt says."""
+        raise self._as_written("addLayer")
+
+    def addLayerToPrev(self, name: str, type: str, *settings: Any) -> int:
+        """Refuse: a net is what its prototxt says."""
+        raise self._as_written("addLayerToPrev")
+
+    def connect(self, outPin: str, inpPin: str) -> None:
+        """Refuse: a net is what its prototxt says."""
+        raise self._as_written("connect")
+
+    def registerOutput(self, outputName: str, layerId: int, outputPort: int) -> int:
+        """Refuse: a net is what its prototxt says."""
+        raise self._as_written("registerOutput")
+
+    def _as_written(self, func: str) -> DnnError:
+        message = f"{func} cannot change a net of Caffe's files; write the layer into the prototxt"
+        return DnnError(message, self._file(), NOT_IMPLEMENTED, func)
+
+    def quantize(self, calibData: Any, inputsDtype: int, outputsDtype: int, perChannel: bool = True) -> Any:
+        """Refuse: nets compute in float32."""
+        message = (
+            "nets of Caffe's files are not quantized here; export the net to ONNX (netspec export) and quantize that"
+        )
+        raise DnnError(message, self._file(), NOT_IMPLEMENTED, "quantize")
+
+    def getInputDetails(self) -> Any:
+        """Refuse, as OpenCV does for a net that is not quantized."""
+        raise DnnError("the net is not quantized", self._file(), func="getInputDetails")
+
+    def getOutputDetails(self) -> Any:
+        """Refuse, as OpenCV does for a net that is not quantized."""
+        raise DnnError("the net is not quantized", self._file(), func="getOutputDetails")
+
+    # As a graph
+
+    def dump(self) -> str:
+        """Return the layers, with the shapes of their tops, and what they read, in Graphviz's language."""
+        self._check_not_empty("dump")
+        assert self._files is not None
+        given = {key: value.shape for key, value in self._values.items()}
+        with as_dnn_error("dump"):
+            net = self._files.build(given, "meta")
+        return graph_of(self._files.net, self._table, [self._shapes(net, entry)[1] for entry in self._table])
+
+    def dumpToFile(self, path: str) -> None:
+        """Write :meth:`dump` to a file."""
+        with as_dnn_error("dumpToFile"), whole_file(path) as unfinished:
+            unfinished.write_text(self.dump())
 
     # Shapes and costs
 

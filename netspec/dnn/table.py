@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from netspec.graph.plan import Plan
+from netspec.layers.base import Shape
 from netspec.proto.schema import LayerParameter, NetParameter
 
 INPUT = "_input"
@@ -59,20 +61,42 @@ def _numbered(name: str, seen: Counter[str]) -> str:
     return name if seen[name] == 1 else f"{name}_{seen[name] - 1}"
 
 
-def unconnected(net: NetParameter, table: Sequence[Entry]) -> list[int]:
-    """Return the numbers of the layers of which no other layer reads any top."""
+def edges(net: NetParameter, table: Sequence[Entry]) -> list[tuple[int, int]]:
+    """Return which layer reads a top of which other, as pairs of numbers (of the layer read, of its reader)."""
     producer: dict[str, int] = {}
-    read: set[int] = set()
+    found: list[tuple[int, int]] = []
     entries: dict[int, list[int]] = {}
     for number, entry in enumerate(table):
         entries.setdefault(entry.layer, []).append(number)
     for i, layer in enumerate(net.layer):
         numbers = entries.get(i, [0])
-        read.update(producer[blob] for blob in layer.bottom if blob in producer)
-        read.update(numbers[:-1] if layer.type == "Axpy" else ())
+        readers = numbers if layer.type == "Convolution" else [numbers[0]] * len(layer.bottom)
+        found += [(producer[blob], n) for blob, n in zip(layer.bottom, readers, strict=False) if blob in producer]
+        found += pairwise(numbers) if layer.type == "Axpy" else ()
         for j, blob in enumerate(layer.top):
             producer[blob] = numbers[min(j, len(numbers) - 1)] if layer.type == "Convolution" else numbers[-1]
+    return found
+
+
+def unconnected(net: NetParameter, table: Sequence[Entry]) -> list[int]:
+    """Return the numbers of the layers of which no other layer reads any top."""
+    read = {number for number, _ in edges(net, table)}
     return [number for number in range(len(table)) if number not in read]
+
+
+def graph_of(net: NetParameter, table: Sequence[Entry], tops: Sequence[Sequence[Shape]]) -> str:
+    """Return the layers and what they read in Graphviz's language; ``tops`` are the shapes of each layer's tops."""
+    lines = ["digraph G {"]
+    for entry, shapes in zip(table, tops, strict=True):
+        sizes = "".join(f"output: {' x '.join(map(str, shape))}\\l" for shape in shapes)
+        label = "\\n".join([entry.name, entry.type, sizes] if entry.type else [entry.name, sizes])
+        lines.append(f"\t{_quoted(entry.name)} [label={_quoted(label)} shape=box]")
+    lines += [f"\t{_quoted(table[a].name)} -> {_quoted(table[b].name)}" for a, b in edges(net, table)]
+    return "\n".join([*lines, "}\n"])
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '\\"') + '"'
 
 
 def nodes_of(plan: Plan, net: NetParameter) -> list[int]:

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg import blas
-from threadpoolctl import ThreadpoolController
 
 Values = torch.Tensor | np.ndarray  # a loop over images is faster on arrays, which it makes once
 
@@ -31,7 +29,14 @@ def array(values: Values) -> np.ndarray:
 
 
 def _routine(name: str, values: np.ndarray) -> Callable[..., Any]:
+    from scipy.linalg import blas  # half a second, for which nets without exact sums need not wait
+
     return getattr(blas, values.dtype.char.replace("f", "s") + name)
+
+
+def gemm_routine(values: np.ndarray) -> Callable[..., Any]:
+    """Return BLAS' product of matrices for numbers of this type: (1, b.T, a.T, 0, c.T, 0, 0, 1) makes c = a b."""
+    return _routine("gemm", values)
 
 
 def gemm(a: Values, b: Values, c: Values, *, a_t: bool = False, b_t: bool = False, add: bool = False) -> None:
@@ -92,10 +97,21 @@ def sum_in_order(values: torch.Tensor, axis: int = 0) -> torch.Tensor:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Within the block BLAS uses one thread: more threads would busy-wait, like torch's, and slow each other down."""
-    with _pools().limit(limits=1):
+    before = [(pool, count) for pool in _pools() if (count := pool.get_num_threads()) != 1]
+    for pool, _ in before:
+        pool.set_num_threads(1)
+    try:
         yield
+    finally:
+        for pool, count in before:
+            pool.set_num_threads(count)
 
 
 @cache
-def _pools() -> ThreadpoolController:
-    return ThreadpoolController().select(internal_api="openblas")
+def _pools() -> list[Any]:
+    """Return the OpenBLAS that SciPy brings, or every one there is where SciPy's has no place of its own."""
+    import scipy.linalg  # noqa: F401  so that its OpenBLAS is there
+    from threadpoolctl import ThreadpoolController
+
+    pools = ThreadpoolController().select(internal_api="openblas").lib_controllers
+    return [pool for pool in pools if "scipy.libs" in pool.filepath] or pools

@@ -17,4 +17,9 @@ def applies(exact: str, values: torch.Tensor, small: bool = False) -> bool:
     """
     if exact != ALL and not (small and exact == SMALL):
         return False
-    return suits_blas(values) and not (torch.compiler.is_compiling() or torch.jit.is_tracing())
+    return suits_blas(values) and not is_recorded()
+
+
+def is_recorded() -> bool:
+    """Return whether operations are recorded, not only run."""
+    return torch.compiler.is_compiling() or torch.jit.is_tracing()

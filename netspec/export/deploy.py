@@ -17,7 +17,7 @@ from netspec.graph import raise_fault
 from netspec.graph.filter import filter_net
 from netspec.graph.fold import origins
 from netspec.net.build import build_net
-from netspec.net.fold import Fold, find_folds, roles_of
+from netspec.net.fold import Fold, find_folds
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions, not_to_be_given
 from netspec.proto.schema import NetParameter, ParamSpec
@@ -76,9 +76,9 @@ def fold(net: Net) -> NetParameter:
     netspec/net/fold.py says what is folded. Blobs keep their names where they still exist, outputs always do;
     layers that share parameters share them still where folding left them equal.
     """
-    folds = find_folds(net)
+    folds = find_folds(net.plan, list(net.layers))
     plan = net.plan
-    passes_on = roles_of(net).passes_on
+    passes_on = [layer.passes_on for layer in net.layers]
     origin = origins(plan, passes_on)
     names = _names(net, origin)
     gone = {i for each in folds for i in each.chain.folded}

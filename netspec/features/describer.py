@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
+from netspec.engines.choice import Choice
 from netspec.features.images import ImageNet
 from netspec.features.scaling import Steps
 from netspec.features.views import read_zooms
@@ -19,8 +19,9 @@ class Describer:
     The net is the prototxt ``model`` in phase TEST, cut down to what computes the blob; the pixels are scaled as its
     data layer's transform_param says or, where any of these is given, by ``swap``, ``raw_scale``, ``mean`` and
     ``scale``, in this order (:class:`netspec.features.scaling.Steps`); each may be text, as on the command line.
-    ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how many. Raises SpecError for faults of
-    the files.
+    ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how many. ``engine`` and ``precision`` say
+    what runs the net (docs/engines.md), ``cache`` which folder keeps its model. Raises SpecError for faults of the
+    files.
     """
 
     def __init__(
@@ -35,10 +36,14 @@ class Describer:
         scale: str | float = 1.0,
         raw_scale: str | float = 1.0,
         swap: str | bool = False,
+        engine: str = "torch",
+        precision: str = "fp32",
+        cache: str | Path | None = None,
     ) -> None:
         steps = Steps.of(mean, scale, raw_scale, swap)
-        chosen = torch.device(device)
-        self.image_net = ImageNet(model, [weights], blob, input, chosen, zooms=read_zooms(zooms), steps=steps)
+        choice = Choice.of(engine, precision, cache)
+        views = read_zooms(zooms)
+        self.image_net = ImageNet(model, [weights], blob, input, device, zooms=views, steps=steps, choice=choice)
         self.views = len(self.image_net.zooms)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:

@@ -3,32 +3,37 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
-import h5py
 import numpy as np
-import torch
 
 from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import decode_pixels, planar
+from netspec.engines.choice import TORCH, Choice
+from netspec.engines.model import Model, Origin
+from netspec.engines.runners import Unable, tell_unable
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.features.image_list import ImageList
-from netspec.features.records import Progress
 from netspec.features.scaling import Steps, scaling_of
 from netspec.features.views import middle
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
-from netspec.net.build import build_filtered
-from netspec.net.options import BuildOptions
-from netspec.net.weights import load_weights
+from netspec.graph.steps import PASSES
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
+
+if TYPE_CHECKING:
+    import torch
+
+    from netspec.features.records import Progress
+    from netspec.net.net import Net
 
 BATCH = 16  # images per forward pass
 
@@ -39,7 +44,8 @@ class ImageNet:
     The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
     None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning;
     something in them must fit, and with ``strict`` every layer must be there. ``steps``, if any are given, are done to
-    the pixels in the place of what the data layer's transform_param says. Raises SpecError for faults of the files;
+    the pixels in the place of what the data layer's transform_param says. ``choice`` is the engine that runs the net:
+    with another than torch, whose model the cache has, torch is not imported. Raises SpecError for faults of the files;
     warns where the weights were trained on other pixels.
     """
 
@@ -49,12 +55,14 @@ class ImageNet:
         weights: Sequence[str | Path],
         blob: str,
         input_blob: str,
-        device: torch.device | None = None,
+        device: torch.device | str = "cpu",
         shape: Shape | None = None,
         zooms: Sequence[float] = (1.0,),
         exact: str = SMALL,
         strict: bool = False,
         steps: Steps | None = None,
+        choice: Choice | None = None,
+        passes: Collection[str] = PASSES,
     ) -> None:
         net, source = parse_net(model)
         net, source = filter_net(with_state(net, TEST), source)
@@ -70,22 +78,54 @@ class ImageNet:
         steps = steps or Steps()
         self.scaling = scaling_of(steps, transforming[0] if transforming else None, self.shape, source.file)
         after, after_source = prune(net, source, [blob], {input_blob: shape})
-        options = BuildOptions(device or torch.device("cpu"), seed=0, exact=exact)
-        self.net = build_filtered(after, after_source, options)
-        self.net.keep = [blob]
-        if weights:
-            load_weights(self.net, weights, strict, some=True)
-        for path in weights:
-            if not transforming and not steps:
-                readers = [layer.name for layer in after.layer if input_blob in layer.bottom]
-                _warn_of_other_pixels(path, model, readers)
+
+        def build() -> Net:
+            built = _build(after, after_source, weights, device, exact, strict, passes)
+            for path in weights:
+                if not transforming and not steps:
+                    readers = [layer.name for layer in after.layer if input_blob in layer.bottom]
+                    _warn_of_other_pixels(path, model, readers)
+            return built
+
+        self._build, self._net, self._model = build, None, None
+        self._choice = choice or Choice()
+        if self._choice.engine == TORCH or str(device) != "cpu":
+            self._use_torch("" if self._choice.engine == TORCH else f"it runs on the CPU, this net is on {device}")
+            return
+        options = {"blob": blob, "input": input_blob, "shape": shape, "strict": strict, "scaled": bool(steps)}
+        try:
+            self._model = Model(self._choice, Origin([model, *weights], options), self._export)
+        except Unable as fault:
+            self._use_torch(str(fault))
+
+    def _use_torch(self, reason: str) -> None:
+        """Run the net by torch; ``reason`` says why the chosen engine does not."""
+        tell_unable(self._choice, reason)
+        self._model, self._net = None, self._build()
+        self._net.keep = [self.blob]
+
+    def _export(self, path: Path) -> None:
+        from netspec.engines.export import write_model
+
+        write_model(self._build(), path)
 
     def __call__(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return the blob (N, V D) float32, views in order, of images (H, W, 3) or (H, W), uint8, BGR, of any size."""
         views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
+        return self._values(self.scaling(np.stack(views)).astype(np.float32)).reshape(len(images), -1)
+
+    def _values(self, data: np.ndarray) -> np.ndarray:
+        if self._model is not None:
+            try:
+                return self._model.run({self.input: data})[self.blob]
+            except Unable as fault:
+                self._use_torch(str(fault))
+        import torch
+
+        assert self._net is not None
         with torch.no_grad():
-            self.net(**{self.input: self.scaling(np.stack(views))})
-        return self.net.blobs[self.blob].reshape(len(images), -1).cpu().numpy()
+            self._net(**{self.input: data})
+        return self._net.blobs[self.blob].cpu().numpy()
 
 
 def extract_images(describe: ImageNet, images: ImageList, progress: Progress = iter) -> dict[str, np.ndarray]:
@@ -112,9 +152,38 @@ def extract_images(describe: ImageNet, images: ImageList, progress: Progress = i
 
 def _shape_of(blob: str, net: NetParameter, source: SourceMap) -> Shape:
     """Return the shape of a blob of a net; data is opened, but no memory for blobs is used."""
+    if len(net.layer) == 1 and net.layer[0].type == "Input" and net.layer[0].input_param.shape:  # no need of torch
+        shapes: Any = net.layer[0].input_param.shape
+        return tuple(shapes[list(net.layer[0].top).index(blob) if len(shapes) > 1 else 0].dim)
+    import torch
+
+    from netspec.net.build import build_filtered
+    from netspec.net.options import BuildOptions
+
     built = build_filtered(net, source, BuildOptions(torch.device("meta"), seed=0))
     built.close()
     return built.shapes[blob]
+
+
+def _build(
+    net: NetParameter,
+    source: SourceMap,
+    weights: Sequence[str | Path],
+    device: torch.device | str,
+    exact: str,
+    strict: bool,
+    passes: Collection[str],
+) -> Net:
+    import torch
+
+    from netspec.net.build import build_filtered
+    from netspec.net.options import BuildOptions
+    from netspec.net.weights import load_weights
+
+    built = build_filtered(net, source, BuildOptions(torch.device(device), seed=0, exact=exact, passes=passes))
+    if weights:
+        load_weights(built, weights, strict, some=True)
+    return built
 
 
 def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Sequence[str]) -> None:
@@ -123,6 +192,8 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
     ``readers`` are the layers of that net that read the input. If the trained net lacks one of them (a Power layer in a
     deploy file, say), it is assumed to replace the transform_param. An HDF5 file contains no settings.
     """
+    import h5py
+
     if h5py.is_hdf5(weights):
         return
     trained = read_net_binary(weights).layer

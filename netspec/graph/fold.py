@@ -6,7 +6,7 @@ on, or hands its bottom on unchanged; netspec/net/fold.py asks the layers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from netspec.graph.plan import Plan
@@ -50,14 +50,14 @@ def origins(plan: Plan, passes_on: Sequence[bool]) -> tuple[int, ...]:
     return tuple(found)
 
 
-def find_chains(plan: Plan, roles: Roles) -> list[Chain]:
-    """Return the chains of a plan; no value within one is read by another layer or put out by the net."""
+def find_chains(plan: Plan, roles: Roles, kept: Collection[int] = ()) -> list[Chain]:
+    """Return the chains of a plan; no value within one is read by another layer, put out by the net, or ``kept``."""
     origin = origins(plan, roles.passes_on)
     readers: dict[int, list[int]] = {}
     for i, node in enumerate(plan.nodes):
         for v in node.bottoms if not roles.passes_on[i] else ():
             readers.setdefault(origin[v], []).append(i)
-    put_out = {origin[v] for v in plan.outputs.values()}
+    put_out = {origin[v] for v in (*plan.outputs.values(), *kept)}
 
     def follower(i: int) -> int | None:
         """Return the affine layer that alone reads the only top of layer ``i``."""

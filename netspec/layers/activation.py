@@ -7,21 +7,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
-from netspec.exact import libm
+from netspec.exact import ALL, libm
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
-from netspec.layers.base import Layer, Shape
+from netspec.layers.base import Finish, Kernel, Layer, Preparation, Shape, finished
+from netspec.layers.learned import values_of
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 
 
 class Activation(Layer):
     """Base of the layers whose top has its bottom's shape."""
+
+    fresh = True
+    any_layout = True
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -34,6 +40,12 @@ class Rounded(Activation):
     @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
+
+    in_place: ClassVar[Finish | None] = None  # torch's function that overwrites its argument, where there is one
+
+    @override
+    def finishing(self) -> Finish | None:
+        return None if self.context.exact == ALL else type(self).in_place
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom by torch's functions, whose gradients autograd knows."""
@@ -78,6 +90,10 @@ class ReLU(Activation):
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
     @override
+    def finishing(self) -> Finish:
+        return partial(F.leaky_relu_, negative_slope=self.slope) if self.slope else F.relu_
+
+    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope)
 
@@ -116,6 +132,13 @@ class PReLU(Activation):
         if self.is_exact(x):
             return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.context.accumulate_in_place).reshape(x.shape)
         return F.prelu(x, slopes.reshape(-1))
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        if self.context.exact == ALL:
+            return super().prepare(how)
+        slopes = values_of(self.blob(0)).clone().reshape(-1)
+        return finished(lambda x: torch.prelu(x, slopes), how.finish)
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
@@ -178,6 +201,7 @@ class Sigmoid(Rounded):
     """
 
     gradient_reads = frozenset({"top"})
+    in_place = torch.sigmoid_
 
     @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
@@ -210,6 +234,7 @@ class TanH(Rounded):
     """
 
     gradient_reads = frozenset({"top"})
+    in_place = torch.tanh_
 
     @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
@@ -266,6 +291,7 @@ class Power(Rounded):
     """
 
     gradient_reads = frozenset({"bottom", "top"})
+    fresh = False
 
     @override
     def setup(self) -> None:

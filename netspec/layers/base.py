@@ -10,6 +10,7 @@ database in a layer's constructor, before it logs the layer's bottoms and tops, 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ from netspec.errors import SpecError, Where
 from netspec.exact import SMALL, switch
 from netspec.graph import Report, raise_fault
 from netspec.layers import fillers
+from netspec.layers.learned import Learned, values_of
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TEST
 
@@ -41,15 +43,44 @@ Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (
 
 @dataclass(frozen=True)
 class Absorbed:
-    """A layer that also does what another did: its LayerParameter and its learned blobs, in double."""
+    """A layer that also does what another did: its LayerParameter and its learned blobs."""
 
     param: Any
     blobs: tuple[torch.Tensor, ...]
 
 
+Kernel = Callable[..., Any]  # bottoms to a top, or to a tuple of tops
+Finish = Callable[[torch.Tensor], torch.Tensor]  # returns its argument, changed in place
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What a layer may know when it prepares for many passes at its present shapes, without gradients.
+
+    ``finish`` is to be done in place to its top; its first bottom may be overwritten where ``reuse``. What it makes of
+    its blobs for all shapes it gets by ``memo(name, make)``, which makes it once; weights may be laid out for a kernel
+    where ``pack``.
+    """
+
+    finish: Finish | None = None
+    reuse: bool = False
+    memo: Callable[[str, Callable[[], Any]], Any] = lambda _, make: make()
+    pack: bool = True
+
+
 def rounded(value: float) -> float:
     """Return a number of a float32 field as it was written: the shortest that float32 rounds to it."""
     return float(str(np.float32(value)))
+
+
+def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
+    """Return a kernel of one top followed by what changes it in place."""
+
+    def both(*bottoms: torch.Tensor) -> torch.Tensor:
+        top = kernel(*bottoms)
+        return finish(top[0] if isinstance(top, tuple) else top)  # pyright: ignore[reportOptionalCall]
+
+    return kernel if finish is None else both
 
 
 def copy_of(param: Any) -> Any:
@@ -143,6 +174,11 @@ class Layer(torch.nn.Module):
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
     reads_data: ClassVar[bool] = False  # its tops are records; exported nets take them as inputs
     counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
+    fresh: ClassVar[bool] = False  # its one top is memory of its own, not a bottom's
+    any_layout: ClassVar[bool] = False  # its kernel takes bottoms whose channels lie side by side (channels_last)
+    remembers: ClassVar[bool] = False  # a pass changes more than its tops: it cannot be prepared
+    gathers: ClassVar[bool] = False  # in a test its top is not averaged over the batches: see ``score``
+    solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
     not_exported: ClassVar[str] = "its class does not define it"  # the reason, where it cannot be exported
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
@@ -181,6 +217,11 @@ class Layer(torch.nn.Module):
         """
         raise NotImplementedError
 
+    @property
+    def small(self) -> bool:
+        """Whether the layer is so small, at its present shapes, that Caffe's order of sums costs next to nothing."""
+        return False
+
     def is_exact(self, bottom: torch.Tensor, small: bool = False) -> bool:
         """Return whether to compute in Caffe's order: :func:`netspec.exact.switch.applies`, for one type of numbers."""
         applies = switch.applies(self.context.exact, bottom, small)
@@ -203,6 +244,13 @@ class Layer(torch.nn.Module):
             raise self.error(
                 f"found {', '.join(state)} to remember, expected {', '.join(self.running_state()) or 'nothing'}"
             )
+
+    def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
+        """Return what the tops of all batches of a test say together; for layers that gather.
+
+        ``solver`` is the SolverParameter, None where there is no solver.
+        """
+        raise NotImplementedError
 
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""
@@ -242,7 +290,7 @@ class Layer(torch.nn.Module):
         return False
 
     def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        """Return the layer that scales and shifts the channels of its top, axis 1, as well."""
+        """Return the layer that scales and shifts the channels of its top, axis 1, as well; in their precision."""
         raise NotImplementedError
 
     def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
@@ -251,7 +299,32 @@ class Layer(torch.nn.Module):
 
     def blob_in_double(self, index: int) -> torch.Tensor:
         """Return a copy of a learned blob in double precision, on the CPU."""
-        return self.blob(index).detach().cpu().double()
+        return values_of(self.blob(index)).cpu().double()
+
+    def blob_like(self, index: int, other: torch.Tensor) -> torch.Tensor:
+        """Return a learned blob with the precision of another tensor, on its device."""
+        return values_of(self.blob(index)).to(other)
+
+    def absorbing(self, absorbed: Absorbed) -> Layer:
+        """Return a copy of the layer with this LayerParameter and these blobs, at its present shapes."""
+        made = copy.copy(self)
+        made.param = absorbed.param
+        blobs = torch.nn.ParameterList([torch.nn.Parameter(blob, False) for blob in absorbed.blobs])
+        made._modules = {**self._modules, "blobs": blobs}
+        made.blob_shapes = [tuple(blob.shape) for blob in absorbed.blobs]
+        return made
+
+    def prepare(self, how: Preparation) -> Kernel:
+        """Return what computes ``forward`` for bottoms of the present shapes, without gradients, again and again.
+
+        Only this kernel uses the layer from now on, at these shapes. A layer that overrides this may keep its blobs in
+        another form, copied: whoever writes to them has it prepared anew. No kernel may keep an alias of them.
+        """
+        return finished(self.forward, how.finish)
+
+    def finishing(self) -> Finish | None:
+        """Return what computes the layer in place, where it maps number to number and there is such a function."""
+        return None
 
     def refusal(self, target: str, reason: str = "") -> SpecError:
         """Return the error of a layer that cannot be exported, with the reason."""
@@ -275,16 +348,17 @@ class Layer(torch.nn.Module):
 
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
         """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""
-        data = torch.full(self.possible(shape), value, device=self.context.device)
+        axes, device = self.possible(shape), self.context.device
+        data: torch.Tensor | None = None
         if filler is not None:
             try:
-                if data.is_meta:
-                    fillers.check(filler, tuple(shape))
+                if device.type == "meta":
+                    fillers.check(filler, axes)
                 else:
-                    data.copy_(fillers.fill(filler, tuple(shape), self.context.random.on("cpu")))
+                    data = fillers.fill(filler, axes, self.context.random.on("cpu")).to(device)
             except ValueError as fault:
                 self.context.report(self.error(str(fault), *self._path_to(filler)))
-        self.blobs.append(torch.nn.Parameter(data))
+        self.blobs.append(Learned(fillers.constant(axes, value, device) if data is None else data))
         self.blob_shapes.append(tuple(shape))
 
     def blob(self, index: int) -> torch.Tensor:

@@ -10,8 +10,9 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.products import ChosenRows, VectorProducts
-from netspec.layers.base import Absorbed, Layer, Shape, copy_of
+from netspec.exact.products import ChosenRows, VectorProducts, prepared_vectors
+from netspec.layers import fused
+from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TRAIN
@@ -57,10 +58,37 @@ class InnerProduct(Layer):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed = self.param.inner_product_param.transpose
-        if self.is_exact(data, small=weight.numel() <= SMALL_PRODUCT):
+        if self.is_exact(data, self.small):
             vectors, in_place = data.reshape(-1, self.inputs), self.context.accumulate_in_place
             return VectorProducts.apply(vectors, weight, bias, transposed, in_place).reshape(self.top_shapes[0])
         return F.linear(data.flatten(self.axis), weight.t() if transposed else weight, bias)
+
+    @property
+    @override
+    def small(self) -> bool:
+        return math.prod(self.blob_shapes[0]) <= SMALL_PRODUCT
+
+    fresh = True
+    any_layout = True
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+        transposed, top_shape = self.param.inner_product_param.transpose, self.top_shapes[0]
+        rows = math.prod(top_shape[:-1])
+        one_by_one = (rows, self.inputs)
+        if self.is_exact(weight, self.small):
+            multiply = finished(prepared_vectors(rows, weight, bias, transposed), how.finish)
+        else:
+            weight = weight.t() if transposed else weight
+            # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
+            if rows > 1 and how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:
+                multiply = fused.product(weight, bias, how)
+            else:
+                multiply = finished(lambda vectors: F.linear(vectors, weight, bias), how.finish)
+        if self.axis == 1:
+            return lambda data: multiply(data.reshape(one_by_one))
+        return lambda data: multiply(data.reshape(one_by_one)).view(top_shape)
 
     @override
     def multiply_adds(self) -> int:
@@ -86,10 +114,10 @@ class InnerProduct(Layer):
         param = copy_of(self.param)
         param.inner_product_param.bias_term = True
         outputs = param.inner_product_param.num_output
-        bias = self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros(outputs, dtype=torch.double)
+        bias = self.blob_like(1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
         factors = scale.expand(outputs)
         factors = factors if param.inner_product_param.transpose else factors[:, None]
-        return Absorbed(param, (self.blob_in_double(0) * factors, scale * bias + shift))
+        return Absorbed(param, (self.blob_like(0, scale) * factors, scale * bias + shift))
 
     @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:

@@ -10,10 +10,11 @@ import torch
 from torch.nn import functional as F
 from typing_extensions import override
 
-from netspec.exact import SMALL_ITEM, libm
+from netspec.exact import ALL, SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization, ChannelProducts, RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.base import Absorbed, Affine, Layer, Shape, copy_of, rounded
+from netspec.layers.base import Absorbed, Affine, Kernel, Layer, Preparation, Shape, copy_of, finished, rounded
+from netspec.layers.learned import values_of
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TEST
@@ -80,7 +81,7 @@ class BatchNorm(Layer):
     def _by_past(self, data: torch.Tensor) -> torch.Tensor:
         mean, variance = self.past()
         eps = self.param.batch_norm_param.eps
-        if self._is_exact(data):
+        if self.is_exact(data, self.small):
             return (data - _along(mean, 1, data)) / _along(libm.sqrt(variance + eps), 1, data)
         if _far_from_zero(mean, variance, eps):
             data, mean = data - _along(mean, 1, data), torch.zeros_like(mean)
@@ -90,7 +91,7 @@ class BatchNorm(Layer):
         eps, keep = self.param.batch_norm_param.eps, self.param.batch_norm_param.moving_average_fraction
         values = data.numel() // self.channels
         unbiased = 1.0
-        if self._is_exact(data):
+        if self.is_exact(data, self.small):
             top, mean, variance = BatchNormalization.apply(data.reshape(*data.shape[:2], -1), eps)
             top = top.reshape(data.shape)
             unbiased = values / (values - 1) if values > 1 else 1.0
@@ -107,8 +108,31 @@ class BatchNorm(Layer):
             self.blob(2).mul_(keep).add_(1)
         return top
 
-    def _is_exact(self, data: torch.Tensor) -> bool:
-        return self.is_exact(data, small=math.prod(data.shape[1:]) <= SMALL_ITEM)
+    @property
+    @override
+    def small(self) -> bool:
+        return math.prod(self.bottom_shapes[0][1:]) <= SMALL_ITEM
+
+    fresh = True
+    any_layout = True
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        if not self.use_global_stats:
+            return super().prepare(how)
+        eps, axes = self.param.batch_norm_param.eps, (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
+        mean, variance = self.past()
+        if self.is_exact(mean, self.small):
+            by_channel, deviation = mean.view(axes), libm.sqrt(variance + eps).view(axes)
+            return finished(lambda data: (data - by_channel).div_(deviation), how.finish)
+        far, by_channel, cudnn = _far_from_zero(mean, variance, eps), mean.view(axes), torch.backends.cudnn.enabled
+        mean = torch.zeros_like(mean) if far else mean
+
+        def kernel(data: torch.Tensor) -> torch.Tensor:
+            data = data - by_channel if far else data
+            return torch.batch_norm(data, None, None, mean, variance, False, 0.0, eps, cudnn)
+
+        return finished(kernel, how.finish)
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
@@ -290,7 +314,7 @@ class Scale(_Affine):
         scale = self.blob(0) if factors is None else factors
         bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
         by_channel = self.axis == 1 and scale.dim() == 1
-        if self.is_exact(data, small=by_channel and math.prod(data.shape[1:]) <= SMALL_ITEM):
+        if self.is_exact(data, self.small):
             return self.apply_exactly(data, scale, bias, self.axis)
         if by_channel:
             # By channel: batch normalization with mean 0 and variance 1 is this, three times as fast, backward too.
@@ -305,6 +329,33 @@ class Scale(_Affine):
         if not self.param.scale_param.bias_term:
             return top
         return graph.node("Add", top, self.onnx_operand(graph, bottoms[:1], len(self.blobs) - 1, self.axis))
+
+    @property
+    @override
+    def small(self) -> bool:
+        shape, axes = self.bottom_shapes[0], len((*self.bottom_shapes[1:], *self.blob_shapes)[0])
+        return self.axis == 1 and axes == 1 and math.prod(shape[1:]) <= SMALL_ITEM
+
+    fresh = True
+    any_layout = True
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        if not self._by_channel:
+            return super().prepare(how)
+        scale, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+        axes = (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
+        if self.is_exact(scale, self.small):
+            factors, shift = (
+                values_of(scale).clone().view(axes),
+                None if bias is None else values_of(bias).clone().view(axes),
+            )
+            if shift is None:
+                return finished(lambda data: data * factors, how.finish)
+            return finished(lambda data: (data * factors).add_(shift), how.finish)
+        zero, one, cudnn = torch.zeros_like(scale), torch.ones_like(scale), torch.backends.cudnn.enabled
+        kernel = lambda data: torch.batch_norm(data, scale, bias, zero, one, False, 0.0, 0.0, cudnn)  # noqa: E731
+        return finished(kernel, how.finish)
 
     @property
     def _by_channel(self) -> bool:
@@ -328,7 +379,8 @@ class Scale(_Affine):
         assert own is not None
         param = copy_of(self.param)
         param.scale_param.bias_term = True
-        return Absorbed(param, (own[0] * scale, own[0] * shift + own[1]))
+        factor, offset = (values.to(scale) for values in own)
+        return Absorbed(param, (factor * scale, factor * shift + offset))
 
     @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
@@ -431,6 +483,37 @@ class LRN(Layer):
         else:
             base = 1 + param.alpha * F.avg_pool2d(squares, size, stride=1, padding=reach)
         return data * base.pow(-param.beta)
+
+    fresh = True
+    any_layout = True
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        param, shape = self.param.lrn_param, self.bottom_shapes[0]
+        if param.norm_region != ACROSS_CHANNELS or self.context.exact == ALL:
+            return super().prepare(how)
+        size, channels, reach = param.local_size, shape[1], param.local_size // 2
+        frames: dict[bool, torch.Tensor] = {}
+
+        def kernel(data: torch.Tensor) -> torch.Tensor:
+            side_by_side = not data.is_contiguous()
+            if side_by_side not in frames:
+                layout = torch.channels_last if side_by_side else torch.contiguous_format
+                with torch.inference_mode(False):
+                    frame = data.new_zeros(shape[0], channels + 2 * reach, *shape[2:])
+                    frames[side_by_side] = frame.contiguous(memory_format=layout)
+            frame = frames[side_by_side]
+            torch.mul(data, data, out=frame[:, reach : reach + channels])
+            total = frame[:, :channels] + frame[:, 1 : 1 + channels] if size > 1 else frame.clone()
+            for shift in range(2, size):
+                total += frame[:, shift : shift + channels]
+            base = total.mul_(param.alpha / size).add_(param.k)
+            if param.beta == 0.75:
+                root = base.rsqrt_()  # x ** -0.75 = r sqrt(r), for r = 1 / sqrt(x), five times as fast as a power
+                return root.mul_(root.sqrt()).mul_(data)
+            return base.pow_(-param.beta).mul_(data)
+
+        return finished(kernel, how.finish)
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:

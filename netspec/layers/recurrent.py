@@ -82,6 +82,7 @@ class Recurrent(Layer):
     state_names: ClassVar[tuple[str, ...]]
     torch_function: Callable[..., Any]
     blob_names: ClassVar[tuple[str, ...]]
+    remembers = True
     gates: ClassVar[int] = 1  # how many numbers a hidden unit takes in
 
     @override

@@ -6,7 +6,7 @@ Caffe: Net::Init (src/caffe/net.cpp)
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import torch
@@ -16,6 +16,7 @@ from netspec.exact import SMALL
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
+from netspec.graph.steps import PASSES
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.weights import copy_weights, load_weights
@@ -36,16 +37,20 @@ def load_net(
     exact: str = SMALL,
     strict: bool = False,
     write_files: bool = True,
+    passes: Collection[str] = PASSES,
 ) -> Net:
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
 
     A warning names the layers that the weights lack; with ``strict`` that is an error.
+    ``passes`` are what may speed up a net of phase TEST that runs without gradients (netspec/graph/steps.py).
     ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
     Without ``write_files`` no layer writes one. Raises SpecError for every fault of the files.
     """
     net, source = parse_net(path)
     number = PHASES[phase] if isinstance(phase, str) else PhaseValue(phase)
-    options = BuildOptions(torch.device(device), seed, allow_python=allow_python, exact=exact, write_files=write_files)
+    options = BuildOptions(
+        torch.device(device), seed, allow_python=allow_python, exact=exact, write_files=write_files, passes=passes
+    )
     built = build_net(with_state(net, number, level, stages), source, options)
     if weights is not None:
         load_weights(built, weights, strict)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import torch
 
 from netspec.graph.fold import Chain, Roles, find_chains
-from netspec.layers.base import Absorbed, Affine
-from netspec.net.net import Net
+from netspec.graph.plan import Plan
+from netspec.layers.base import Absorbed, Affine, Layer
 
 
 @dataclass(frozen=True)
@@ -26,27 +26,33 @@ class Fold:
     absorbed: Absorbed
 
 
-def roles_of(net: Net) -> Roles:
-    """Return what each layer of a net is for folding."""
-    one_to_one = [len(node.bottoms) == 1 and len(node.tops) == 1 for node in net.plan.nodes]
-    affine = [one and layer.as_affine() is not None for one, layer in zip(one_to_one, net.layers, strict=True)]
+def roles_of(plan: Plan, layers: Sequence[Layer]) -> Roles:
+    """Return what each layer of a plan is for folding."""
+    one_to_one = [len(node.bottoms) == 1 and len(node.tops) == 1 for node in plan.nodes]
+    affine = [one and layer.as_affine() is not None for one, layer in zip(one_to_one, layers, strict=True)]
     return Roles(
-        absorbs=[len(node.tops) == 1 and layer.absorbs for node, layer in zip(net.plan.nodes, net.layers, strict=True)],
+        absorbs=[len(node.tops) == 1 and layer.absorbs for node, layer in zip(plan.nodes, layers, strict=True)],
         affine=affine,
-        absorbs_before=[one and layer.absorbs_before for one, layer in zip(affine, net.layers, strict=True)],
-        passes_on=[layer.passes_on for layer in net.layers],
+        absorbs_before=[one and layer.absorbs_before for one, layer in zip(affine, layers, strict=True)],
+        passes_on=[layer.passes_on for layer in layers],
     )
 
 
-def find_folds(net: Net) -> list[Fold]:
-    """Return all that can be folded in a net, with its weights as they are; the net is not changed."""
-    folds = []
-    for chain in find_chains(net.plan, roles_of(net)):
-        keeper = net.layers[chain.keeper]
-        scale, shift = composed([net.layers[i].as_affine() for i in chain.folded])
-        absorb = keeper.absorb if chain.keeper < chain.folded[0] else keeper.absorb_before
-        folds.append(Fold(chain, absorb(scale, shift)))
-    return folds
+def find_folds(plan: Plan, layers: Sequence[Layer]) -> list[Fold]:
+    """Return all that can be folded, with the weights as they are; the layers are not changed."""
+    return [Fold(chain, absorbed_by(chain, layers)) for chain in find_chains(plan, roles_of(plan, layers))]
+
+
+def absorbed_by(chain: Chain, layers: Sequence[Layer], like: torch.Tensor | None = None) -> Absorbed:
+    """Return what a chain's keeper has to be to do the work of all, in double or in the precision of ``like``.
+
+    What scales and shifts is composed in double in any case.
+    """
+    keeper = layers[chain.keeper]
+    scale, shift = composed([layers[i].as_affine() for i in chain.folded])
+    if like is not None:
+        scale, shift = scale.to(like), shift.to(like)
+    return (keeper.absorb if chain.keeper < chain.folded[0] else keeper.absorb_before)(scale, shift)
 
 
 def composed(maps: Sequence[Affine | None]) -> Affine:

@@ -19,7 +19,7 @@ from typing_extensions import override
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.exact.sums import RowSums
-from netspec.exact.switch import applies
+from netspec.exact.switch import applies, is_recorded
 from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, unknown_type
@@ -27,8 +27,9 @@ from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
 from netspec.net.options import BuildOptions
+from netspec.net.programs import Programs
 from netspec.net.table import table
-from netspec.proto.schema import PHASE_NAMES, NetParameter
+from netspec.proto.schema import PHASE_NAMES, TEST, NetParameter
 
 Array = np.ndarray | torch.Tensor
 
@@ -63,8 +64,9 @@ class Net(torch.nn.Module):
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
         self.device = options.device
-        self._exact = options.exact
+        self.exact = options.exact
         self.keep: str | Iterable[str] = ()
+        self._kept_of: dict[str | tuple[str, ...], frozenset[int]] = {}  # by ``keep``, as it was last
         self.blobs: dict[str, torch.Tensor] = {}
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
@@ -78,6 +80,15 @@ class Net(torch.nn.Module):
         ]
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
+        self._given = [
+            v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
+        ]
+        self.programs = Programs(self, options.passes) if self.phase == TEST and options.passes else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without what was prepared from it."""
+        prepared = self.programs and Programs(self, self.programs.passes)
+        return {**super().__getstate__(), "programs": prepared}
 
     # Building
 
@@ -221,6 +232,8 @@ class Net(torch.nn.Module):
             known = ", ".join(self.inputs) or "none (it reads its own data)"
             raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
         kept = self._kept()
+        if self.programs and not torch.is_grad_enabled() and not is_recorded():
+            return self._run_prepared(self.programs, inputs, kept)
         values: dict[int, torch.Tensor] = {}
         memories: dict[int, Memory] = {}
         loss: torch.Tensor | None = None
@@ -239,6 +252,16 @@ class Net(torch.nn.Module):
                 if v not in kept:
                     del values[v]
         self.blobs = {self.plan.blobs[v]: values[v] for v in sorted(kept)}
+        outputs = {name: values[v] for name, v in self.plan.outputs.items()}
+        return (torch.zeros((), device=self.device) if loss is None else loss), outputs
+
+    def _run_prepared(
+        self, programs: Programs, inputs: Mapping[str, Array], kept: frozenset[int]
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        given = {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
+        loss, values = programs.run(given, kept)
+        blobs = self.plan.blobs
+        self.__dict__["blobs"] = {blobs[v]: values[v] for v in sorted(kept)}  # a module's own way of setting is slow
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
@@ -262,7 +285,7 @@ class Net(torch.nn.Module):
 
     def weighted_sum(self, top: torch.Tensor, weight: float) -> torch.Tensor:
         """Return the contribution of a top to the net's loss (Caffe: Layer::Forward)."""
-        if top.numel() > 1 and applies(self._exact, top):
+        if top.numel() > 1 and applies(self.exact, top):
             return RowSums.apply(top.reshape(1, -1), weight)[0]
         return top.sum() if weight == 1 else top.sum() * weight
 
@@ -272,13 +295,14 @@ class Net(torch.nn.Module):
         dtype = self.learnable[0].parameter.dtype if self.learnable else torch.float32
         return torch.as_tensor(np.asarray(value)).to(self.device, dtype)
 
-    def _kept(self) -> set[int]:
-        current = {name: v for v, name in enumerate(self.plan.blobs)}
-        if self.keep == "all":
-            return set(current.values())
-        names = [self.keep] if isinstance(self.keep, str) else list(self.keep)
-        check_blobs(names, current, self.plan.source.file)
-        return set(self.plan.outputs.values()) | {current[name] for name in names}
+    def _kept(self) -> frozenset[int]:
+        asked = self.keep if isinstance(self.keep, str) else tuple(self.keep)
+        if asked not in self._kept_of:
+            current = {name: v for v, name in enumerate(self.plan.blobs)}
+            names = list(current) if asked == "all" else [asked] if isinstance(asked, str) else asked
+            check_blobs(names, current, self.plan.source.file)
+            self._kept_of = {asked: frozenset((*self.plan.outputs.values(), *(current[name] for name in names)))}
+        return self._kept_of[asked]
 
     # Parameters and data
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import torch
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.exact import SMALL, check_choice
 from netspec.graph import Report, raise_fault
+from netspec.graph.steps import PASSES
 from netspec.layers.base import Shape
 from netspec.proto.schema import NetParameter
 
@@ -27,6 +28,7 @@ class BuildOptions:
     ``exact`` sets which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
     ``accumulate_in_place`` makes layers add the gradients that they sum up to ``grad`` themselves, like Caffe;
     hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see these gradients.
+    ``passes`` are those of netspec/graph/steps.py that a net of phase TEST may use when it runs without gradients.
     """
 
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
@@ -41,6 +43,7 @@ class BuildOptions:
     ranks: int = 1
     exact: str = SMALL
     accumulate_in_place: bool = False
+    passes: Collection[str] = PASSES
 
     def __post_init__(self) -> None:
         check_choice(self.exact)

@@ -6,6 +6,7 @@ Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -86,7 +87,9 @@ def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
         for layer, j, values in copies if not faults else ():
             blob = layer.blob(j)
             if not blob.is_meta:
-                blob.copy_(torch.tensor(values).view(blob.shape))
+                with warnings.catch_warnings():  # values may lie in read-only memory: they are only read
+                    warnings.simplefilter("ignore", UserWarning)
+                    blob.copy_(torch.from_numpy(np.ascontiguousarray(values)).view(blob.shape))
     return {id(layer.blobs[j]) for layer, j, _ in copies}
 
 

@@ -344,7 +344,7 @@ class _Reader:
         error = self._error(fault + (elsewhere or hint), token)
         if elsewhere or self.lexer.suspicion(token.start):
             return error
-        return ForkFault(error.message, error.where, "field", name, dialects)
+        return ForkFault(error.message, error.where, "field", name, dialects, descriptor.name)
 
     def _elsewhere(self, message: Message, name: str) -> str:
         """Return the sentence that a field belongs into another message or file; or an empty string."""

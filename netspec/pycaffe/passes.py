@@ -65,6 +65,9 @@ class Passes:
         self._records = [self._is_recorded(i) for i in range(len(self._layers))]
         for i in range(len(self._layers)):
             self._set_up(i)
+        self._prepares = self._can_prepare()
+        self._given, self._results = self._ends()
+        self._final_values = frozenset(v for v, *_ in (*self._given, *self._results))
 
     # Building
 
@@ -103,6 +106,21 @@ class Passes:
         for top, weight in self._losses[i]:
             top.diff_memory.put(torch.full(top.shape, weight, device=self.net.device))
 
+    def _ends(self) -> tuple[list[tuple[int, int]], list[tuple[int, Blob, bool, bool]]]:
+        """Return the inputs, each a value and its blob; and the last value of every other blob.
+
+        With each of these: whether it lies where another blob does, and whether it is in memory of its own.
+        """
+        given: list[tuple[int, int]] = []
+        results: dict[int, tuple[int, Blob, bool, bool]] = {}
+        for node, layer, ids in zip(self.net.plan.nodes, self._layers, self.top_ids, strict=True):
+            for v, b in zip(node.tops, ids, strict=False):
+                if layer.is_input:
+                    given.append((v, b))
+                else:
+                    results[b] = v, self.blobs[b], "data" in layer.shares, layer.fresh
+        return given, list(results.values())
+
     def _is_recorded(self, i: int) -> bool:
         """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
         layer, plan = self._layers[i], self.net.backward_plan
@@ -116,6 +134,8 @@ class Passes:
     def forward(self, start: int, end: int) -> torch.Tensor:
         """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses, a scalar."""
         self.upload()
+        if self._prepares and (start, end) == (0, len(self._layers) - 1) and not self._has_hooks():
+            return self._forward_prepared()
         loss: torch.Tensor | None = None
         before, after = self.hooks["before_forward"], self.hooks["after_forward"]
         for i in range(start, end + 1):
@@ -127,6 +147,48 @@ class Passes:
                 loss = term if loss is None else loss + term
             for hook in after:
                 hook(i)
+        return torch.zeros((), device=self.net.device) if loss is None else loss
+
+    def _has_hooks(self) -> bool:
+        return bool(self.hooks["before_forward"] or self.hooks["after_forward"])
+
+    def _can_prepare(self) -> bool:
+        """Return whether a whole pass may run as netspec's own: only its results matter, blob by blob."""
+        return (
+            self.net.programs is not None
+            and self.net.device.type == "cpu"
+            and not any(self._records)
+            and not any(isinstance(layer, Python) or layer.filled_once() for layer in self._layers)
+            and AUTOMATIC not in self.names
+            and not self._overwrites_shared()
+        )
+
+    def _overwrites_shared(self) -> bool:
+        """Return whether a layer works in place on memory that is already another blob's too."""
+        sharing: dict[int, set[int]] = {}
+        for node, tops in zip(self.net.plan.nodes, self.tops, strict=True):
+            for top, in_place in zip(tops, node.in_place, strict=False):
+                blobs = sharing.setdefault(id(top.data_memory), set())
+                blobs.add(id(top))
+                if in_place and len(blobs) > 1:
+                    return True
+        return False
+
+    def _forward_prepared(self) -> torch.Tensor:
+        """Run the whole net as netspec does (netspec/net/programs.py), and put what it computes where views look."""
+        assert self.net.programs is not None
+        given = {v: self.blobs[b].data_memory.tensor(self.blobs[b].shape) for v, b in self._given}
+        loss, values = self.net.programs.run(given, self._final_values)
+        taken = _storages(list(given.values()))
+        for v, blob, shares, fresh in self._results:
+            tensor = values[v]
+            if shares:
+                if tensor.shape != blob.shape:
+                    blob.reshape(*tensor.shape)
+                continue
+            blob.put_data(tensor if fresh else _apart(tensor, taken))
+            if not fresh:
+                taken |= _storages([tensor])
         return torch.zeros((), device=self.net.device) if loss is None else loss
 
     @torch.no_grad()

@@ -1,7 +1,8 @@
 """Puts a ``caffe`` package and Caffe's commands into the current Python environment, and takes them away again.
 
 The package is a few lines that hand over to netspec.pycaffe, the commands are those of netspec and lmdb_build under
-Caffe's names. Every file that is written begins with a mark; nothing else is ever removed.
+Caffe's names. Shell scripts call the commands in a folder that Caffe is built in (``build/tools/caffe``): such a folder
+can be made too. Every file that is written begins with a mark; nothing else is ever removed.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import shutil
 import sys
 import sysconfig
+from contextlib import suppress
 from pathlib import Path
 
 from netspec.errors import SpecError
@@ -35,6 +37,10 @@ _COMMANDS: dict[str, tuple[str, list[str]]] = {
     "upgrade_net_proto_binary": (_NETSPEC, ["upgrade_net_proto_binary"]),
     "upgrade_solver_proto_text": (_NETSPEC, ["upgrade_solver_proto_text"]),
 }
+_EXAMPLES: dict[str, tuple[str, list[str]]] = {  # in the build folder only
+    "examples/mnist/convert_mnist_data": (_BUILD, ["mnist"]),
+    "examples/cifar10/convert_cifar_data": (_BUILD, ["cifar"]),
+}
 _ASIDE = ".before-netspec"  # what a file in the way is called meanwhile
 
 
@@ -44,7 +50,7 @@ def install_caffe(replace: bool = False) -> list[Path]:
     Raises SpecError where a real Caffe or a command of one of these names is there, unless ``replace``, and OSError
     where the environment cannot be written to.
     """
-    paths = {_package(): _PACKAGE} | {_scripts() / name: _command(name) for name in _COMMANDS}
+    paths = {_package(): _PACKAGE} | {_scripts() / name: _command(*command) for name, command in _COMMANDS.items()}
     in_the_way = [str(path) for path in paths if path.exists() and not _is_ours(path)]
     real = real_caffe()
     if real and real not in in_the_way:
@@ -81,6 +87,40 @@ def remove_caffe() -> list[Path]:
     return removed
 
 
+def make_build_folder(folder: Path) -> list[Path]:
+    """Write the commands where Caffe's build has them: ``tools/caffe``, ``tools/caffe.bin``, ...; return the paths.
+
+    Raises SpecError where there is another file of one of these names, and OSError where the folder cannot be written
+    to.
+    """
+    paths = _build_paths(folder)
+    there = [str(path) for path in paths if path.exists() and not _is_ours(path)]
+    if there:
+        raise SpecError(f"{', '.join(there)}: is there already and not netspec's; name another folder")
+    for path, (module, words) in paths.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(_command(module, words), "utf-8")
+        path.chmod(0o755)
+    return list(paths)
+
+
+def remove_build_folder(folder: Path) -> list[Path]:
+    """Take away what :func:`make_build_folder` wrote, and the folders that are empty then; return what was taken."""
+    removed = [path for path in _build_paths(folder) if _is_ours(path)]
+    for path in removed:
+        path.unlink()
+    parents = {parent for path in removed for parent in path.parents if parent.is_relative_to(folder)}
+    for parent in sorted(parents, reverse=True):  # the innermost first
+        with suppress(OSError):  # it is not empty
+            parent.rmdir()
+    return removed
+
+
+def _build_paths(folder: Path) -> dict[Path, tuple[str, list[str]]]:
+    commands = {f"tools/{name}": command for name, command in _COMMANDS.items()} | _EXAMPLES
+    return {folder / f"{name}{end}": command for name, command in commands.items() for end in ("", ".bin")}
+
+
 def _package() -> Path:
     return Path(sysconfig.get_path("purelib")) / NAME / "__init__.py"
 
@@ -89,8 +129,7 @@ def _scripts() -> Path:
     return Path(sysconfig.get_path("scripts"))
 
 
-def _command(name: str) -> str:
-    module, words = _COMMANDS[name]
+def _command(module: str, words: list[str]) -> str:
     return f"""#!{sys.executable}
 {MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
 import sys

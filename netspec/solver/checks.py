@@ -37,11 +37,11 @@ def check_settings(param: Any, node: Place, report: Report = raise_fault) -> Non
         report(SpecError("snapshot is given but snapshot_prefix is not", node.find("snapshot")))
 
 
-def fields_without_effect(param: Any, node: Place) -> Iterator[str]:
-    """Yield a line for each field of a fork that is given: dialects bring such fields, but no solver reads them."""
+def fields_without_effect(param: Any, node: Place, read: frozenset[str] = frozenset()) -> Iterator[str]:
+    """Yield a line for each field of a fork that is given: the layers of the test nets read only ``read`` of them."""
     for name, field in added_fields.get(param.DESCRIPTOR.full_name, {}).items():
-        if field.present(param):
-            yield f"{node.find(name)}: {name} has no effect: it is a fork's, and no solver here reads it"
+        if field.present(param) and name not in read:
+            yield f"{node.find(name)}: {name} has no effect: it is a fork's, and nothing in these nets reads it"
 
 
 def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_it: bool = True) -> None:

@@ -47,7 +47,7 @@ from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
-from netspec.solver.tally import Outputs, Tally, as_scores, score_lines
+from netspec.solver.tally import Outputs, Tally, as_scores, score_lines, scorers
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
@@ -163,8 +163,6 @@ class Solver:
         node = node or Place(Where("<solver>"))
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         check_settings(param, node)
-        for line in fields_without_effect(param, node):
-            log.warning("solver.cpp:45", line)
         if param.snapshot:
             check_prefix(param, node)
         self.param = param
@@ -209,6 +207,9 @@ class Solver:
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
             self.test_nets.append(self._build(test, test.label, self._device))
         self._check_size()
+        read = frozenset[str]().union(*(layer.solver_reads for net in self.test_nets for layer in net.layers))
+        for line in fields_without_effect(param, node, read):
+            log.warning("solver.cpp:45", line)
         log.info("solver.cpp:57", "Solver scaffolding done.")
         self.history = [
             torch.zeros_like(learnable.parameter.detach())
@@ -230,6 +231,7 @@ class Solver:
             ranks=ranks,
             exact=self._exact,
             accumulate_in_place=True,
+            passes=(),
         )
         net = build_net(described.net, described.source, options)
         files = [path.strip() for paths in self.param.weights for path in paths.split(",")]
@@ -433,7 +435,7 @@ class Solver:
         net, batches = self.test_nets[i], self.param.test_iter[i]
         net.share_weights_with(self.net)
         net.random.begin(f"test at iteration {self.iteration}")
-        tally = Tally()
+        tally = Tally(scorers(net, self.param))
         for _ in range(batches):
             while request := self.action():
                 if request == "snapshot":

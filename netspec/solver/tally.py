@@ -5,28 +5,46 @@ Caffe: Solver::Test (src/caffe/solver.cpp), test() (tools/caffe.cpp)
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import torch
 
 from netspec.log import number
+from netspec.net.net import Net
 
 Outputs = dict[str, list[float]]
+Scorer = Callable[[Sequence[torch.Tensor]], list[float]]
+
+
+def scorers(net: Net, solver: Any = None) -> dict[str, Scorer]:
+    """Return, by output, how its score follows from all batches, for those whose layers gather (layers/base.py)."""
+    makers = {v: layer for node, layer in zip(net.plan.nodes, net.layers, strict=True) for v in node.tops}
+    outputs = net.plan.outputs.items()
+    return {name: partial(makers[v].score, solver=solver) for name, v in outputs if v in makers and makers[v].gathers}
 
 
 class Tally:
-    """Sums up the losses and outputs of batches; ``loss`` and ``scores`` are their means so far."""
+    """Sums up the losses and outputs of batches; ``loss`` and ``scores`` are their means so far.
 
-    def __init__(self) -> None:
+    Outputs in ``scorers`` are kept instead, and scored together.
+    """
+
+    def __init__(self, scorers: Mapping[str, Scorer] | None = None) -> None:
         self.batches = 0
         self._loss = 0.0
         self._sums: Outputs = {}
+        self._scorers = dict(scorers or {})
+        self._gathered: dict[str, list[torch.Tensor]] = {name: [] for name in self._scorers}
 
     def add(self, loss: torch.Tensor, outputs: Mapping[str, torch.Tensor]) -> Outputs:
         """Add what ``Net.forward_loss`` returned for a batch; return the batch's own scores."""
         self.batches += 1
         self._loss += loss.item()
-        batch = as_scores(outputs)
+        for name, gathered in self._gathered.items():
+            gathered.append(outputs[name].detach())
+        batch = as_scores({name: blob for name, blob in outputs.items() if name not in self._scorers})
         for name, values in batch.items():
             sums = self._sums.setdefault(name, [0.0] * len(values))
             self._sums[name] = [a + b for a, b in zip(sums, values, strict=True)]
@@ -39,8 +57,9 @@ class Tally:
 
     @property
     def scores(self) -> Outputs:
-        """The mean of each element of each output blob."""
-        return {name: [value / self.batches for value in values] for name, values in self._sums.items()}
+        """The mean of each element of each output blob, then the scores of those that are gathered."""
+        means = {name: [value / self.batches for value in values] for name, values in self._sums.items()}
+        return means | {name: score(self._gathered[name]) for name, score in self._scorers.items()}
 
 
 def as_scores(outputs: Mapping[str, torch.Tensor]) -> Outputs:

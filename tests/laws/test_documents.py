@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+import benchmarks.cli
 import lmdb_build.cli
 import loopclosure.cli
 import netspec
@@ -16,7 +17,12 @@ from netspec.cli import run_script
 from paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("*/README.md")), *sorted((ROOT / "docs").glob("*.md"))]
-PARSERS = {"netspec": netspec.cli.parser, "lmdb-build": lmdb_build.cli.parser, "loopclosure": loopclosure.cli.parser}
+PARSERS = {
+    "netspec": netspec.cli.parser,
+    "lmdb-build": lmdb_build.cli.parser,
+    "loopclosure": loopclosure.cli.parser,
+    "benchmarks": benchmarks.cli.parser,
+}
 OTHERS = {"source", "cd", "pip"}  # programs that are not ours
 BLOCKS = {
     (f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, found.start()) + 2}", found[1]): found[2]

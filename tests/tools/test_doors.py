@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 DOORS = sorted(
     path.name
     for path in (ROOT / "tools").iterdir()
-    if path.is_file() and "python" in path.read_text().partition("\n")[0] and not path.name.startswith("benchmark_")
+    if path.is_file() and "python" in path.read_text().partition("\n")[0]
 )
 
 
@@ -33,7 +33,7 @@ def project(tmp_path: Path) -> Path:
     """The scripts and the packages in a folder without ``.venv``."""
     folder = tmp_path / "project"
     shutil.copytree(ROOT / "tools", folder / "tools")
-    for package in ("netspec", "loopclosure", "lmdb_build"):
+    for package in ("netspec", "loopclosure", "lmdb_build", "benchmarks"):
         (folder / package).symlink_to(ROOT / package)
     return folder
 

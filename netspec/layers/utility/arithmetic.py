@@ -12,7 +12,7 @@ from typing_extensions import override
 from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
 from netspec.exact.sums import Product, RowMagnitudes, RowSquares, RowSums
-from netspec.layers.base import Layer, Shape
+from netspec.layers.base import Kernel, Layer, Preparation, Shape, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 
@@ -75,6 +75,15 @@ class Eltwise(Layer):
         for x in others:
             top = top + x if self.operation == self.SUM else top * x
         return top
+
+    fresh = True
+    any_layout = True
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        if self.operation != self.SUM or self.coeff != [1.0, 1.0]:
+            return super().prepare(how)
+        return finished(torch.Tensor.add_ if how.reuse else torch.add, how.finish)
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
@@ -247,6 +256,8 @@ class Softmax(Layer):
     """
 
     gradient_reads = frozenset({"top"})
+    fresh = True
+    any_layout = True
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:

@@ -139,6 +139,13 @@ class Concat(Layer):
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
 
+    any_layout = True
+
+    @property
+    def fresh(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the top is memory of its own."""
+        return len(self.bottom_shapes) > 1
+
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Concat", *bottoms, axis=self.axis)
@@ -190,6 +197,8 @@ class Slice(Layer):
     @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return x.split(self.sizes, self.axis)
+
+    any_layout = True
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:

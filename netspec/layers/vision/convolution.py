@@ -12,8 +12,9 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.products import ColumnProducts, Columns, Filter, SpreadProducts
-from netspec.layers.base import Absorbed, Layer, Shape, copy_of
+from netspec.exact.products import ColumnProducts, Columns, Filter, SpreadProducts, prepared_columns
+from netspec.layers import fused
+from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 
@@ -216,11 +217,38 @@ class Convolution(_SlidingFilter):
         if any(overhang):
             maps = F.pad(maps, overhang)
         stride, pad, dilation = geometry
-        work = math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * weight.numel()
-        if self.is_exact(maps, small=axes == 2 and self.group == 1 and work <= SMALL_PRODUCT):
+        if self.is_exact(maps, self.small):
             sliding, in_place = Filter(weight.shape[2:], *geometry), self.context.accumulate_in_place
             return ColumnProducts.apply(maps, weight, bias, sliding, self.group, in_place)
         return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
+
+    @property
+    @override
+    def small(self) -> bool:
+        return self.spatial_axes == 2 and self.group == 1 and self._work <= SMALL_PRODUCT
+
+    @property
+    def _work(self) -> int:
+        """The multiply-adds for one image, bias aside."""
+        return math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * math.prod(self.blob_shapes[0])
+
+    fresh = True
+    any_layout = True
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(self.bottom_shapes[0]))
+        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+        exact = self.is_exact(weight, self.small)
+        if not usual or len(self.bottom_shapes) > 1 or (exact and self.group > 1):
+            return super().prepare(how)
+        if exact:
+            sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
+            return finished(prepared_columns(self.bottom_shapes[0], weight, bias, sliding), how.finish)
+        geometry = (self.stride, self.pad, self.dilation, self.group)
+        if self.bottom_shapes[0][0] * self._work > SMALL_PRODUCT and how.pack and fused.suits(weight):
+            return fused.convolution(weight, bias, *geometry, how)
+        return finished(lambda maps: torch.conv2d(maps, weight, bias, *geometry), how.finish)
 
     @override
     def multiply_adds(self) -> int:
@@ -268,12 +296,12 @@ class Convolution(_SlidingFilter):
     def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         param = copy_of(self.param)
         param.convolution_param.bias_term = True
-        bias = self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros(self.num_output, dtype=torch.double)
+        bias = self.blob_like(1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
         return Absorbed(param, (self.scaled_filters(scale.expand(self.num_output)), scale * bias + shift))
 
     def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
-        """Return blobs[0], in double, with the filters of each output channel multiplied by a number of their own."""
-        filters = self.blob_in_double(0)
+        """Return blobs[0] with the filters of each output channel multiplied by a number of their own."""
+        filters = self.blob_like(0, scale)
         return filters * scale.reshape(-1, *(1,) * (filters.dim() - 1))
 
     torch_module: ClassVar[str] = "Conv"
@@ -332,6 +360,15 @@ class Deconvolution(Convolution):
         pixels = math.prod(self.bottom_shapes[0]) // self.channels
         return len(self.bottom_shapes) * pixels * math.prod(self.blob_shapes[0])
 
+    @property
+    @override
+    def small(self) -> bool:
+        return False
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        return Layer.prepare(self, how)
+
     onnx_op = "ConvTranspose"
 
     @override
@@ -341,7 +378,7 @@ class Deconvolution(Convolution):
 
     @override
     def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
-        filters = self.blob_in_double(0)
+        filters = self.blob_like(0, scale)
         grouped = filters.reshape(self.group, -1, *filters.shape[1:])
         factors = scale.reshape(self.group, 1, -1, *(1,) * self.spatial_axes)
         return (grouped * factors).reshape(filters.shape)

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact.sums import Copies
-from netspec.layers.base import Layer, Shape
+from netspec.layers.base import Kernel, Layer, Preparation, Shape, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TRAIN
@@ -304,6 +304,26 @@ class Pooling(_PoolingBase):
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
+
+    fresh = True
+    any_layout = True
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        windows, empty = self.windows, math.prod(self.top_shapes[0]) == 0
+        if self.num_tops > 1 or self.method == STOCHASTIC or empty or not windows.known_to_torch:
+            return super().prepare(how)
+        geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
+        if self.method == AVE:
+            return finished(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.finish)
+
+        def kernel(maps: torch.Tensor) -> torch.Tensor:
+            values = torch.max_pool2d(maps, *geometry, 1, ceil)
+            return (
+                values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]
+            )  # as there: torch lets NaN win
+
+        return finished(kernel, how.finish)
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:

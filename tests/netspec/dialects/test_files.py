@@ -94,7 +94,7 @@ FAULTS = {
     "nothing like it": (
         None,
         "x" * 20,
-        f'unknown dialect "{"x" * 20}"; expected one of: blocks, layout, rcnn, ssd, or the path',
+        f'unknown dialect "{"x" * 20}"; expected one of: blocks, filters, layout, nvidia, rcnn, ristretto, ssd,',
     ),
     "no such file": (None, "{path}", "{path}: cannot be read: No such file or directory"),
     "not text": (b"\xff\xfe", "{path}", "{path}: cannot be read: 'utf-8' codec can't decode"),
@@ -285,3 +285,9 @@ def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None
 
 def test_what_no_dialect_has_is_left_to_the_reader(files_afresh: None) -> None:
     assert use_dialects_of('layer { type: "NoSuchType" no_such_param { } }', "x.prototxt") == []
+
+
+def test_the_readme_names_every_dialect() -> None:
+    table = re.findall(r"^\| `(\w+)` \|", (ROOT / "netspec" / "README.md").read_text(), re.MULTILINE)
+    own = {path.stem for path in (ROOT / "netspec" / "dialects").glob("[!_]*.py")}
+    assert own <= set(table)

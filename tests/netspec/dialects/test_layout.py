@@ -110,3 +110,16 @@ def test_merge_crop_refuses_what_does_not_fit(build: Build, param: str, large: t
         build("layout", f"type: 'MergeCrop' mergecrop_param {{ {param} }}", (2, 3, 4, 4), large)
     with pytest.raises(SpecError, match="found 3 forward, expected one per bottom"):
         build("layout", "type: 'MergeCrop' mergecrop_param { forward: [1, 1, 1] }", (2, 3, 4, 4), (2, 3, 4, 4))
+
+
+def test_crop_center(build: Build, gradcheck: Gradcheck) -> None:
+    data = torch.randn(1, 2, 7, 6)
+    layer = build("layout", "type: 'CropCenter' crop_center_param { crop_size: [0, 0, 2, 1] }", data.shape)
+    np.testing.assert_array_equal(run(layer, data), data.numpy()[:, :, 2:-2, 1:-1])
+    gradcheck(layer, data)
+
+
+@pytest.mark.parametrize("sizes", ["[0, 0, 2]", "[0, 0, 4, 0]", "[1, 0, 0, 0]"])
+def test_crop_center_leaves_something(build: Build, sizes: str) -> None:
+    with pytest.raises(SpecError, match=r"expected one for each axis of .1, 2, 7, 6., less than half of it"):
+        build("layout", f"type: 'CropCenter' crop_center_param {{ crop_size: {sizes} }}", (1, 2, 7, 6))

@@ -123,6 +123,18 @@ def test_prior_box(
     assert np.array_equal(top[0, 1], np.full(4 * len(expected), 0.1, np.float32))
 
 
+def test_sizes_that_are_cut_are_named_since_forks_differ(build: Build, caplog: pytest.LogCaptureFixture) -> None:
+    settings = "min_size: 9.2 min_size: 12 max_size: 11.5 max_size: 20 img_size: 60"
+    build("ssd", f"type: 'PriorBox' prior_box_param {{ {settings} }}", (1, 1, 2, 2))
+    cut, other = caplog.messages
+    place = '<layer>:1:36: layer "" (PriorBox): '
+    assert cut.startswith(f"{place}min_size is cut to whole pixels, as in SSD: 9.2 to 9; OpenCV and some forks keep it")
+    assert "max_size is cut to whole pixels, as in SSD: 11.5 to 11" in other
+    caplog.clear()
+    build("ssd", "type: 'PriorBox' prior_box_param { min_size: 30 img_size: 60 }", (1, 1, 2, 2))
+    assert not caplog.messages
+
+
 def test_prior_boxes_are_clipped_and_have_their_variances(build: Build) -> None:
     settings = "min_size: 50 clip: true img_size: 60 variance: 0.1 variance: 0.2 variance: 0.3 variance: 0.4"
     maps = torch.randn(1, 1, 2, 2)

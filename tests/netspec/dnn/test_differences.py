@@ -54,9 +54,34 @@ def test_layers_that_opencv_lacks_run() -> None:
     np.testing.assert_allclose(net.forward(), DATA.sum((2, 3)), rtol=1e-6)
 
 
-def test_an_unknown_field_is_refused() -> None:
-    with pytest.raises(dnn.DnnError, match=r'^<prototxt>:2:\d+: .*"no_such_param"'):
-        made('layer { name: "a" type: "Power" bottom: "data" top: "a" no_such_param { x: 1 } }')
+def test_an_unknown_field_is_skipped_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    net = made(
+        'layer { name: "a" type: "Power" bottom: "data" top: "a" no_such_param { x: 1 }'
+        " power_param { scale: 2 no_such: FOO } }"
+    )
+    net.setInput(DATA)
+    np.testing.assert_allclose(net.forward(), 2 * DATA)
+    assert '<prototxt>:2:57: layer "a" (Power): skipped: LayerParameter has no field "no_such_param"' in caplog.text
+    assert 'skipped: PowerParameter has no field "no_such"' in caplog.text
+
+
+@pytest.mark.parametrize(
+    "param", ["convolution_param { num_output: 1 kernel_size: 3", "pooling_param { kernel_size: 2"]
+)
+def test_an_unknown_field_of_a_window_is_refused(param: str) -> None:
+    kind = "Convolution" if "output" in param else "Pooling"
+    with pytest.raises(dnn.DnnError, match=r'^<prototxt>:2:\d+: .*has no field "no_such"'):
+        made(f'layer {{ name: "a" type: "{kind}" bottom: "data" top: "a" {param} no_such: 1 }} }}')
+
+
+def test_nothing_is_said_of_old_formats_and_fields_without_effect(caplog: pytest.LogCaptureFixture) -> None:
+    text = """input: "data" input_dim: 1 input_dim: 3 input_dim: 4 input_dim: 4
+        layers { name: "a" type: POWER bottom: "data" top: "a" power_param { scale: 2 }
+        relu_param { negative_slope: 1 } }"""
+    net = dnn.readNetFromCaffe(text.encode())
+    net.setInput(DATA)
+    assert net.forward().shape == DATA.shape
+    assert caplog.text == ""
 
 
 def test_an_axpy_multiplies_the_second_bottom() -> None:
@@ -154,7 +179,57 @@ def test_opencvs_other_models_do_not_take_these_nets() -> None:
         dnn.KeypointsModel(read("segment"))
 
 
-@pytest.mark.parametrize("name", ["addLayer", "connect", "dump", "forwardAsync", "registerOutput"])
-def test_methods_that_change_or_print_a_net_are_not_there(name: str) -> None:
-    assert hasattr(cv2.dnn.Net, name)
-    assert not hasattr(dnn.Net, name)
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("addLayer", ("a", "ReLU", cv2.CV_32F, {})),
+        ("addLayerToPrev", ("a", "ReLU", cv2.CV_32F, {})),
+        ("connect", ("_input", "fc")),
+        ("registerOutput", ("a", 1, 0)),
+        ("quantize", ([], cv2.CV_32F, cv2.CV_32F)),
+        ("forwardAsync", ()),
+        ("getInputDetails", ()),
+        ("getOutputDetails", ()),
+    ],
+)
+def test_methods_that_change_a_net_say_that_it_is_as_written(name: str, arguments: tuple[Any, ...]) -> None:
+    with pytest.raises(dnn.DnnError):
+        getattr(read("classify"), name)(*arguments)
+
+
+def test_every_method_of_opencv_4_is_there() -> None:
+    methods = """addLayer addLayerToPrev connect dump dumpToFile empty enableFusion enableWinograd forward
+        forwardAndRetrieve forwardAsync getFLOPS getInputDetails getLayer getLayerId getLayerNames getLayerShapes
+        getLayerTypes getLayersCount getLayersShapes getMemoryConsumption getOutputDetails getParam getPerfProfile
+        getUnconnectedOutLayers getUnconnectedOutLayersNames quantize registerOutput setHalideScheduler setInput
+        setInputShape setInputsNames setParam setPreferableBackend setPreferableTarget"""
+    assert [name for name in methods.split() if not hasattr(dnn.Net, name)] == []
+    assert dnn.DNN_LAYOUT_NCHW == 2
+
+
+def test_a_net_is_dumped_as_a_graph(tmp_path: Path) -> None:
+    net = made('layer { name: "a" type: "Power" bottom: "data" top: "a" }')
+    graph = """digraph G {
+\t"_input" [label="_input\\noutput: 1 x 3 x 4 x 4\\l" shape=box]
+\t"a" [label="a\\nPower\\noutput: 1 x 3 x 4 x 4\\l" shape=box]
+\t"_input" -> "a"
+}
+"""
+    assert net.dump() == graph
+    net.setInput(np.ones((2, 3, 5, 4)))
+    net.dumpToFile(str(tmp_path / "net.dot"))
+    assert (tmp_path / "net.dot").read_text() == graph.replace("1 x 3 x 4", "2 x 3 x 5")
+
+
+def test_weights_shrink_to_half_precision_as_opencv_4_writes_them(tmp_path: Path) -> None:
+    small, values = str(tmp_path / "small.caffemodel"), np.random.RandomState(1).rand(1, 3, 20, 20)
+    dnn.shrinkCaffeModel(HERE / "classify.caffemodel", small)
+    assert Path(small).stat().st_size < 0.6 * (HERE / "classify.caffemodel").stat().st_size
+    net, whole = dnn.readNetFromCaffe(str(HERE / "classify.prototxt"), small), read("classify")
+    for each in net, whole:
+        each.setInput(values)
+    np.testing.assert_array_equal(net.getParam("fc"), whole.getParam("fc").astype(np.float16))
+    np.testing.assert_array_equal(net.getParam("bn1"), whole.getParam("bn1"))
+    np.testing.assert_allclose(net.forward(), whole.forward(), atol=1e-3)
+    with pytest.raises(dnn.DnnError, match="No such file"):
+        dnn.shrinkCaffeModel(str(tmp_path / "none"), small)

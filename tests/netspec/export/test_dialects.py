@@ -84,6 +84,18 @@ CASES: dict[str, tuple[str, str, dict[str, Shape]]] = {
     "BN of SegNet": ("blocks", "type: 'BN' bn_param { bn_mode: INFERENCE }", {"x": MAP}),
     "BN by the batch": ("blocks", "type: 'BN' bn_param { bn_mode: LEARN }", {"x": MAP}),
     "Transpose": ("layout", "type: 'Transpose' transpose_param { dim: [0, 2, 3, 1] }", {"x": MAP}),
+    "CropCenter": ("layout", "type: 'CropCenter' crop_center_param { crop_size: [0, 0, 2, 1] }", {"x": MAP}),
+    "Convolution with holes": (
+        "filters",
+        "type: 'Convolution' convolution_param { num_output: 3 kernel_size: 2 hole: 2 }",
+        {"x": MAP},
+    ),
+    "Convolution with sides": (
+        "filters",
+        "type: 'Convolution' convolution_param { num_output: 3 kernel_size: 3 stride: 2 pad_l: 1 pad_b: 2 }",
+        {"x": MAP},
+    ),
+    "BatchNorm of NVIDIA": ("nvidia", "type: 'BatchNorm' batch_norm_param { scale_bias: true }", {"x": MAP}),
     "Dropout": ("rcnn", "type: 'Dropout' dropout_param { dropout_ratio: 0.25 scale_train: false }", {"x": MAP}),
     "SmoothL1Loss": (
         "rcnn",

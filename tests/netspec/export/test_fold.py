@@ -109,7 +109,7 @@ def test_towers_share_their_weights_where_folding_leaves_them_equal(
 def test_folding_is_in_double_precision(net_of: Callable[..., Net]) -> None:
     text = f'{INPUT} layer {{ name: "conv" type: "Convolution" bottom: "data" top: "a" {CONV} }}' + NORM.format(*"abc")
     net = trained(net_of(text))
-    (found,) = find_folds(net)
+    (found,) = find_folds(net.plan, list(net.layers))
     assert found.chain.keeper == 1
     assert found.chain.folded == (2, 3)
     weights, bias = found.absorbed.blobs

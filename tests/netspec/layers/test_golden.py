@@ -1,6 +1,6 @@
 """Every layer case that BVLC Caffe computed: outputs, input gradients, parameter gradients, running statistics."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +31,23 @@ def test_layer_computes_what_caffe_computed(folder: Path, exact: str, device: st
     case = LayerCase(folder)
     found = case.compute(exact, device)
     assert [key for key in found if key.startswith("out/")] == sorted(k for k in case.golden if k.startswith("out/"))
+    assert_close(found, case.golden)
+
+
+def assert_close(found: Mapping[str, np.ndarray], golden: Mapping[str, np.ndarray]) -> None:
     for key, value in found.items():
-        expected = case.golden[key]
+        expected = golden[key]
         assert value.shape == expected.shape, key
         scale = max(float(np.abs(expected).max(initial=0)), 1e-30)
         worst = float(np.abs(value.astype(np.float64) - expected).max(initial=0)) / scale
         assert worst <= TOLERANCE, f"{key}: off by {worst:.2e} of the largest element"
+
+
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+@pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
+def test_a_run_without_gradients_computes_the_same(folder: Path, exact: str) -> None:
+    case = LayerCase(folder)
+    assert_close(case.outputs(exact), case.golden)
 
 
 @pytest.mark.parametrize(
@@ -48,4 +59,6 @@ def test_layer_computes_caffes_bits(folder: Path, exact: str, same_blas: bool) -
         pytest.skip("another kind of CPU than Caffe's: its BLAS rounds differently")
     case = LayerCase(folder)
     for key, value in case.compute(exact).items():
+        np.testing.assert_array_equal(value, case.golden[key], key)
+    for key, value in case.outputs(exact).items():
         np.testing.assert_array_equal(value, case.golden[key], key)

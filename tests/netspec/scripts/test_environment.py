@@ -5,6 +5,7 @@ import sysconfig
 import venv
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from paths import ROOT
@@ -99,3 +100,70 @@ def test_a_real_caffe_elsewhere_on_the_path_is_refused(environment: Path, monkey
     (environment / "caffe.py").write_text("real = 1")
     monkeypatch.setenv("PYTHONPATH", str(environment))
     assert "caffe.py: is there already" in run(environment, "python", "-m", "netspec", "install-caffe", rc=1).stderr
+
+
+CREATE = """#!/usr/bin/env sh
+# Make a database, its mean and a net, as Caffe's own shell scripts do.
+set -e
+
+EXAMPLE=examples/mnist
+DATA=data/mnist
+BUILD=build/examples/mnist
+TOOLS=./build/tools
+BACKEND="lmdb"
+
+rm -rf $EXAMPLE/mnist_train_${BACKEND}
+$BUILD/convert_mnist_data.bin $DATA/train-images-idx3-ubyte \\
+  $DATA/train-labels-idx1-ubyte $EXAMPLE/mnist_train_${BACKEND} --backend=${BACKEND}
+$TOOLS/compute_image_mean -backend=$BACKEND $EXAMPLE/mnist_train_$BACKEND $EXAMPLE/mean.binaryproto
+GLOG_logtostderr=1 $TOOLS/convert_imageset --resize_height=4 --resize_width=4 --gray \\
+  $DATA/ $DATA/list.txt $EXAMPLE/images_lmdb
+$TOOLS/caffe train --solver=$EXAMPLE/lenet_solver.prototxt $@
+$TOOLS/caffe.bin test -model $EXAMPLE/net.prototxt -weights $EXAMPLE/lenet_iter_2.caffemodel -iterations 1
+"""
+
+
+def test_shell_scripts_find_the_commands_where_caffe_is_built(environment: Path) -> None:
+    import cv2
+
+    mnist = environment / "examples" / "mnist"
+    data = environment / "data" / "mnist"
+    mnist.mkdir(parents=True)
+    data.mkdir(parents=True)
+    head = b"\0\0\x08"
+    (data / "train-images-idx3-ubyte").write_bytes(head + b"\3\0\0\0\2\0\0\0\4\0\0\0\4" + bytes(range(32)))
+    (data / "train-labels-idx1-ubyte").write_bytes(head + b"\1\0\0\0\2\0\1")
+    cv2.imwrite(str(data / "a.png"), np.zeros((8, 8), np.uint8))
+    (data / "list.txt").write_text("a.png 1\n")
+    transform = 'transform_param { mean_file: "examples/mnist/mean.binaryproto" scale: 0.01 }'
+    source = 'data_param { source: "examples/mnist/mnist_train_lmdb" batch_size: 2 backend: LMDB }'
+    ip = 'layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" inner_product_param { num_output: 2 } }'
+    loss = 'layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" }'
+    layer = f'layer {{ name: "d" type: "Data" top: "data" top: "label" {transform} {source} }}'
+    (mnist / "net.prototxt").write_text(f"{layer}\n{ip}\n{loss}\n")
+    (mnist / "lenet_solver.prototxt").write_text(
+        'net: "examples/mnist/net.prototxt" base_lr: 0.1 lr_policy: "fixed" max_iter: 2 solver_mode: CPU\n'
+        'snapshot_prefix: "examples/mnist/lenet"\n'
+    )
+    (environment / "create.sh").write_text(CREATE)
+    (environment / "create.sh").chmod(0o755)
+    before = files(environment)
+    said = run(environment, "python", "-m", "netspec", "install-caffe", "--build", "build").stdout.splitlines()
+    assert {environment / line for line in said} == files(environment) - before
+    run(environment, "python", "-c", IMPORT, rc=1)  # the environment stays as it was
+    done = run(environment, "../create.sh")
+    assert "Loss: " in done.stderr
+    assert (mnist / "images_lmdb" / "data.mdb").is_file()
+    (environment / "build" / "mine").write_text("mine")
+    run(environment, "python", "-m", "netspec", "remove-caffe", "--build", "build")
+    assert {path.name for path in (environment / "build").rglob("*")} == {"mine"}
+
+
+def test_a_real_build_is_left_alone(environment: Path) -> None:
+    tool = environment / "build" / "tools" / "caffe"
+    tool.parent.mkdir(parents=True)
+    tool.write_text("#!/bin/sh\necho real\n")
+    refused = run(environment, "python", "-m", "netspec", "install-caffe", "--build", "build", rc=1).stderr
+    assert "build/tools/caffe: is there already and not netspec's; name another folder" in refused
+    run(environment, "python", "-m", "netspec", "remove-caffe", "--build", "build")
+    assert [path for path in (environment / "build").rglob("*") if path.is_file()] == [tool]

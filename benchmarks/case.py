@@ -1,0 +1,193 @@
+"""The files that all that is compared reads: one net, its weights, its ONNX model, its inputs, its records."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.zoo import ZOO, deploy, training
+from netspec.errors import SpecError
+
+ROOT = Path(__file__).resolve().parents[1]
+PAPER = [f"siamese_{n}" for n in ("8", "128", "resnet27_256", "resnet27_512")]
+SMALL = [f"small/{name}" for name in PAPER]
+CATALOGUE = [*PAPER, *SMALL, *ZOO]
+RATE, MOMENTUM, DECAY = 1e-4, 0.9, 5e-4  # of trainings: small, so that numbers stay usual ones however long it takes
+
+
+@dataclass(frozen=True)
+class Case:
+    """One net at one batch size; ``folder`` has its files. ``twin`` is the name of its twin, if it has one."""
+
+    name: str
+    batch: int
+    folder: Path
+    twin: str | None
+
+    @property
+    def prototxt(self) -> Path:
+        """The net."""
+        return self.folder / "net.prototxt"
+
+    @property
+    def caffemodel(self) -> Path:
+        """Its weights."""
+        return self.folder / "net.caffemodel"
+
+    @property
+    def onnx(self) -> Path:
+        """The same net and weights as ``netspec export --to onnx`` writes them."""
+        return self.folder / "net.onnx"
+
+    @property
+    def inputs(self) -> Path:
+        """An .npz: its inputs by blob, or a batch of records and labels for training."""
+        return self.folder / "inputs.npz"
+
+    @property
+    def solver(self) -> Path:
+        """For training: a solver without tests and snapshots."""
+        return self.folder / "solver.prototxt"
+
+
+@contextmanager
+def forward_case(
+    name: str, batch: int, weights: str | None = None, twin: str | None = None, onnx: bool = True
+) -> Iterator[Case]:
+    """Write what forward passes of a net need; ``name`` is one of the catalogue, or the path of a prototxt.
+
+    Without ``weights`` they are random. Raises SpecError for faults of the files.
+    """
+    import netspec
+    from netspec.export.onnx import export_onnx
+    from netspec.proto.text import write_text
+
+    with TemporaryDirectory(prefix="bench-") as folder:
+        case = Case(name, batch, Path(folder), name if name in CATALOGUE else twin)
+        case.prototxt.write_text(write_text(_with_batch(_deploy(name), batch)))
+        net = netspec.load_net(case.prototxt, "TEST", weights, seed=0)
+        if weights is None:
+            randomize(net)
+        random = np.random.default_rng(0)
+        inputs = {blob: random.standard_normal(net.shapes[blob], np.float32) for blob in net.inputs}
+        if weights is None:
+            calm(net, inputs)
+        netspec.save_weights(net, case.caffemodel)
+        if onnx:
+            export_onnx(net, case.onnx)
+        np.savez(case.inputs, allow_pickle=False, **inputs)
+        yield case
+
+
+@contextmanager
+def training_case(name: str, batch: int) -> Iterator[Case]:
+    """Write what the training of a net of the catalogue needs: a database that has one batch."""
+    import netspec
+    from netspec.data.database import Writer
+    from netspec.data.datum import array_to_datum
+    from netspec.proto.schema import SolverParameter
+    from netspec.proto.text import write_text
+
+    if name not in CATALOGUE:
+        raise SpecError(f'no training of "{name}"; there are: {", ".join(CATALOGUE)}')
+    with TemporaryDirectory(prefix="bench-") as folder:
+        case = Case(name, batch, Path(folder), name)
+        source = str(case.folder / "records")
+        case.prototxt.write_text(write_text(_training(name, source, batch)))
+        solver = SolverParameter(
+            net=str(case.prototxt),
+            base_lr=RATE,
+            momentum=MOMENTUM,
+            weight_decay=DECAY,
+            lr_policy="fixed",
+            max_iter=10**9,
+        )
+        solver.random_seed = 0
+        case.solver.write_text(write_text(solver))
+        shape, classes = _record(name)
+        random = np.random.default_rng(0)
+        records = random.integers(0, 256, (batch, *shape), np.uint8)
+        labels = np.arange(batch) % classes
+        with Writer(source) as writer:
+            for k, (record, label) in enumerate(zip(records, labels, strict=True)):
+                writer.put(b"%08d" % k, array_to_datum(record, int(label)).SerializeToString())
+        np.savez(case.inputs, allow_pickle=False, data=(records - np.float32(128)) / 128, label=labels)
+        net = netspec.load_net(case.prototxt, "TRAIN", seed=0)
+        netspec.save_weights(net, case.caffemodel)
+        net.close()
+        yield case
+
+
+def _deploy(name: str) -> Any:
+    from netspec.proto.text import read_net
+
+    if name in ZOO:
+        return deploy(name)
+    return read_net(ROOT / "prototxt" / name / "deploy.prototxt" if name in CATALOGUE else name)
+
+
+def _training(name: str, source: str, batch: int) -> Any:
+    from netspec.proto.text import read_net
+
+    if name in ZOO:
+        return training(name, source, batch)
+    message = read_net(ROOT / "prototxt" / name / "train_val.prototxt")
+    for layer in message.layer:
+        if layer.type == "Data":
+            layer.data_param.source, layer.data_param.batch_size = source, batch
+    return message
+
+
+def _record(name: str) -> tuple[tuple[int, int, int], int]:
+    """Return the shape of a net's records, and how many labels there are."""
+    if name in ZOO:
+        return ZOO[name][1], 10
+    size = 64 if name in SMALL else 224
+    return (6, size, size), 2
+
+
+def _with_batch(message: Any, batch: int) -> Any:
+    for layer in message.layer:
+        if layer.type == "Input":
+            for shape in layer.input_param.shape:
+                shape.dim[0] = batch
+    return message
+
+
+def randomize(net: Any) -> None:
+    """Set BatchNorm statistics as after some training, and normally distributed weights where there is no filler."""
+    import torch
+
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for layer in net.layers:
+            if layer.type == "BatchNorm":
+                means, variances, weight = layer.blobs
+                weight.fill_(50)
+                means.normal_(0, 0.1).mul_(weight)
+                variances.uniform_(0.5, 1.5).mul_(weight)
+                continue
+            for blob in layer.blobs:
+                if not blob.any():
+                    blob.normal_(0, (2 / blob[0].numel()) ** 0.5 if blob.dim() > 1 else 0.1)
+
+
+def calm(net: Any, inputs: dict[str, np.ndarray]) -> None:
+    """Scale the last layer that learns, so that its values are of the size of 1: a softmax then tells differences."""
+    import torch
+
+    last = [layer for layer in net.layers if len(layer.blobs)][-1:]
+    for layer in last:
+        net.keep = list(layer.param.top)
+        with torch.no_grad():
+            net(**inputs)
+            size = net.blobs[layer.param.top[0]].std()
+            for blob in layer.blobs:
+                blob /= size
+    net.keep = ()

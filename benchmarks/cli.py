@@ -1,0 +1,118 @@
+"""``tools/bench``: its commands; netspec/command_line.py reads them as it reads those of netspec."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+from netspec.command_line import Commands, run
+
+FORWARD = ("netspec", "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe")
+TRAINING = ("netspec", "pytorch", "pycaffe")
+YARDSTICKS = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in an environment of their own
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit statuses are those of netspec."""
+    return run(parser(), list(sys.argv[1:] if argv is None else argv))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    made = argparse.ArgumentParser(prog="tools/bench", description=__doc__, allow_abbrev=False)
+    commands = _Quiet(made)
+    p = commands.add("forward", _forward, "time forward passes beside those of other programs")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list), or a prototxt")
+    p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
+    p.add_argument("--twin", help="the net of the catalogue whose PyTorch twin the prototxt has")
+    _add_common(p, FORWARD, FORWARD[:5])
+    p = commands.add("train", _train, "time training iterations: forward, backward, update")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
+    _add_common(p, TRAINING, TRAINING[:2])
+    p = commands.add(
+        "waiting", _waiting, "time two trainings side by side, as their OpenMP threads wait in several ways"
+    )
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
+    p.add_argument("--waits", nargs="+", default=["", "OMP_WAIT_POLICY=PASSIVE"], metavar="VARIABLE=VALUE")
+    p.add_argument("--batch", type=int, default=32, help="items of a batch (default: 32)")
+    p.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
+    p.add_argument("--rounds", type=int, default=7, help="default: 7")
+    commands.add("list", _list, "list the nets of the catalogue")
+    return made
+
+
+class _Quiet(Commands):
+    """Commands that show no log."""
+
+    def add(self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str) -> Any:
+        """See :class:`netspec.command_line.Commands`."""
+        added = super().add(name, function, summary)
+        added.set_defaults(log_level=logging.WARNING)
+        return added
+
+
+def _add_common(p: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
+    p.add_argument(
+        "--with", dest="ways", nargs="+", choices=known, default=list(default), help=f"default: {' '.join(default)}"
+    )
+    p.add_argument("--caffe", metavar="BINARY", help="also Caffe's own program")
+    p.add_argument("--batch", type=int, nargs="+", default=[1], help="items of a batch, one or several (default: 1)")
+    p.add_argument("--threads", type=int, nargs="+", default=[1], help="threads of a pass, one or several (default: 1)")
+    p.add_argument("--rounds", type=int, default=9, help="rounds, in each of which every way has its turn (default: 9)")
+    p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    from benchmarks.case import CATALOGUE
+
+    print("\n".join(CATALOGUE))
+
+
+def _forward(arguments: argparse.Namespace) -> None:
+    from benchmarks.case import forward_case
+
+    def case(name: str, batch: int) -> Any:
+        needs_onnx = any(way.startswith(("onnxruntime", "openvino")) for way in arguments.ways)
+        return forward_case(name, batch, arguments.weights, arguments.twin, needs_onnx)
+
+    _compare(arguments, case, "")
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from benchmarks.case import training_case
+
+    _compare(arguments, training_case, "_training")
+
+
+def _waiting(arguments: argparse.Namespace) -> None:
+    from benchmarks.waiting import compare
+
+    for name in arguments.nets:
+        compare(name, arguments.waits, arguments.batch, arguments.threads, arguments.rounds)
+
+
+def _compare(arguments: argparse.Namespace, case_of: Any, suffix: str) -> None:
+    from benchmarks import environment, report
+    from benchmarks.compare import rows_of
+
+    yardsticks = environment.python() if set(arguments.ways) & set(YARDSTICKS) else None
+    described, rows = report.machine(yardsticks), []
+    for name in arguments.nets:
+        for batch in arguments.batch:
+            with ExitStack() as stack:
+                case = stack.enter_context(case_of(name, batch))
+                for threads in arguments.threads:
+                    found = rows_of(
+                        case, threads, arguments.ways, suffix, yardsticks, arguments.caffe, arguments.rounds
+                    )
+                    rows += found
+                    print(report.table(found), flush=True)
+                    for row in found:
+                        if row.fault:
+                            print(f"{row.name}: {row.fault}", file=sys.stderr)
+                    if arguments.json:
+                        report.write_json(arguments.json, rows, described)

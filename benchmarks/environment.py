@@ -1,0 +1,33 @@
+"""The environment of the yardsticks: their libraries contradict netspec's, or netspec does not need them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import venv
+
+from benchmarks.case import ROOT
+from netspec.errors import SpecError
+
+FOLDER = ROOT / ".venv-bench"
+PACKAGES = (
+    "opencv-python-headless==4.12.0.88",
+    "onnxruntime>=1.20",
+    "openvino>=2024.6",
+)  # the last OpenCV 4 as a wheel
+
+
+def python() -> str:
+    """Return the Python of the yardsticks; at the first call, install them. Raises SpecError where that fails."""
+    program, done = FOLDER / "bin" / "python", FOLDER / "installed"
+    wanted = "\n".join(PACKAGES)
+    if not done.is_file() or done.read_text() != wanted:
+        print(f"Installing the yardsticks into {FOLDER} ...", file=sys.stderr)
+        venv.create(FOLDER, with_pip=True)
+        words = [str(program), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *PACKAGES]
+        finished = subprocess.run(words, capture_output=True, text=True, check=False)
+        if finished.returncode:
+            last = (finished.stderr.strip().splitlines() or ["pip failed"])[-1]
+            raise SpecError(f"{FOLDER}: cannot install the yardsticks: {last}")
+        done.write_text(wanted)
+    return str(program)

@@ -1,0 +1,95 @@
+"""What is printed and kept of a benchmark: tables, JSON, and which machine it was."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import statistics
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+FLAGS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16", "asimd", "bf16")
+PACKAGES = ("torch", "numpy", "onnxruntime", "openvino", "opencv-python-headless")
+REFERENCES = ("pytorch", "opencv4", "caffe")
+
+
+@dataclass(frozen=True)
+class Row:
+    """How one way ran one net. ``seconds`` has each round; ``ratios`` are its times in those of the references."""
+
+    net: str
+    batch: int
+    threads: int
+    name: str
+    seconds: list[float]
+    ratios: Mapping[str, float]
+    difference: float | None
+    fault: str = ""
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return rows as a Markdown table."""
+    references = [name for name in REFERENCES if any(name in row.ratios for row in rows)]
+    head = ["net", "batch", "threads", "run by", "ms", "best", *(f"/ {name}" for name in references), "off by"]
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        where = [row.net, str(row.batch), str(row.threads), row.name]
+        if row.fault:
+            lines.append([*where, *["-"] * (len(head) - 4)])
+            continue
+        times = [f"{1e3 * value:.2f}" for value in (statistics.median(row.seconds), min(row.seconds))]
+        ratios = [f"{row.ratios[name]:.2f}" if name in row.ratios else "-" for name in references]
+        lines.append([*where, *times, *ratios, "-" if row.difference is None else f"{row.difference:.0e}"])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def machine(python: str | None = None) -> dict[str, Any]:
+    """Describe the machine; ``python`` is that of the yardsticks, whose versions are added."""
+    cpu = _cpu()
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    described: dict[str, Any] = {
+        "processor": cpu.get("model name") or platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "flags": [flag for flag in FLAGS if flag in (cpu.get("flags") or cpu.get("Features") or "").split()],
+        "memory_gib": round(memory, 1),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "versions": _versions(),
+        "load_average": [round(load, 2) for load in os.getloadavg()],
+    }
+    if python:
+        code = "import json; from benchmarks.report import _versions; print(json.dumps(_versions()))"
+        root = str(Path(__file__).resolve().parents[1])
+        done = subprocess.run(
+            [python, "-c", code], env={**os.environ, "PYTHONPATH": root}, capture_output=True, text=True, check=True
+        )
+        described["yardsticks"] = json.loads(done.stdout)
+    return described
+
+
+def write_json(path: str | Path, rows: Sequence[Row], described: Mapping[str, Any]) -> None:
+    """Write all there is to know."""
+    Path(path).write_text(json.dumps({"machine": described, "rows": [asdict(row) for row in rows]}, indent=1) + "\n")
+
+
+def _cpu() -> dict[str, str]:
+    path = Path("/proc/cpuinfo")
+    if not path.is_file():
+        return {}
+    pairs = (line.split(":", 1) for line in path.read_text().partition("\n\n")[0].splitlines() if ":" in line)
+    return {key.strip(): value.strip() for key, value in pairs}
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found

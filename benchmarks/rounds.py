@@ -1,0 +1,175 @@
+"""Rounds in which all that is compared takes its turn, so that other load on the machine meets all alike."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+TURN, MOST = 0.4, 50  # seconds of a turn, and at most so many passes
+REST = 0.03  # seconds before a turn: threads of the one before may still spin
+
+
+class Contestant(Protocol):
+    """What takes turns. ``fault`` says why it cannot, else it is empty; ``outputs`` are those of its first pass."""
+
+    name: str
+    fault: str
+    outputs: dict[str, np.ndarray]
+
+    def turn(self, passes: int) -> list[float]:
+        """Return the seconds of so many passes."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
+class Worker:
+    """A process of benchmarks/worker.py, with the Python that has its library."""
+
+    def __init__(
+        self, name: str, python: str, task: Mapping[str, Any], variables: Mapping[str, str | None] | None = None
+    ):
+        self.name = name
+        result = Path(task["folder"]) / f"{name.replace('/', '_')}.npz"
+        command = [python, "-m", "benchmarks.worker", json.dumps({**task, "result": str(result)})]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), **(variables or {})}
+        environment = {key: value for key, value in environment.items() if value is not None}
+        self.errors = result.with_suffix(".log").open("w+")
+        self.process = subprocess.Popen(
+            command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors, text=True
+        )
+        self.fault = self._said().get("fault", "")
+        self.outputs: dict[str, np.ndarray] = {}
+        if not self.fault:
+            with np.load(result) as arrays:
+                self.outputs = {key: arrays[key] for key in arrays.files}
+
+    def tell(self, passes: int) -> None:
+        """Let it begin so many passes."""
+        assert self.process.stdin is not None
+        print(passes, file=self.process.stdin, flush=True)
+
+    def answer(self) -> list[float]:
+        """Return their seconds."""
+        said = self._said()
+        if isinstance(said, dict):
+            raise RuntimeError(f"{self.name}: {said['fault']}")
+        return said
+
+    def turn(self, passes: int) -> list[float]:
+        """See :class:`Contestant`."""
+        self.tell(passes)
+        return self.answer()
+
+    def close(self) -> None:
+        """See :class:`Contestant`."""
+        self.process.communicate()
+        self.errors.close()
+
+    def _said(self) -> Any:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if line:
+            return json.loads(line)
+        status = self.process.wait()
+        self.errors.seek(0)
+        lines = self.errors.read().strip().splitlines()
+        return {"fault": lines[-1] if lines else f"ended with status {status}"}
+
+
+class CaffeProgram:
+    """The program ``caffe`` itself, begun anew at each turn; times are those in its log."""
+
+    name = "caffe"
+
+    def __init__(self, binary: str, task: Mapping[str, Any], training: bool) -> None:
+        self.binary, self.task, self.training = binary, task, training
+        self.outputs: dict[str, np.ndarray] = {}
+        self.fault = ""
+        try:
+            self.turn(1)
+        except (OSError, RuntimeError) as fault:
+            self.fault = str(fault)
+
+    def turn(self, passes: int) -> list[float]:
+        """See :class:`Contestant`."""
+        found = self._iterations(passes) if self.training else self._passes(passes)
+        if not found:
+            raise RuntimeError(f"{self.binary} logs no times that are known here")
+        return found
+
+    def _passes(self, count: int) -> list[float]:
+        log = self._log(["time", f"-model={self.task['prototxt']}", "-phase=TEST", f"-iterations={count}"])
+        return [float(told) / 1e3 for told in re.findall(r"Average Forward pass: ([\d.e+-]+) ms", log)]
+
+    def _iterations(self, count: int) -> list[float]:
+        solver = Path(self.task["folder"]) / "caffe_solver.prototxt"
+        limit = f"max_iter: {count + 2}\ndisplay: 1\nsnapshot_after_train: false"
+        solver.write_text(re.sub(r"max_iter: \d+", limit, Path(self.task["solver"]).read_text()))
+        log = self._log(["train", f"-solver={solver}", f"-weights={self.task['caffemodel']}"])
+        told = re.findall(r"^I(?:\d{4})?\d{4} (\d\d:\d\d:\d\d\.\d+).*Iteration \d+, lr", log, re.M)
+        moments = [datetime.strptime(text, "%H:%M:%S.%f") for text in told[1:]]  # the first does not count
+        return [(b - a).total_seconds() % 86400 for a, b in itertools.pairwise(moments)]
+
+    def _log(self, words: Sequence[str]) -> str:
+        threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+        variables = {
+            **dict.fromkeys(threads, str(self.task["threads"])),
+            "GLOG_minloglevel": "0",
+            "GLOG_logtostderr": "1",
+        }
+        done = subprocess.run(
+            [self.binary, *words], env={**os.environ, **variables}, capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            raise RuntimeError((done.stderr.strip().splitlines() or ["it failed"])[-1])
+        return done.stderr
+
+    def close(self) -> None:
+        """See :class:`Contestant`."""
+
+
+def measure(contestants: Sequence[Contestant], rounds: int, tell: Callable[[int], object]) -> dict[str, list[float]]:
+    """Return, by name, the seconds of a pass in each round: the median of its turn.
+
+    ``tell`` gets the number of each round before it begins.
+    """
+    seconds: dict[str, list[float]] = {one.name: [] for one in contestants}
+    passes = {one.name: max(1, min(MOST, int(TURN / min(one.turn(1))))) for one in contestants}
+    for k in range(rounds):
+        tell(k)
+        for one in contestants if k % 2 == 0 else reversed(contestants):
+            time.sleep(REST)
+            seconds[one.name].append(statistics.median(one.turn(passes[one.name])))
+    return seconds
+
+
+def ratio(seconds: Sequence[float], others: Sequence[float]) -> float:
+    """Return the median of the ratios of times in the same round."""
+    return statistics.median(a / b for a, b in zip(seconds, others, strict=True))
+
+
+def difference(outputs: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> float | None:
+    """Return the largest difference of any output, relative to its largest element; None where shapes differ."""
+    worst = 0.0
+    for name, value in expected.items():
+        found = outputs.get(name)
+        if found is None or found.size != value.size:
+            return None
+        largest = float(np.abs(value).max(initial=0)) or 1.0
+        worst = max(worst, float(np.abs(found.reshape(-1) - value.reshape(-1)).max(initial=0)) / largest)
+    return worst

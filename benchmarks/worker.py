@@ -1,0 +1,221 @@
+"""A process that runs one net in one way whenever it is told to: ``python -m benchmarks.worker TASK``.
+
+TASK is JSON: ``runs`` names the way, the rest says on what. Answers are lines of JSON on stdout: first {} or
+{"fault": ...}, then, for each line with a number n on stdin, the seconds of n passes after one that is not counted.
+Every way imports its library itself, since each may live in an environment that lacks the others.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+Task = dict[str, Any]
+Run = Callable[[], dict[str, Any]]  # a pass; returns its outputs by blob
+
+
+def netspec(task: Task) -> Run:
+    """Run the default engine, as a program does that imports netspec."""
+    import torch
+
+    import netspec
+
+    torch.set_num_threads(task["threads"])
+    net = netspec.load_net(task["prototxt"], "TEST", task["caffemodel"])
+    inputs = _inputs(task)
+
+    def run() -> dict[str, Any]:
+        with torch.inference_mode():
+            return net(**inputs)
+
+    return run
+
+
+def pycaffe(task: Task) -> Run:
+    """Run netspec's pycaffe."""
+    os.environ.setdefault("GLOG_minloglevel", "2")
+    import torch
+
+    import netspec.pycaffe as caffe
+
+    torch.set_num_threads(task["threads"])
+    net = caffe.Net(task["prototxt"], task["caffemodel"], caffe.TEST)
+    for name, value in _inputs(task).items():
+        net.blobs[name].data[...] = value
+    return net.forward
+
+
+def pytorch(task: Task) -> Run:
+    """Run the hand-written twin in eval mode. netspec, which tells OpenMP how to wait, is imported after torch."""
+    import torch
+
+    from benchmarks import twins
+
+    torch.set_num_threads(task["threads"])
+    twin = twins.net(task["twin"]).eval()
+    twins.load(twin, task["caffemodel"])
+    softmax = task["twin"] in twins.CLASSIFIERS
+    ((_, value),) = _inputs(task).items()
+    data = torch.from_numpy(value)
+
+    def run() -> dict[str, Any]:
+        with torch.inference_mode():
+            return {task["outputs"][0]: torch.softmax(twin(data), 1) if softmax else twin(data)}
+
+    return run
+
+
+def opencv4(task: Task) -> Run:
+    """Run OpenCV 4's importer."""
+    import cv2
+
+    cv2.setNumThreads(task["threads"])
+    net = cv2.dnn.readNetFromCaffe(task["prototxt"], task["caffemodel"])  # type: ignore[attr-defined]
+    inputs, outputs = _inputs(task), task["outputs"]
+
+    def run() -> dict[str, Any]:
+        for name, value in inputs.items():
+            net.setInput(value, name)
+        return dict(zip(outputs, net.forward(outputs), strict=True))
+
+    return run
+
+
+def onnxruntime(task: Task) -> Run:
+    """Run the exported model in onnxruntime itself."""
+    import onnxruntime as ort
+
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = task["threads"]
+    options.log_severity_level = 3
+    session = ort.InferenceSession(task["onnx"], options, providers=["CPUExecutionProvider"])
+    inputs, outputs = _inputs(task), task["outputs"]
+    return lambda: dict(zip(outputs, session.run(outputs, inputs), strict=True))
+
+
+def openvino(task: Task) -> Run:
+    """Run the exported model in OpenVINO itself, in the precision of the task."""
+    import openvino
+
+    core = openvino.Core()
+    model = core.read_model(task["onnx"])
+    inputs, outputs = _inputs(task), task["outputs"]
+    model.reshape({name: list(value.shape) for name, value in inputs.items()})
+    settings = {
+        "INFERENCE_PRECISION_HINT": {"fp32": "f32", "bf16": "bf16"}[task.get("precision", "fp32")],
+        "INFERENCE_NUM_THREADS": task["threads"],
+        "PERFORMANCE_HINT": "LATENCY",
+    }
+    request = core.compile_model(model, "CPU", settings).create_infer_request()
+
+    def run() -> dict[str, Any]:
+        found = request.infer(inputs)
+        return {name: found[name] for name in outputs}
+
+    return run
+
+
+def netspec_training(task: Task) -> Run:
+    """Train as ``netspec train`` does: its data layer, its solver."""
+    if task.get("torch_first"):  # netspec then leaves the way to wait alone
+        import torch
+    import torch
+
+    import netspec
+
+    torch.set_num_threads(task["threads"])
+    solver = netspec.load_solver(task["solver"], task["caffemodel"], device="cpu")
+
+    def run() -> dict[str, Any]:
+        solver.step(1)
+        return {"loss": solver.loss}
+
+    return run
+
+
+def pycaffe_training(task: Task) -> Run:
+    """Train with the solver of netspec's pycaffe."""
+    os.environ.setdefault("GLOG_minloglevel", "2")
+    import torch
+
+    import netspec.pycaffe as caffe
+
+    torch.set_num_threads(task["threads"])
+    solver = caffe.get_solver(task["solver"])
+    solver.net.copy_from(task["caffemodel"])
+
+    def run() -> dict[str, Any]:
+        solver.step(1)
+        return {"loss": solver.net.blobs["loss"].data.copy()}
+
+    return run
+
+
+def pytorch_training(task: Task) -> Run:
+    """Train the twin with torch's SGD, on a batch that is in memory."""
+    import torch
+
+    from benchmarks import twins
+
+    torch.set_num_threads(task["threads"])
+    twin = twins.net(task["twin"]).train()
+    twins.load(twin, task["caffemodel"])
+    loss_of = twins.Classified(twin) if task["twin"] in twins.CLASSIFIERS else twins.Pairs(twin)
+    groups = twins.parameter_groups(twin, task["rate"], task["decay"])
+    optimizer = torch.optim.SGD(groups, lr=task["rate"], momentum=task["momentum"])
+    data, labels = (torch.from_numpy(value) for value in _inputs(task).values())
+
+    def run() -> dict[str, Any]:
+        optimizer.zero_grad()
+        loss = loss_of(data, labels)
+        loss.backward()
+        optimizer.step()
+        return {"loss": loss.detach()}
+
+    return run
+
+
+WAYS: dict[str, Callable[[Task], Run]] = {
+    way.__name__: way
+    for way in (
+        *(netspec, pycaffe, pytorch, opencv4, onnxruntime, openvino),
+        *(netspec_training, pycaffe_training, pytorch_training),
+    )
+}
+
+
+def _inputs(task: Task) -> dict[str, np.ndarray]:
+    with np.load(task["inputs"]) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def main() -> None:
+    """Serve until stdin ends."""
+    task = json.loads(sys.argv[1])
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # libraries that print do it on stderr
+    try:
+        run = WAYS[task["runs"]](task)
+        np.savez(task["result"], allow_pickle=False, **{name: np.array(value) for name, value in run().items()})
+    except Exception as fault:
+        print(json.dumps({"fault": f"{type(fault).__name__}: {' '.join(str(fault).split())}"}), file=answers)
+        return
+    print(json.dumps({}), file=answers)
+    for line in sys.stdin:
+        run()
+        seconds = []
+        for _ in range(int(line)):
+            began = time.perf_counter()
+            run()
+            seconds.append(time.perf_counter() - began)
+        print(json.dumps(seconds), file=answers)
+
+
+if __name__ == "__main__":
+    main()

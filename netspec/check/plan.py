@@ -1,0 +1,53 @@
+"""How a net of phase TEST runs without gradients, as text: which layers run together, by which kernels."""
+
+from __future__ import annotations
+
+import torch
+
+from netspec.graph.steps import PASSES, Step
+from netspec.layers.fused import has_bfloat16
+from netspec.net.net import Net
+
+KINDS = {
+    "packed": "by oneDNN, weights laid out in advance, channels side by side",
+    "exact": "sums in Caffe's order (--exact)",
+    "prepared": "by torch's kernels",
+    "as is": "like a layer in training: somebody may write to its parameters",
+    "by value": "like a layer in training: the shapes follow from values",
+}
+
+
+def plan_text(net: Net) -> str:
+    """Return one line per step, and what the kinds of steps mean; data is not opened.
+
+    The net must have been built with memory for its weights.
+    """
+    if net.programs is None:
+        return "no passes: nets run layer by layer in phase TRAIN, and where passes are switched off"
+    given = tuple(
+        (v, shape, torch.float32)
+        for node, layer in zip(net.plan.nodes, net.layers, strict=True)
+        if not node.bottoms
+        for v, shape in zip(node.tops, layer.top_shapes, strict=False)
+    )
+    program = net.programs.program(given, frozenset(net.plan.outputs.values()))
+    steps = program.schedule.steps
+    used = [kind for kind in KINDS if kind in program.kinds]
+    names = [_name(net, step) for step in steps]
+    width = max((len(kind) for kind in used), default=0)
+    bfloat16 = {True: "yes", False: "no", None: "unknown"}[has_bfloat16()]
+    passes = ", ".join(name for name in PASSES if name in net.programs.passes)
+    layers = sum(bool(node.bottoms) for node in net.plan.nodes)
+    return "\n".join(
+        [
+            f"{layers} layers run as {len(steps)} steps; passes: {passes}; bfloat16 on this CPU: {bfloat16}",
+            *(f"  {kind:{width}}  {name}" for kind, name in zip(program.kinds, names, strict=True)),
+            *(f"{kind}: {KINDS[kind]}" for kind in used),
+        ]
+    )
+
+
+def _name(net: Net, step: Step) -> str:
+    members = [step.node, *(step.chain.folded if step.chain else ())]
+    members = sorted(members) + ([step.finish] if step.finish is not None else [])
+    return " + ".join(net.plan.nodes[i].name for i in members)

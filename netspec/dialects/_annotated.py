@@ -1,0 +1,180 @@
+"""SSD's AnnotatedData: images with boxes from a database of AnnotatedDatum, varied as its settings say.
+
+Fork: weiliu89/caffe (ssd), src/caffe/layers/annotated_data_layer.cpp
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from random import Random
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from typing_extensions import override
+
+from netspec.data.database import Reader
+from netspec.data.datum import datum_to_array, times
+from netspec.data.random_words import derived
+from netspec.data.sources import Arrays, Cursor, Source
+from netspec.dialects._augment import COLUMNS, FIT_SMALL_SIZE, Augmenter, wrong_settings
+from netspec.errors import SpecError, Where
+from netspec.layers.base import Shape
+from netspec.layers.data.files import Data, ReadingLayer
+from netspec.proto.schema import has, message, value
+
+Array = np.ndarray
+
+
+class AnnotatedSource:
+    """The records of a database of AnnotatedDatum, made into batches.
+
+    The variations of a record follow from ``seed``, ``stream`` and the record's position alone. ``typed`` says that
+    records count as having boxes, whatever they say. Raises SpecError for a record that cannot be read.
+    """
+
+    def __init__(
+        self,
+        reader: Reader,
+        cursor: Cursor,
+        augment: Augmenter,
+        typed: bool,
+        seed: int,
+        stream: str,
+        where: Where | None,
+    ) -> None:
+        self.cursor, self._reader, self._augment, self._where = cursor, reader, augment, where
+        self._seed, self._stream = seed, stream
+        self._parse = message("ssd.AnnotatedDatum").FromString
+        self._has_boxes = True
+        image, first = self._read(cursor.records(0)[0])
+        self._has_boxes = typed or first.HasField("type")
+        self._shape = (image.shape[2], *augment.size(image.shape))
+        count = sum(len(group.annotation) for group in first.annotation_group)
+        batch = cursor.batch_size
+        self.shapes: Sequence[Shape] = (
+            (batch, *self._shape),
+            (1, 1, max(count, 1), COLUMNS + 1) if self._has_boxes else (batch, 1, 1, 1),
+        )
+
+    def keys(self, iteration: int) -> list[str]:
+        """Return the keys of the records of an iteration."""
+        return [self._name(record) for record in self.cursor.records(iteration)]
+
+    def batch(self, iteration: int) -> Arrays:
+        """Return images (N, C, H, W) and rows of boxes (1, 1, n, 8), or labels (N, 1, 1, 1)."""
+        images, rows, labels = [], [], []
+        places = zip(self.cursor.records(iteration), self.cursor.positions(iteration), strict=True)
+        for item, (record, position) in enumerate(places):
+            pixels, datum = self._read(record)
+            draw = Random(derived(self._seed, f"{self._stream}/{position}"))
+            image, boxes = self._augment(pixels, self._boxes(datum), draw)
+            if self.cursor.batch_size > 1 and image.shape != self._shape:
+                advice = "all must have the same size: give resize_param, or batch_size: 1"
+                found = f'record "{self._name(record)}" gives {times(image.shape)}, the first {times(self._shape)}'
+                raise SpecError(f"{found}; {advice}", self._where)
+            images.append(image)
+            rows.append(np.insert(boxes, 0, item, axis=1))
+            labels.append(datum.datum.label)
+        if not self._has_boxes:
+            return np.stack(images), np.array(labels, np.float32).reshape(-1, 1, 1, 1)
+        found = np.concatenate(rows)
+        nothing = np.full((1, COLUMNS + 1), -1, np.float32)
+        return np.stack(images), (found if len(found) else nothing)[None, None]
+
+    def _name(self, record: int) -> str:
+        return self._reader.key(record).decode(errors="backslashreplace")
+
+    def _read(self, record: int) -> tuple[Array, Any]:
+        """Return the image (H, W, C) of a record, and the record."""
+        try:
+            try:
+                datum = self._parse(self._reader.record(record))
+            except DecodeError:
+                raise ValueError("is no AnnotatedDatum") from None
+            if not datum.HasField("datum"):
+                raise ValueError("is no AnnotatedDatum; for a database of plain images use a layer of type Data")
+            image = datum_to_array(datum.datum, self._augment.color)
+            if image.dtype != np.uint8:
+                raise ValueError(f"has {image.dtype} values, expected 8 bits per channel")
+            return np.ascontiguousarray(image.transpose(1, 2, 0)), datum
+        except ValueError as fault:
+            raise SpecError(f'record "{self._name(record)}" {fault}', self._where) from None
+
+    @staticmethod
+    def _boxes(datum: Any) -> Array:
+        """Return the boxes of a record (n, 7): label, instance, xmin, ymin, xmax, ymax, difficult."""
+        rows = [
+            (group.group_label, a.instance_id, a.bbox.xmin, a.bbox.ymin, a.bbox.xmax, a.bbox.ymax, a.bbox.difficult)
+            for group in datum.annotation_group
+            for a in group.annotation
+        ]
+        return np.array(rows, np.float32).reshape(-1, COLUMNS)
+
+
+class AnnotatedData(Data):
+    """Read images with boxes from a database of AnnotatedDatum, in the order of its keys, over and over.
+
+    Each image is varied in this order: colors (distort_param), a larger canvas (expand_param), a window that one of the
+    batch samplers draws, a new size (resize_param), crop, mirror, mean, scale. Boxes are cut off at the window's sides;
+    emit_constraint says which stay.
+
+    top[0]  images (batch_size, C, H, W)
+    top[1]  a row for each box (1, 1, n, 8): image, label, instance, xmin, ymin, xmax, ymax, difficult; corners in
+            parts of the image; one row of -1 where there is none. Records without a type give their labels
+            (batch_size, 1, 1, 1). May be left out.
+    Fork: src/caffe/layers/annotated_data_layer.cpp
+    """
+
+    @override
+    def wrong_settings(self) -> Iterator[SpecError]:
+        p = self.param
+        yield from ReadingLayer.wrong_settings(self)
+        yield from wrong_settings(p.transform_param, self._samplers, self.context.at)
+        resize = value(p.transform_param, "resize_param")
+        if resize.resize_mode == FIT_SMALL_SIZE and p.data_param.batch_size > 1:
+            found = f"found {p.data_param.batch_size}"
+            message = f"FIT_SMALL_SIZE gives each image a size of its own: it needs batch_size: 1, {found}"
+            yield self.error(message, "data_param", "batch_size")
+
+    @property
+    def _samplers(self) -> Sequence[Any]:
+        samplers: Sequence[Any] = value(self.param, "annotated_data_param").batch_sampler
+        return samplers
+
+    @override
+    def open(self) -> Source | None:
+        p, context = self.param, self.context
+        reader = self._reader
+        augment = self.attempt(Augmenter, p.transform_param, self._samplers, self.phase, context.at)
+        if reader is None or augment is None:
+            return None
+        if p.data_param.force_encoded_color:
+            augment.color = True
+        skip = self.skip(p.data_param.rand_skip, len(reader), "data_param", "rand_skip")
+        cursor = Cursor(len(reader), self.batch_size, skip, rank=context.rank, ranks=context.ranks)
+        typed = has(value(p, "annotated_data_param"), "anno_type")
+        source = AnnotatedSource(reader, cursor, augment, typed, context.data_seed, self.stream, self.place)
+        self.log_size(source, "annotated_data_layer.cpp:62")
+        return source
+
+    @override
+    def known_shape(self) -> Shape | None:
+        """Return the shape where the prototxt says size and channels."""
+        p = self.param.transform_param
+        resize, crop = value(p, "resize_param"), (value(p, "crop_h"), value(p, "crop_w"))
+        channels = 3 if p.force_color else 1 if p.force_gray else len(p.mean_value)
+        if p.crop_size or all(crop):
+            size = (p.crop_size,) * 2 if p.crop_size else crop
+        elif has(p, "resize_param") and resize.resize_mode != FIT_SMALL_SIZE:
+            size = (resize.height, resize.width)
+        else:
+            return None
+        return (self.batch_size, channels, *size) if channels > 1 or p.force_gray else None
+
+    @override
+    def shapes_without_data(self) -> list[Shape]:
+        """Return the images' shape, and that of a single box."""
+        data, *_ = super().shapes_without_data()
+        given = self.context.given_shapes
+        return [data, *(given.get(top, (1, 1, 1, COLUMNS + 1)) for top in self.param.top[1:])]

@@ -1,0 +1,46 @@
+"""Which engine is to run a net, in what precision, and where its model is kept."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from netspec.errors import SpecError, did_you_mean
+
+TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")
+FP32, BF16 = PRECISIONS = ("fp32", "bf16")
+_NEEDS = {ONNXRUNTIME: ("onnx", "onnxruntime"), OPENVINO: ("onnx", "openvino")}  # modules
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An engine. ``cache`` is the folder in which exported models are kept, None if they are not."""
+
+    engine: str = TORCH
+    precision: str = FP32
+    cache: Path | None = None
+
+    @staticmethod
+    def of(engine: str, precision: str = FP32, cache: str | Path | bool | None = None) -> Choice:
+        """Return a checked choice. ``cache``: None for the user's cache folder, False for none, or a folder.
+
+        Raises SpecError for an engine or a precision that there is not, and for an engine that is not installed.
+        """
+        for what, found, known in (("engine", engine, ENGINES), ("precision", precision, PRECISIONS)):
+            if found not in known:
+                close = did_you_mean(found, known) or f"; expected one of: {', '.join(known)}"
+                raise SpecError(f'unknown {what} "{found}"{close}')
+        for module in _NEEDS.get(engine, ()):
+            if find_spec(module) is None:
+                raise SpecError(f"engine {engine} needs the {module} library: pip install 'netspec-caffe[{engine}]'")
+        if cache is None or cache is True:
+            return Choice(engine, precision, user_folder())
+        return Choice(engine, precision, None if cache is False or cache == "" else Path(cache))
+
+
+def user_folder() -> Path:
+    """Return where the models are kept by default: ``netspec`` in XDG_CACHE_HOME, or in ``~/.cache``."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "netspec"

@@ -1,0 +1,113 @@
+"""Passes for inference: the steps of a plan, without what does nothing, with what others do in the same pass.
+
+``fold``   what scales and shifts channels becomes part of the weights of the layer before or after it
+``fuse``   an activation is computed in place, on the top of the layer before it
+``skip``   layers that hand their bottom on are not run
+
+They know no layer type: :class:`Roles` says of each layer what it can do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from netspec.graph.fold import Chain, Roles, find_chains, origins
+from netspec.graph.plan import Plan
+
+FOLD, FUSE, SKIP, PACK = "fold", "fuse", "skip", "pack"
+PASSES = (FOLD, FUSE, SKIP, PACK)  # pack: weights laid out in advance (netspec/layers/fused.py)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One kernel of a run: layer ``node`` with its ``chain`` folded in, then layer ``finish`` in place on its top.
+
+    ``bottoms`` and ``tops`` are values; ``reuse``: nobody else needs the memory of the first bottom; ``ends``: values
+    that are not needed after it.
+    """
+
+    node: int
+    bottoms: tuple[int, ...]
+    tops: tuple[int, ...]
+    chain: Chain | None = None
+    finish: int | None = None
+    reuse: bool = False
+    ends: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Steps in running order; ``origin[v]`` is the value that stands for value v."""
+
+    steps: tuple[Step, ...]
+    origin: tuple[int, ...]
+
+
+def schedule(
+    plan: Plan,
+    roles: Roles,
+    finishes: Sequence[bool],
+    fresh: Sequence[bool],
+    given: Collection[int],
+    kept: Collection[int],
+    passes: Collection[str],
+) -> Schedule:
+    """Return the steps that compute the values ``kept`` and the net's outputs, and run every layer, once.
+
+    ``finishes[i]``: layer i can be computed in place; ``fresh[i]``: its top is memory of its own. The values ``given``
+    are there before the first step.
+    """
+    passes_on = roles.passes_on if SKIP in passes else [False] * len(plan.nodes)
+    kept = {*kept, *plan.outputs.values()}
+    chains = find_chains(plan, _with(roles, passes_on), kept) if FOLD in passes else []
+    by_keeper = {chain.keeper: chain for chain in chains}
+    gone = {i for chain in chains for i in chain.folded}
+    origin = origins(plan, passes_on)
+    lasting = {origin[v] for v in kept}
+    readers = _readers(plan, origin, passes_on)
+    steps: list[Step] = []
+    for i, node in enumerate(plan.nodes):
+        if i in gone or passes_on[i] or (node.tops and set(node.tops) <= set(given)):
+            continue
+        chain = by_keeper.get(i)
+        first, last = (min(i, *chain.folded), chain.last) if chain else (i, i)
+        tops, finish = plan.nodes[last].tops, None
+        if FUSE in passes and fresh[i] and len(tops) == 1 and tops[0] not in lasting:
+            after = readers.get(tops[0], [])
+            if len(after) == 1 and finishes[after[0]] and after[0] not in gone:
+                finish = after[0]
+                gone.add(finish)
+                tops = plan.nodes[finish].tops
+        steps.append(Step(i, tuple(origin[v] for v in plan.nodes[first].bottoms), tops, chain, finish))
+    return Schedule(tuple(_with_ends(steps, fresh, lasting, FUSE in passes)), origin)
+
+
+def _with(roles: Roles, passes_on: Sequence[bool]) -> Roles:
+    return Roles(roles.absorbs, roles.affine, roles.absorbs_before, passes_on)
+
+
+def _readers(plan: Plan, origin: Sequence[int], passes_on: Sequence[bool]) -> dict[int, list[int]]:
+    """Return the layers that read each value, in running order."""
+    readers: dict[int, list[int]] = {}
+    for i, node in enumerate(plan.nodes):
+        for v in node.bottoms if not passes_on[i] else ():
+            readers.setdefault(origin[v], []).append(i)
+    return readers
+
+
+def _with_ends(steps: Sequence[Step], fresh: Sequence[bool], lasting: Collection[int], reusing: bool) -> list[Step]:
+    """Return the steps with what ends with them, and what may be overwritten: memory that no view shows."""
+    last = {v: s for s, step in enumerate(steps) for v in (*step.bottoms, *step.tops)}
+    owned: set[int] = set()
+    made = []
+    for s, step in enumerate(steps):
+        ends = tuple(dict.fromkeys(v for v in (*step.bottoms, *step.tops) if last[v] == s and v not in lasting))
+        first = step.bottoms[0] if step.bottoms else -1
+        reuse = reusing and first in ends and first in owned and step.bottoms.count(first) == 1
+        made.append(Step(step.node, step.bottoms, step.tops, step.chain, step.finish, reuse, ends))
+        if fresh[step.node]:
+            owned.update(step.tops)
+        else:
+            owned.difference_update(step.bottoms)
+    return made

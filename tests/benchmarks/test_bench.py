@@ -1,0 +1,122 @@
+"""tools/bench: its rounds, its tables, its words for what cannot run."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import environment
+from benchmarks.cli import main
+from benchmarks.report import Row, table
+from benchmarks.rounds import difference, measure, ratio
+
+
+class Clock:
+    """Something that takes turns and says that its passes take so long."""
+
+    def __init__(self, name: str, seconds: float, turns: list[str]) -> None:
+        self.name, self.seconds, self.turns, self.fault, self.outputs = name, seconds, turns, "", {}
+
+    def turn(self, passes: int) -> list[float]:
+        self.turns.append(self.name)
+        return [self.seconds] * passes
+
+    def close(self) -> None:
+        pass
+
+
+def test_all_take_their_turn_in_every_round_in_either_order() -> None:
+    turns: list[str] = []
+    found = measure([Clock("a", 0.1, turns), Clock("b", 0.2, turns)], 3, lambda k: None)
+    assert turns == ["a", "b", "a", "b", "b", "a", "a", "b"]  # the first two say how many passes a turn has
+    assert found == {"a": [0.1] * 3, "b": [0.2] * 3}
+
+
+def test_a_ratio_is_that_of_times_in_the_same_round() -> None:
+    assert ratio([1, 10, 3], [2, 20, 3]) == 0.5
+
+
+def test_a_difference_is_relative_and_needs_equal_shapes() -> None:
+    expected = {"a": np.array([1, 2, 4.0])}
+    assert difference({"a": np.array([[1, 2, 3.0]])}, expected) == 0.25
+    assert difference({"a": np.zeros(2)}, expected) is None
+    assert difference({}, expected) is None
+
+
+def test_a_table_has_the_ratios_of_what_ran_and_a_line_for_what_did_not() -> None:
+    rows = [
+        Row("lenet", 1, 2, "netspec", [1e-3, 3e-3, 2e-3], {"pytorch": 0.5}, None),
+        Row("lenet", 1, 2, "pytorch", [4e-3] * 3, {}, 1e-7),
+        Row("lenet", 1, 2, "opencv4", [], {}, None, "it cannot"),
+    ]
+    lines = table(rows).splitlines()
+    assert lines[0] == "| net | batch | threads | run by | ms | best | / pytorch | off by |"
+    assert lines[2:] == [
+        "| lenet | 1 | 2 | netspec | 2.00 | 1.00 | 0.50 | - |",
+        "| lenet | 1 | 2 | pytorch | 4.00 | 4.00 | - | 1e-07 |",
+        "| lenet | 1 | 2 | opencv4 | - | - | - | - |",
+    ]
+
+
+@pytest.mark.slow
+def test_forward_passes_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "lenet.json"
+    ways = ["--with", "netspec", "pytorch", "pycaffe"]
+    assert main(["forward", "lenet", *ways, "--rounds", "2", "--json", str(out)]) == 0
+    assert "| lenet | 1 | 1 | pytorch |" in capsys.readouterr().out
+    told = json.loads(out.read_text())
+    assert [row["name"] for row in told["rows"]] == ["netspec", "pytorch", "pycaffe"]
+    assert all(len(row["seconds"]) == 2 and not row["fault"] for row in told["rows"])
+    assert told["rows"][1]["difference"] < 1e-5
+    assert told["machine"]["cores"] > 0
+
+
+@pytest.mark.slow
+def test_trainings_are_compared_with_the_program_caffe_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    caffe = shutil.which("netspec", path=str(Path(sys.executable).parent))  # it has Caffe's commands and log
+    if caffe is None:
+        pytest.skip("netspec is not installed as a program")
+    out = tmp_path / "lenet.json"
+    words = ["--batch", "4", "--rounds", "2", "--caffe", caffe, "--json", str(out)]
+    assert main(["train", "lenet", "--with", "netspec", "pytorch", *words]) == 0
+    rows = json.loads(out.read_text())["rows"]
+    assert [row["name"] for row in rows] == ["netspec", "pytorch", "caffe"]
+    assert all(min(row["seconds"]) > 0 for row in rows)
+    assert rows[1]["difference"] < 1e-5
+    assert "/ pytorch | / caffe" in capsys.readouterr().out
+
+
+def test_what_cannot_run_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    net = tmp_path / "net.prototxt"
+    net.write_text('layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 2 } } }')
+    assert main(["forward", str(net), "--with", "pytorch", "--rounds", "1"]) == 0
+    told = capsys.readouterr()
+    assert told.err.splitlines()[-1].startswith("pytorch: there is no twin of this net")
+    assert main(["train", "resnet51"]) == 1
+    assert 'no training of "resnet51"' in capsys.readouterr().err
+
+
+def test_an_environment_that_cannot_be_installed_is_a_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(environment, "FOLDER", tmp_path / "bench")
+    monkeypatch.setattr(
+        environment,
+        "PACKAGES",
+        (
+            "--no-index",
+            "no-such-package",
+        ),
+    )
+
+    def create(folder: Path, **_: object) -> None:
+        (folder / "bin").mkdir(parents=True)
+        (folder / "bin" / "python").write_text("#!/bin/sh\necho no such package >&2; exit 1\n")
+        (folder / "bin" / "python").chmod(0o755)
+
+    monkeypatch.setattr(environment.venv, "create", create)
+    assert main(["forward", "lenet", "--with", "opencv4", "--rounds", "1"]) == 1
+    assert capsys.readouterr().err.endswith("bench: cannot install the yardsticks: no such package\n")

@@ -1,0 +1,54 @@
+"""``netspec check --plan`` and ``--passes``."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from paths import ROOT
+
+DEPLOY = ROOT / "prototxt" / "small" / "siamese_resnet27_256" / "deploy.prototxt"
+
+
+def test_the_plan_names_what_runs_together(run: Callable[..., Any]) -> None:
+    lines = run("check", DEPLOY, "--plan").out.splitlines()
+    (first,) = (line for line in lines if line.startswith("  ") and line.split()[1] == "conv1a")
+    assert first.split(maxsplit=1)[1] == "conv1a + bn_conv1a + scale_conv1a + relu_conv1a"
+    assert any("passes: fold, fuse, skip, pack; bfloat16 on this CPU:" in line for line in lines)
+
+
+@pytest.mark.parametrize(("passes", "steps"), [("skip", 124), ("none", None)])
+def test_passes_are_switched(run: Callable[..., Any], passes: str, steps: int | None) -> None:
+    out = run("check", DEPLOY, "--plan", "--passes", passes).out
+    assert (f"run as {steps} steps" in out) if steps else "no passes" in out
+
+
+def test_an_unknown_pass_is_refused(run: Callable[..., Any]) -> None:
+    result = run("check", DEPLOY, "--passes", "folds")
+    assert result.status == 2
+    assert "found 'folds', expected none, or some of fold,fuse,skip,pack" in result.err
+
+
+def test_a_training_net_has_no_passes(run: Callable[..., Any]) -> None:
+    assert "no passes" in run("check", DEPLOY, "--plan", "--phase", "TRAIN").out
+
+
+def test_extract_takes_passes(run: Callable[..., Any]) -> None:
+    words = (
+        "extract",
+        "--model",
+        "sgd_step/train_val.prototxt",
+        "--weights",
+        "sgd_step/init.caffemodel",
+        "--blob",
+        "feat",
+        "--iterations",
+        1,
+    )
+    found = []
+    for passes in ("none", "fold,pack"):
+        result = run(*words, "--out", "f.npz", "--passes", passes)
+        assert result.status == 0, result.err
+        found.append(np.load("f.npz")["feat"])
+    np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,285 @@
+"""SSD's AnnotatedData beside plain loops, and pictures whose boxes must stay on what they show."""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from annotated_records import annotated, write
+from netspec.data.datum import array_to_datum
+from netspec.dialects import use_dialect
+from netspec.errors import SpecError
+from netspec.layers import Context, Layer, layer_class
+from netspec.proto.schema import TEST, TRAIN
+from netspec.proto.text import parse_net_text
+
+
+@pytest.fixture(autouse=True)
+def _ssd() -> None:
+    use_dialect("ssd")
+
+
+def reading(
+    source: Path, transform: str = "", more: str = "", batch: int = 1, phase: int = TEST, seed: int = 0
+) -> Layer:
+    text = f"""layer {{ name: "data" type: "AnnotatedData" top: "data" top: "label" transform_param {{ {transform} }}
+        data_param {{ source: "{source}" batch_size: {batch} backend: LMDB prefetch: 0 }}
+        annotated_data_param {{ {more} }} }}"""
+    net, places = parse_net_text(text, "net.prototxt")
+    cls = layer_class("AnnotatedData")
+    assert cls is not None
+    at = lambda *path: places.at(0, *path, layer="data", type="AnnotatedData")  # noqa: E731
+    return cls(net.layer[0], [], Context(phase=phase, data_seed=seed, at=at))
+
+
+def batch_of(layer: Layer) -> tuple[np.ndarray, np.ndarray]:
+    data, label = layer.run()
+    assert [tuple(data.shape), tuple(label.shape)] == layer.top_shapes
+    return data.numpy(), label.numpy()
+
+
+def noise(height: int, width: int, channels: int = 3) -> np.ndarray:
+    return np.random.default_rng(height).integers(0, 256, (height, width, channels), np.uint8)
+
+
+OBJECTS = [(3, (0.1, 0.2, 0.5, 0.75), False), (3, (0.0, 0.0, 0.25, 0.5), True), (5, (0.5, 0.25, 1.0, 1.0), False)]
+
+
+@pytest.mark.parametrize("encode", [False, True])
+def test_images_and_rows_of_boxes(tmp_path: Path, encode: bool) -> None:
+    first, second = noise(8, 12), noise(8, 12) // 2
+    source = write(tmp_path, annotated(first, OBJECTS, encode), annotated(second, OBJECTS[2:], encode))
+    data, label = batch_of(reading(source, "mean_value: 10 mean_value: 20 mean_value: 30 scale: 0.5", batch=2))
+    expected = (np.stack([first, second]).astype(float) - [10, 20, 30]) * 0.5
+    np.testing.assert_allclose(data, expected.transpose(0, 3, 1, 2))
+    rows = [
+        (0, 3, 0, 0.1, 0.2, 0.5, 0.75, 0),
+        (0, 3, 1, 0.0, 0.0, 0.25, 0.5, 1),
+        (0, 5, 0, 0.5, 0.25, 1.0, 1.0, 0),
+        (1, 5, 0, 0.5, 0.25, 1.0, 1.0, 0),
+    ]
+    np.testing.assert_allclose(label[0, 0], rows, atol=1e-6)
+
+
+def test_without_any_box_there_is_one_row_of_minus_one(tmp_path: Path) -> None:
+    layer = reading(write(tmp_path, annotated(noise(4, 4), [])))
+    assert layer.top_shapes[1] == (1, 1, 1, 8)
+    assert np.array_equal(batch_of(layer)[1], np.full((1, 1, 1, 8), -1))
+
+
+def test_records_without_a_type_give_their_labels(tmp_path: Path) -> None:
+    datum = annotated(noise(4, 4), OBJECTS)
+    datum.ClearField("type")
+    source = write(tmp_path, datum)
+    assert batch_of(reading(source))[1].tolist() == [[[[7]]]]
+    assert batch_of(reading(source, more="anno_type: BBOX"))[1].shape == (1, 1, 3, 8)
+
+
+def test_an_image_is_warped_and_its_boxes_stay(tmp_path: Path) -> None:
+    image = noise(9, 15)
+    layer = reading(write(tmp_path, annotated(image, OBJECTS)), "resize_param { height: 6 width: 6 }")
+    data, label = batch_of(layer)
+    np.testing.assert_array_equal(data[0], cv2.resize(image, (6, 6)).transpose(2, 0, 1))
+    np.testing.assert_allclose(label[0, 0, :, 3:7], [box for _, box, _ in OBJECTS], atol=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width", "inner"), [(10, 20, (15, 30)), (20, 10, (30, 15))])
+def test_an_image_is_fitted_in_and_its_boxes_with_it(
+    tmp_path: Path, height: int, width: int, inner: tuple[int, int]
+) -> None:
+    image = noise(height, width)
+    resize = "resize_param { resize_mode: FIT_LARGE_SIZE_AND_PAD height: 30 width: 30 pad_value: 9 }"
+    data, label = batch_of(reading(write(tmp_path, annotated(image, OBJECTS)), resize))
+    top, left = (30 - inner[0]) // 2, (30 - inner[1]) // 2
+    expected = np.full((3, 30, 30), 9.0)
+    small = cv2.resize(image, inner[::-1]).transpose(2, 0, 1)
+    expected[:, top : top + inner[0], left : left + inner[1]] = small
+    np.testing.assert_array_equal(data[0], expected)
+    moved = [
+        [
+            ((30 - inner[1]) / 2 + x * inner[1]) / 30 if k % 2 == 0 else ((30 - inner[0]) / 2 + x * inner[0]) / 30
+            for k, x in enumerate(box)
+        ]
+        for _, box, _ in OBJECTS
+    ]
+    np.testing.assert_allclose(label[0, 0, :, 3:7], moved, atol=1e-6)
+
+
+def test_an_image_is_fitted_around_and_its_boxes_counted_in_parts_of_a_given_size(tmp_path: Path) -> None:
+    resize = "resize_param { resize_mode: FIT_SMALL_SIZE height: 8 width: 8 %s }"
+    source = write(tmp_path, annotated(noise(10, 20), OBJECTS))
+    data, label = batch_of(reading(source, resize % ""))
+    assert data.shape == (1, 3, 8, 16)
+    np.testing.assert_allclose(label[0, 0, :, 3:7], [box for _, box, _ in OBJECTS], atol=1e-6)
+    scaled = batch_of(reading(source, resize % "height_scale: 16 width_scale: 32"))[1]
+    np.testing.assert_allclose(scaled[0, 0, :, 3:7], np.array([box for _, box, _ in OBJECTS]) / 2, atol=1e-6)
+
+
+def test_a_crop_cuts_boxes_and_drops_those_outside(tmp_path: Path) -> None:
+    boxes = [(1, (0.0, 0.0, 0.5, 0.5), False), (2, (0.0, 0.0, 0.2, 0.2), False)]
+    image = noise(20, 40)
+    data, label = batch_of(reading(write(tmp_path, annotated(image, boxes)), "crop_h: 10 crop_w: 20"))
+    np.testing.assert_array_equal(data[0], image[5:15, 10:30].transpose(2, 0, 1))
+    np.testing.assert_allclose(label[0, 0], [(0, 1, 0, 0, 0, 0.5, 0.5, 0)], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("constraint", "kept"),
+    [
+        ("", [1, 2]),
+        ("emit_type: CENTER", [1]),
+        ("emit_type: MIN_OVERLAP emit_overlap: 0.1", [1, 2]),
+        ("emit_type: MIN_OVERLAP emit_overlap: 0.3", [1]),
+    ],
+)
+def test_emit_constraint_says_which_boxes_stay(tmp_path: Path, constraint: str, kept: list[int]) -> None:
+    boxes = [(1, (0.3, 0.3, 0.6, 0.6), False), (2, (0.0, 0.0, 0.48, 0.48), False)]  # 23 % of the second are inside
+    emit = f"emit_constraint {{ {constraint} }}" if constraint else ""
+    label = batch_of(reading(write(tmp_path, annotated(noise(20, 20), boxes)), f"crop_size: 10 {emit}"))[1]
+    assert label[0, 0, :, 1].tolist() == kept
+
+
+SSD = """mirror: true mean_value: 104 mean_value: 117 mean_value: 123
+    resize_param { prob: 1 resize_mode: WARP height: 60 width: 60 interp_mode: LINEAR interp_mode: AREA
+                   interp_mode: NEAREST interp_mode: CUBIC interp_mode: LANCZOS4 }
+    emit_constraint { emit_type: CENTER }
+    expand_param { prob: 0.5 max_expand_ratio: 3 }"""
+DISTORT = """distort_param { brightness_prob: 0.5 brightness_delta: 32 contrast_prob: 0.5 contrast_lower: 0.5
+    contrast_upper: 1.5 hue_prob: 0.5 hue_delta: 18
+    saturation_prob: 0.5 saturation_lower: 0.5 saturation_upper: 1.5 }"""
+SAMPLERS = "batch_sampler { max_sample: 1 max_trials: 1 } " + " ".join(
+    f"""batch_sampler {{ sampler {{ min_scale: 0.3 max_scale: 1 min_aspect_ratio: 0.5 max_aspect_ratio: 2 }}
+        sample_constraint {{ {limit} }} max_sample: 1 max_trials: 50 }}"""
+    for limit in ("min_jaccard_overlap: 0.1", "min_jaccard_overlap: 0.7", "max_jaccard_overlap: 1.0")
+)
+
+
+def test_boxes_stay_on_what_they_show_however_an_image_is_varied(tmp_path: Path) -> None:
+    image = np.full((90, 120, 3), (104, 117, 123), np.uint8)
+    image[30:60, 20:80] = 255
+    source = write(tmp_path, annotated(image, [(1, (20 / 120, 30 / 90, 80 / 120, 60 / 90), False)]))
+    layer = reading(source, SSD, SAMPLERS, batch=64, phase=TRAIN)
+    data, label = batch_of(layer)
+    rows = {int(row[0]): row for row in label[0, 0]}
+    assert len(rows) > 50
+    shapes = set()
+    for i, row in rows.items():
+        bright = data[i].min(axis=0) > 60
+        ys, xs = np.nonzero(bright)
+        found = np.array([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1])
+        np.testing.assert_allclose(found, row[3:7] * 60, atol=2.5)
+        shapes.add(tuple(found))
+    assert len(shapes) > 40
+
+
+def test_a_record_is_varied_the_same_in_each_run_and_differently_in_each_epoch(tmp_path: Path) -> None:
+    source = write(tmp_path, annotated(noise(40, 50), OBJECTS))
+    runs = [reading(source, SSD + DISTORT, SAMPLERS, batch=4, phase=TRAIN, seed=seed) for seed in (1, 1, 2)]
+    first, again, other = (batch_of(layer) for layer in runs)
+    np.testing.assert_array_equal(first[0], again[0])
+    np.testing.assert_array_equal(first[1], again[1])
+    assert not np.array_equal(first[0], other[0])
+    assert len({image.tobytes() for image in first[0]}) == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ("brightness_prob: 1 brightness_delta: 40", lambda x: None),
+        ("contrast_prob: 1 contrast_lower: 0.5 contrast_upper: 0.5", lambda x: np.rint(x * 0.5)),
+        ("contrast_prob: 1 contrast_lower: 3 contrast_upper: 3", lambda x: np.minimum(x * 3.0, 255)),
+        ("saturation_prob: 1 saturation_lower: 0 saturation_upper: 0", lambda x: x.max(axis=2, keepdims=True) + 0 * x),
+        ("hue_prob: 0 hue_delta: 90", lambda x: x),
+    ],
+)
+def test_colors(tmp_path: Path, settings: str, expected: Callable[[np.ndarray], np.ndarray | None]) -> None:
+    image = noise(6, 6)
+    data, _ = batch_of(reading(write(tmp_path, annotated(image, [])), f"distort_param {{ {settings} }}", phase=TRAIN))
+    wanted = expected(image)
+    found = data[0].transpose(1, 2, 0)
+    if wanted is None:  # one number is added to all
+        inside = (found > 0) & (found < 255)
+        assert len(np.unique((found - image)[inside])) == 1
+    else:
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_channel_order_is_drawn(tmp_path: Path) -> None:
+    image = noise(3, 3)
+    layer = reading(write(tmp_path, annotated(image, [])), "distort_param { random_order_prob: 1 }", batch=40)
+    orders = set()
+    for one in batch_of(layer)[0]:
+        orders.add(tuple(next(c for c in range(3) if np.array_equal(plane, image[:, :, c])) for plane in one))
+    assert orders == set(itertools.permutations(range(3)))
+
+
+CONSTRAINTS = [
+    ("min_jaccard_overlap: 0.4", lambda jaccard, sample, object_: jaccard >= 0.4),
+    ("max_jaccard_overlap: 0.2", lambda jaccard, sample, object_: jaccard <= 0.2),
+    ("min_sample_coverage: 0.5 max_sample_coverage: 0.8", lambda jaccard, sample, object_: 0.5 <= sample <= 0.8),
+    ("min_object_coverage: 0.9", lambda jaccard, sample, object_: object_ >= 0.9),
+]
+
+
+@pytest.mark.parametrize(("limits", "meets"), CONSTRAINTS)
+def test_windows_meet_their_constraint(tmp_path: Path, limits: str, meets: Callable[..., bool]) -> None:
+    """The image shows its own coordinates, so that the window can be read from it."""
+    y, x = np.mgrid[:200, :200].astype(np.uint8)
+    image = np.dstack([y, x, np.zeros_like(x)])
+    box = (0.2, 0.3, 0.7, 0.8)
+    more = f"""batch_sampler {{ sampler {{ min_scale: 0.2 max_scale: 1 min_aspect_ratio: 0.5 max_aspect_ratio: 2 }}
+        sample_constraint {{ {limits} }} max_sample: 1 max_trials: 500 }}"""
+    layer = reading(write(tmp_path, annotated(image, [(1, box, False)])), "", more, phase=TRAIN)
+    for _ in range(20):
+        data, _ = batch_of(layer)
+        top, left, low, right = data[0, 0].min(), data[0, 1].min(), data[0, 0].max() + 1, data[0, 1].max() + 1
+        window = np.array([left, top, right, low]) / 200
+        across = min(window[2], box[2]) - max(window[0], box[0])
+        down = min(window[3], box[3]) - max(window[1], box[1])
+        common = max(across, 0) * max(down, 0)
+        area, own = (window[2] - window[0]) * (window[3] - window[1]), 0.25
+        measured = [common / (area + own - common), common / area, common / own]
+        assert any(meets(*(m + slack for m in measured)) for slack in (-0.02, 0, 0.02))  # whole pixels
+
+
+@pytest.mark.parametrize(
+    ("transform", "more", "batch", "fault"),
+    [
+        ("resize_param { height: 5 }", "", 1, r"net.prototxt:1:\d+: .*height and width must both be above 0"),
+        ("resize_param { height: 5 width: 5 resize_mode: FIT_SMALL_SIZE }", "", 2, "needs batch_size: 1, found 2"),
+        ("expand_param { max_expand_ratio: 1 }", "", 1, "max_expand_ratio must be above 1"),
+        ("mean_value: 1 mean_value: 2", "", 1, "found 2 mean_value for 3 channels"),
+        ("crop_size: 99", "", 1, "the crop is 99 x 99, larger than the image, 8 x 8"),
+        ("distort_param { contrast_lower: 2 contrast_upper: 1 }", "", 1, "found contrast from 2 to 1"),
+        ("", "batch_sampler { sampler { max_scale: 2 } }", 1, "found scales 1 to 2, expected 0 < min <= max <= 1"),
+        ("", "batch_sampler { sampler { min_aspect_ratio: 0 } }", 1, "found aspect ratios 0 to 1"),
+        ("", "", 2, 'record "0001" gives 3 x 8 x 9, the first 3 x 8 x 8; all must have the same size'),
+    ],
+)
+def test_what_does_not_fit_is_refused(tmp_path: Path, transform: str, more: str, batch: int, fault: str) -> None:
+    source = write(tmp_path, annotated(noise(8, 8), OBJECTS), annotated(noise(8, 9), OBJECTS))
+    with pytest.raises(SpecError, match=fault):
+        batch_of(reading(source, transform, more, batch))
+
+
+def test_a_database_of_plain_images_says_what_it_is(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match='record "0000" is no AnnotatedDatum; for a database of plain images use'):
+        reading(write(tmp_path, array_to_datum(noise(4, 4).transpose(2, 0, 1), 1)))
+
+
+def test_shapes_are_known_without_data() -> None:
+    text = "type: 'AnnotatedData' top: 'data' top: 'label' data_param { source: 'x' batch_size: 8 }"
+    means = "mean_value: 1 mean_value: 2 mean_value: 3"
+    for transform, shape in (
+        (f"{means} resize_param {{ height: 5 width: 6 }}", (8, 3, 5, 6)),
+        (f"{means} resize_param {{ height: 5 width: 6 }} crop_size: 4", (8, 3, 4, 4)),
+        ("force_gray: true crop_h: 4 crop_w: 3", (8, 1, 4, 3)),
+    ):
+        net, _ = parse_net_text(f"layer {{ {text} transform_param {{ {transform} }} }}", "net.prototxt")
+        cls = layer_class("AnnotatedData")
+        assert cls is not None
+        layer = cls(net.layer[0], [], Context(open_data=False))
+        assert layer.top_shapes == [shape, (1, 1, 1, 8)]

@@ -1,0 +1,94 @@
+"""Fields that forks added to Caffe's own layers: Convolution's holes and sides, BatchNorm's slopes and biases."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from netspec.dialects import use_dialects_of
+from netspec.errors import SpecError
+from netspec.layers import Layer
+from netspec.net.build import build_net
+from netspec.proto.schema import TRAIN
+from netspec.proto.text import parse_net_text
+
+Build = Callable[..., Layer]
+Gradcheck = Callable[..., None]
+CONV = "type: 'Convolution' convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: 'xavier' } %s }"
+
+
+@pytest.mark.parametrize(
+    ("given", "dilation"), [("hole: 2", (2, 2)), ("hole_h: 1 hole_w: 2", (1, 2)), ("dilation: 3", (3, 3)), ("", (1, 1))]
+)
+def test_a_hole_is_a_dilation(build: Build, given: str, dilation: tuple[int, int]) -> None:
+    data = torch.randn(2, 3, 9, 8)
+    layer = build("filters", CONV % given, data.shape)
+    (top,) = layer.run(data)
+    np.testing.assert_allclose(
+        top.detach(), F.conv2d(data, *layer.blobs, dilation=dilation).detach(), rtol=1e-4, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_each_side_has_its_pad(build: Build, gradcheck: Gradcheck, stride: int) -> None:
+    data = torch.randn(2, 3, 6, 5)
+    sides = f"stride: {stride} pad_l: 2 pad_r: 1 pad_b: 3"
+    layer = build("filters", CONV % sides, data.shape)
+    (top,) = layer.run(data)
+    assert layer.top_shapes == [tuple(top.shape)]
+    expected = F.conv2d(F.pad(data, (2, 1, 0, 3)), *layer.blobs, stride=stride)
+    np.testing.assert_allclose(top.detach(), expected.detach(), rtol=1e-4, atol=1e-5)
+    gradcheck(build("filters", CONV % sides, (1, 2, 3, 3)), torch.randn(1, 2, 3, 3))
+
+
+@pytest.mark.parametrize(
+    ("given", "fault"),
+    [
+        ("hole: 2 dilation: 2", "found hole beside dilation"),
+        ("hole_h: 2", "or both hole_h and hole_w; found hole_h"),
+        ("hole: 0", "hole must be at least 1"),
+        ("pad: 1 pad_t: 1", "found both pad and pad_t"),
+    ],
+)
+def test_contradictions_are_refused(build: Build, given: str, fault: str) -> None:
+    with pytest.raises(SpecError, match=fault):
+        build("filters", CONV % given, (1, 3, 9, 9))
+
+
+def test_the_dialect_is_found_in_a_file_of_the_older_format() -> None:
+    """DeepLab's files are of 2015: ``layers``, types without quotes, ``hole``."""
+    text = """input: "data" input_dim: 1 input_dim: 3 input_dim: 9 input_dim: 9
+        layers { bottom: "data" top: "fc6" name: "fc6" type: CONVOLUTION
+          convolution_param { num_output: 4 pad: 2 hole: 2 kernel_size: 3 } }"""
+    assert use_dialects_of(text, "net.prototxt") == ["filters"]
+    assert build_net(*parse_net_text(text, "net.prototxt")).shapes["fc6"] == (1, 4, 9, 9)
+
+
+NORM = "type: 'BatchNorm' batch_norm_param { eps: 0.01 scale_bias: true %s }"
+
+
+def test_batch_norm_with_slopes_and_biases(build: Build, gradcheck: Gradcheck) -> None:
+    data = torch.randn(4, 3, 5, 2)
+    fillers = "scale_filler { type: 'uniform' min: 1 max: 2 } bias_filler { type: 'uniform' min: 1 max: 2 }"
+    layer = build("nvidia", NORM % fillers, data.shape)
+    assert layer.blob_shapes == [(3,), (3,), (1,), (3,), (3,)]
+    assert layer.not_learned == {0, 1, 2}
+    with torch.no_grad():
+        for blob, values in zip(layer.blobs, ([1.0, 2, 3], [4.0, 5, 6], [2.0]), strict=False):
+            blob.copy_(torch.tensor(values))
+    mean, variance, weight, slope, bias = (blob.detach() for blob in layer.blobs)
+    expected = F.batch_norm(data, mean / weight, variance / weight, slope, bias, eps=0.01)
+    np.testing.assert_allclose(layer.run(data)[0].detach(), expected, rtol=1e-4, atol=1e-5)
+    trained = build("nvidia", NORM % fillers, data.shape, phase=TRAIN)
+    expected = F.batch_norm(data, None, None, *(trained.blobs[i].detach() for i in (3, 4)), training=True, eps=0.01)
+    np.testing.assert_allclose(trained.run(data)[0].detach(), expected, rtol=1e-4, atol=1e-5)
+    gradcheck(build("nvidia", NORM % fillers, (3, 2), phase=TRAIN), torch.randn(3, 2))
+
+
+def test_batch_norm_begins_with_slopes_of_1_and_is_caffes_without_them(build: Build) -> None:
+    layer = build("nvidia", NORM % "", (2, 3))
+    assert layer.blobs[3].tolist() == [1, 1, 1]
+    assert layer.blobs[4].tolist() == [0, 0, 0]
+    assert len(build("nvidia", "type: 'BatchNorm'", (2, 3)).blobs) == 3
