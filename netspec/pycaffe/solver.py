@@ -101,7 +101,13 @@ class Solver:
             param.type = self.type_name
         with caffes_errors():
             self._training = _Training(
-                param, node, device=mode.device(), allow_python=True, exact=mode.exact(), seed=mode.solver_seed()
+                param,
+                node,
+                device=mode.device(),
+                allow_python=True,
+                exact=mode.exact(),
+                seed=mode.solver_seed(),
+                nan="warn",  # as Caffe goes on: a script may look for itself
             )
         self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
         self._training.on_start = lambda: self._call(0)
