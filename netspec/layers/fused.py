@@ -122,9 +122,8 @@ def _laid_out(weight: torch.Tensor, geometry: Sequence[Any]) -> torch.Tensor:
 
 def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernel:
     """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
-    weight = how.memo(
-        f"rows {tuple(weight.shape)}", lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous())
-    )
+    name = f"rows {tuple(weight.shape)} {weight.stride()}"  # of a shared matrix one layer may take the transpose
+    weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
     bias = _kept(bias, how)
     call, relu = _ops()._linear_pointwise.default, how.finish is F.relu_
     arguments = ("relu" if relu else "none", [], "")
