@@ -42,6 +42,13 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="what SIGHUP does (default: snapshot)")
     add_python(p)
     add_exact(p)
+    p.add_argument(
+        "--precision",
+        choices=("fp32", "tf32", "bf16"),
+        default="fp32",
+        help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, and rounds more "
+        "(default: fp32)",
+    )
     add_strict(p)
 
 
@@ -74,6 +81,7 @@ def _train(arguments: argparse.Namespace) -> None:
             action=action,
             exact=arguments.exact,
             strict=arguments.strict,
+            precision=arguments.precision,
             nan=arguments.nan,
         )
         if arguments.scores:

@@ -12,8 +12,9 @@ The build option ``exact`` sets what is computed in this way, on the CPU:
 ``all``    every sum of Caffe's layers, of any size. It is slower, and it holds for one thread, as Caffe's BLAS had it.
 
 The bits are those of a Caffe whose OpenBLAS chose the same kernels for its CPU. The files in tests/golden come from
-OpenBLAS 0.3.21 with its kernels for AVX-512, in one thread, and glibc 2.36. On newer CPUs OpenBLAS chooses newer
-kernels, unless the environment says ``OPENBLAS_CORETYPE=SkylakeX``. What is known to part from these files:
+OpenBLAS 0.3.21 with its kernels for AVX-512, in one thread, and glibc 2.36. On CPUs with AVX-512 these kernels are
+chosen here too, unless the environment has ``OPENBLAS_CORETYPE`` or SciPy's BLAS was loaded before. What is known to
+part from these files:
 
 - Newer OpenBLAS. 0.3.23 to 0.3.30 (SciPy 1.17 has 0.3.30) compute the same bits, in all products of random sizes that
   were compared, transposed or not, and in gemv, dot, asum, axpy and scal. 0.3.31 sums rows of 6 or 7 numbers otherwise

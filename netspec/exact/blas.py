@@ -5,16 +5,38 @@ Caffe: src/caffe/util/math_functions.cpp
 
 from __future__ import annotations
 
+import ctypes
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 import torch
+from threadpoolctl import ThreadpoolController
 
-Values = torch.Tensor | np.ndarray  # a loop over images is faster on arrays, which it makes once
+CORE_TYPE = "OPENBLAS_CORETYPE"  # the environment variable by which OpenBLAS chooses its kernels, when it is loaded
 
+
+def _load() -> tuple[Any, Any]:
+    """Return SciPy's BLAS, for arrays and for addresses, with the kernels for AVX-512 that Caffe's had, if possible.
+
+    OpenBLAS chooses others on some newer CPUs. What the environment says stays; if SciPy's BLAS was loaded before, so
+    do its kernels.
+    """
+    chosen = CORE_TYPE not in os.environ and torch.backends.cpu.get_cpu_capability() == "AVX512"
+    if chosen:
+        os.environ[CORE_TYPE] = "SkylakeX"
+    try:
+        return import_module("scipy.linalg.blas"), import_module("scipy.linalg.cython_blas")
+    finally:
+        if chosen:
+            del os.environ[CORE_TYPE]
+
+
+blas, cython_blas = _load()
 _IN_DOUBLE = 32  # OpenBLAS' dot sums up fewer products than this in double, one by one
 
 
@@ -23,9 +45,9 @@ def suits_blas(tensor: torch.Tensor) -> bool:
     return tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64) and tensor.numel() > 0
 
 
-def array(values: Values) -> np.ndarray:
+def array(values: torch.Tensor) -> np.ndarray:
     """Return values on the CPU as an array that shares their memory."""
-    return values if isinstance(values, np.ndarray) else values.detach().numpy()
+    return values.detach().numpy()
 
 
 def _routine(name: str, values: np.ndarray) -> Callable[..., Any]:
@@ -39,20 +61,75 @@ def gemm_routine(values: np.ndarray) -> Callable[..., Any]:
     return _routine("gemm", values)
 
 
-def gemm(a: Values, b: Values, c: Values, *, a_t: bool = False, b_t: bool = False, add: bool = False) -> None:
+def gemm(
+    a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, *, a_t: bool = False, b_t: bool = False, add: bool = False
+) -> None:
     """C = A B, or C += A B; ``a_t`` and ``b_t`` take the transposes of what is stored (caffe_cpu_gemm).
 
     All three are matrices, stored row by row without gaps. To BLAS, which goes by columns, they are their transposes.
+    Stacks of matrices (N, rows, columns) are multiplied one after the other, as Caffe goes from image to image. There a
+    single matrix stands for N times itself; as C it sums up the products, with ``add``.
     """
-    a, b, c = array(a), array(b), array(c)
-    _routine("gemm", c)(1.0, b.T, a.T, beta=float(add), c=c.T, trans_a=b_t, trans_b=a_t, overwrite_c=True)
+    flags = [ctypes.create_string_buffer(b"T" if t else b"N") for t in (b_t, a_t)]
+    sizes = [ctypes.c_int(n) for n in (c.shape[-1], c.shape[-2], a.shape[-2 if a_t else -1])]
+    factors = [_NUMBERS[c.dtype](n) for n in (1.0, add)]
+    rows = [ctypes.c_int(m.shape[-1]) for m in (b, a, c)]
+    head = [*map(ctypes.addressof, (*flags, *sizes, factors[0]))]
+    row_b, row_a, row_c, beta = map(ctypes.addressof, (*rows, factors[1]))
+    at_a, at_b, at_c = (m.data_ptr() for m in (a, b, c))
+    step_a, step_b, step_c = (_step(m) for m in (a, b, c))
+    call = _function("gemm", c.dtype)
+    for _ in range(_count(a, b, c)):
+        call(*head, at_b, row_b, at_a, row_a, beta, at_c, row_c)
+        at_a, at_b, at_c = at_a + step_a, at_b + step_b, at_c + step_c
 
 
-def add_sums(a: Values, sums: Values, axis: int, factor: float = 1.0) -> None:
-    """Add the sums of matrix A along an axis, times a factor, as its product with a vector of ones (caffe_cpu_gemv)."""
-    a, sums = array(a), array(sums)
-    ones = np.ones(a.shape[axis], a.dtype)
-    _routine("gemv", a)(factor, a.T, ones, beta=1.0, y=sums, trans=axis == 1, overwrite_y=True)
+def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int, factor: float = 1.0) -> None:
+    """Add the sums of matrix A along an axis, times a factor, as its product with a vector of ones (caffe_cpu_gemv).
+
+    Of a stack of matrices (N, rows, columns) the sums of each are added, one after the other; with sums of two axes,
+    (N, ...), to those of its own.
+    """
+    ones = torch.ones(a.shape[axis - 2], dtype=a.dtype)
+    flag = ctypes.create_string_buffer(b"T" if axis == 1 else b"N")
+    rows, columns, step = (ctypes.c_int(n) for n in (a.shape[-2], a.shape[-1], 1))
+    alpha, beta = (_NUMBERS[a.dtype](n) for n in (factor, 1.0))
+    head = [*map(ctypes.addressof, (flag, columns, rows, alpha))]
+    row, one, plus = map(ctypes.addressof, (columns, step, beta))
+    at_ones, at_a, at_sums, step_a = ones.data_ptr(), a.data_ptr(), sums.data_ptr(), _step(a)
+    step_sums = sums.stride(0) * sums.element_size() if sums.dim() == 2 else 0
+    call = _function("gemv", a.dtype)
+    for _ in range(_count(a)):
+        call(*head, at_a, row, at_ones, one, plus, at_sums, one)
+        at_a, at_sums = at_a + step_a, at_sums + step_sums
+
+
+_NUMBERS = {torch.float32: ctypes.c_float, torch.float64: ctypes.c_double}
+_ARGUMENTS = {"gemm": 13, "gemv": 11}
+
+
+@cache
+def _function(name: str, dtype: torch.dtype) -> Callable[..., None]:
+    """Return a Fortran routine of SciPy's BLAS, whose arguments are addresses."""
+    capsule = cython_blas.__pyx_capi__[("s" if dtype == torch.float32 else "d") + name]
+    api = ctypes.pythonapi
+    api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    api.PyCapsule_GetPointer.restype = ctypes.c_void_p
+    api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
+    address = api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule))
+    return ctypes.PYFUNCTYPE(None, *[ctypes.c_void_p] * _ARGUMENTS[name])(address)
+
+
+def _count(*matrices: torch.Tensor) -> int:
+    return max((len(m) for m in matrices if m.dim() == 3), default=1)
+
+
+def _step(matrices: torch.Tensor) -> int:
+    """Return how many bytes lie between a matrix and the next; 0 for a single one. Refuse one with gaps."""
+    rows, columns = matrices.shape[-2:]
+    assert matrices.stride(-1) == 1 or columns == 1, "the numbers of a row lie side by side"
+    assert matrices.stride(-2) == columns or rows == 1, "the rows of a matrix lie side by side"
+    return matrices.stride(0) * matrices.element_size() if matrices.dim() == 3 else 0
 
 
 def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -111,7 +188,6 @@ def one_thread() -> Iterator[None]:
 def _pools() -> list[Any]:
     """Return the OpenBLAS that SciPy brings, or every one there is where SciPy's has no place of its own."""
     import scipy.linalg  # noqa: F401  so that its OpenBLAS is there
-    from threadpoolctl import ThreadpoolController
 
     pools = ThreadpoolController().select(internal_api="openblas").lib_controllers
     return [pool for pool in pools if "scipy.libs" in pool.filepath] or pools

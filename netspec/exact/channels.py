@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.accumulate import ParameterSums
-from netspec.exact.blas import add_sums, array, dot, one_thread, sum_in_order
+from netspec.exact.blas import add_sums, dot, one_thread, sum_in_order
 
 
 class ChannelProducts(ParameterSums):
@@ -48,8 +48,7 @@ class ChannelProducts(ParameterSums):
         factors_sums, bias_sums = sums = ParameterSums.sums(ctx)
         diff = diff.contiguous()
         if bias_sums is not None:
-            for image in array(diff):
-                add_sums(image, bias_sums.view(-1), axis=1)
+            add_sums(diff, bias_sums.view(-1), axis=1)
         if factors_sums is not None:
             _add_products(values * diff, factors_sums.view(-1))
         values_diff = None

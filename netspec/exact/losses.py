@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
 from netspec.exact import libm
-from netspec.exact.blas import add_sums, array, dots, one_thread, sum_in_order
+from netspec.exact.blas import add_sums, dots, one_thread, sum_in_order
 
 
 @one_thread()
@@ -19,8 +19,7 @@ def softmax(scores: torch.Tensor) -> torch.Tensor:
     """Return the softmax along axis 1 of scores (outer, classes, inner) (src/caffe/layers/softmax_layer.cpp)."""
     p = libm.exp(scores - scores.amax(1, keepdim=True))
     sums = p.new_zeros(len(p), p.shape[2])
-    for item, total in zip(array(p), array(sums), strict=True):
-        add_sums(item, total, axis=0)
+    add_sums(p, sums, axis=0)
     return p.div_(sums.unsqueeze(1))
 
 

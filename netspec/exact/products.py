@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -17,9 +18,11 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact.accumulate import ParameterSums
-from netspec.exact.blas import Values, add_sums, array, gemm, gemm_routine, one_thread
+from netspec.exact.blas import add_sums, gemm, gemm_routine, one_thread
 
 Axes = tuple[int, ...]
+FEW = 64  # vectors; a product of fewer takes less time than to round the weights to another precision
+COLUMNS = 2**20  # numbers, 4 MB: the columns of some images, which stay in a CPU's cache
 
 
 @dataclass(frozen=True)
@@ -39,41 +42,45 @@ class Filter:
         axes = zip(size, self.kernel, self.stride, self.pad, self.dilation, strict=True)
         return [(n + 2 * p - d * (k - 1) - 1) // s + 1 for n, k, s, p, d in axes]
 
-    def columns(self, image: torch.Tensor) -> torch.Tensor:
-        """Return (C kernel, positions): a column for each position of the filter, the pixels under it (im2col)."""
+    def columns(self, maps: torch.Tensor) -> torch.Tensor:
+        """Return (N, C kernel, positions): a column for each position of the filter, the pixels under it (im2col)."""
         axes = len(self.kernel)
-        windows = F.pad(image, [p for pad in reversed(self.pad) for p in (pad, pad)]) if any(self.pad) else image
+        windows = F.pad(maps, [p for pad in reversed(self.pad) for p in (pad, pad)]) if any(self.pad) else maps
         for axis in range(axes):
             extent = self.dilation[axis] * (self.kernel[axis] - 1) + 1
-            windows = windows.unfold(1 + axis, extent, self.stride[axis])[..., :: self.dilation[axis]]
-        columns = windows.permute(0, *range(1 + axes, 1 + 2 * axes), *range(1, 1 + axes))
-        return columns.reshape(len(image) * math.prod(self.kernel), -1).contiguous()
+            windows = windows.unfold(2 + axis, extent, self.stride[axis])[..., :: self.dilation[axis]]
+        columns = windows.permute(0, 1, *range(2 + axes, 2 + 2 * axes), *range(2, 2 + axes))
+        return columns.reshape(len(maps), maps.shape[1] * math.prod(self.kernel), -1).contiguous()
 
     def spread(self, columns: torch.Tensor, size: Axes) -> torch.Tensor:
-        """Return the map (C, size) to which every column adds its pixels, one pixel of the filter at a time (col2im).
+        """Return the maps (N, C, size) to which columns add their pixels, one pixel of the filter at a time (col2im).
 
         Torch's own col2im adds in the same order; it is for two axes.
         """
         if len(size) == 2:
             return F.fold(columns, size, self.kernel, self.dilation, self.pad, self.stride)
-        channels, positions = len(columns) // math.prod(self.kernel), self.fits(size)
-        pixels = columns.view(channels, *self.kernel, *positions)
-        framed = columns.new_zeros(channels, *(n + 2 * p for n, p in zip(size, self.pad, strict=True)))
+        count, positions = len(columns), self.fits(size)
+        pixels = columns.view(count, -1, *self.kernel, *positions)
+        framed = columns.new_zeros(count, pixels.shape[1], *(n + 2 * p for n, p in zip(size, self.pad, strict=True)))
+        every = (slice(None), slice(None))
         for pixel in product(*map(range, self.kernel)):
             axes = zip(pixel, self.dilation, self.stride, positions, strict=True)
             under = tuple(slice(k * d, k * d + s * (count - 1) + 1, s) for k, d, s, count in axes)
-            framed[(slice(None), *under)] += pixels[(slice(None), *pixel)]
-        return framed[(slice(None), *(slice(p, p + n) for n, p in zip(size, self.pad, strict=True)))]
+            framed[(*every, *under)] += pixels[(*every, *pixel)]
+        return framed[(*every, *(slice(p, p + n) for n, p in zip(size, self.pad, strict=True)))]
+
+    def images_at_once(self, channels: int, size: Axes) -> int:
+        """Return for how many maps (channels, size) to have columns at a time: no more than ``COLUMNS`` numbers."""
+        return max(1, COLUMNS // (channels * math.prod(self.kernel) * math.prod(self.fits(size))))
 
 
-def _gemm_by_group(a: Values, b: Values, c: Values, group: int, **how: bool) -> None:
-    """Multiply matrices group by group; the rows of each are those of one group after the other."""
+def _gemm_by_group(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, group: int, **how: bool) -> None:
+    """Multiply stacks of matrices group by group; the rows of a matrix are those of one group after the other."""
     if group == 1:
         gemm(a, b, c, **how)
         return
-    parts = [array(m).reshape(group, len(m) // group, -1) for m in (a, b, c)]
-    for k in range(group):
-        gemm(*[part[k] for part in parts], **how)
+    for own in zip(*(m.unflatten(-2, (group, -1)).unbind(-3) for m in (a, b, c)), strict=True):
+        gemm(*own, **how)
 
 
 class ColumnProducts(ParameterSums):
@@ -101,11 +108,12 @@ class ColumnProducts(ParameterSums):
         """Return the responses; keep the maps, not their columns, which are larger by the filter's pixels."""
         ParameterSums.keep(ctx, maps, (weight, bias), in_place)
         ctx.sliding, ctx.group = sliding, group
-        filters = array(weight.flatten(1))
+        ctx.at_once = sliding.images_at_once(maps.shape[1], maps.shape[2:])
+        filters = weight.contiguous().flatten(1)
         tops = maps.new_empty(len(maps), len(weight), *sliding.fits(maps.shape[2:]))
         with one_thread():
-            for image, top in zip(maps, array(tops.flatten(2)), strict=True):
-                _gemm_by_group(filters, sliding.columns(image), top, group)
+            for some, top in zip(maps.split(ctx.at_once), tops.flatten(2).split(ctx.at_once), strict=True):
+                _gemm_by_group(filters, sliding.columns(some), top, group)
         return tops if bias is None else tops.add_(_by_channel(bias, tops))
 
     @staticmethod
@@ -116,18 +124,20 @@ class ColumnProducts(ParameterSums):
         """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, _ = ctx.saved_tensors
         weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
-        filters, diffs = array(weight.flatten(1)), array(tops_diff.contiguous().flatten(2))
-        of_filters = None if weight_sums is None else array(weight_sums.flatten(1))
-        maps_diff = torch.empty_like(maps) if ctx.needs_input_grad[0] else None
-        columns_diff = maps.new_empty(ctx.group * filters.shape[1], diffs.shape[2])
-        for n, diff in enumerate(diffs):
-            if bias_sums is not None:
-                add_sums(diff, bias_sums, axis=1)
-            if of_filters is not None:
-                _gemm_by_group(diff, ctx.sliding.columns(maps[n]), of_filters, ctx.group, b_t=True, add=True)
-            if maps_diff is not None:
-                _gemm_by_group(filters, diff, columns_diff, ctx.group, a_t=True)
-                maps_diff[n] = ctx.sliding.spread(columns_diff, maps.shape[2:])
+        filters, diffs = weight.contiguous().flatten(1), tops_diff.contiguous().flatten(2)
+        if bias_sums is not None:
+            add_sums(diffs, bias_sums, axis=1)
+        if weight_sums is not None:
+            of_filters = weight_sums.flatten(1)
+            for some, diff in zip(maps.split(ctx.at_once), diffs.split(ctx.at_once), strict=True):
+                _gemm_by_group(diff, ctx.sliding.columns(some), of_filters, ctx.group, b_t=True, add=True)
+        maps_diff = None
+        if ctx.needs_input_grad[0]:
+            maps_diff = torch.empty_like(maps, memory_format=torch.contiguous_format)
+            columns = maps.new_empty(min(ctx.at_once, len(maps)), ctx.group * filters.shape[1], diffs.shape[2])
+            for some, diff in zip(maps_diff.split(ctx.at_once), diffs.split(ctx.at_once), strict=True):
+                _gemm_by_group(filters, diff, columns[: len(diff)], ctx.group, a_t=True)
+                some.copy_(ctx.sliding.spread(columns[: len(diff)], maps.shape[2:]))
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None
 
 
@@ -214,13 +224,15 @@ class SpreadProducts(ParameterSums):
         maps = maps.contiguous()
         ParameterSums.keep(ctx, maps, (weight, bias), in_place)
         ctx.sliding, ctx.group = sliding, group
-        filters, values = array(weight.flatten(1)), array(maps.flatten(2))
-        tops = maps.new_empty(len(maps), weight.shape[1] * group, *size)
-        columns = maps.new_empty(group * filters.shape[1], values.shape[2])
+        channels = weight.shape[1] * group
+        ctx.at_once = sliding.images_at_once(channels, size)
+        filters, values = weight.contiguous().flatten(1), maps.flatten(2)
+        tops = maps.new_empty(len(maps), channels, *size)
+        columns = maps.new_empty(min(ctx.at_once, len(maps)), group * filters.shape[1], values.shape[2])
         with one_thread():
-            for image, top in zip(values, tops, strict=True):
-                _gemm_by_group(filters, image, columns, group, a_t=True)
-                top.copy_(sliding.spread(columns, size))
+            for some, top in zip(values.split(ctx.at_once), tops.split(ctx.at_once), strict=True):
+                _gemm_by_group(filters, some, columns[: len(some)], group, a_t=True)
+                top.copy_(sliding.spread(columns[: len(some)], size))
         return tops if bias is None else tops.add_(_by_channel(bias, tops))
 
     @staticmethod
@@ -231,17 +243,18 @@ class SpreadProducts(ParameterSums):
         """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, _ = ctx.saved_tensors
         weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
-        filters, values = array(weight.flatten(1)), array(maps.flatten(2))
-        of_filters = None if weight_sums is None else array(weight_sums.flatten(1))
+        filters, values = weight.contiguous().flatten(1), maps.flatten(2)
         maps_diff = torch.empty_like(maps) if ctx.needs_input_grad[0] else None
-        for n, diff in enumerate(tops_diff.contiguous()):
+        for start in range(0, len(maps), ctx.at_once):
+            these = slice(start, start + ctx.at_once)
+            diff = tops_diff[these].contiguous()
             if bias_sums is not None:
-                add_sums(diff.flatten(1), bias_sums, axis=1)
+                add_sums(diff.flatten(2), bias_sums, axis=1)
             columns = ctx.sliding.columns(diff)
-            if of_filters is not None:
-                _gemm_by_group(values[n], columns, of_filters, ctx.group, b_t=True, add=True)
+            if weight_sums is not None:
+                _gemm_by_group(values[these], columns, weight_sums.flatten(1), ctx.group, b_t=True, add=True)
             if maps_diff is not None:
-                _gemm_by_group(filters, columns, maps_diff[n].flatten(1), ctx.group)
+                _gemm_by_group(filters, columns, maps_diff[these].flatten(2), ctx.group)
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
 
 
@@ -258,13 +271,13 @@ class Columns(torch.autograd.Function):
     @override
     def forward(ctx: Any, maps: torch.Tensor, sliding: Filter) -> torch.Tensor:
         ctx.sliding, ctx.size = sliding, maps.shape[2:]
-        return torch.stack([sliding.columns(image) for image in maps])
+        return sliding.columns(maps)
 
     @staticmethod
     @once_differentiable
     @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return torch.stack([ctx.sliding.spread(columns, ctx.size) for columns in diff.contiguous()]), None
+        return ctx.sliding.spread(diff.contiguous(), ctx.size), None
 
 
 def _by_channel(bias: torch.Tensor, tops: torch.Tensor) -> torch.Tensor:
@@ -318,6 +331,54 @@ class VectorProducts(ParameterSums):
         if ctx.needs_input_grad[0]:
             vectors_diff = torch.empty_like(vectors)
             gemm(tops_diff, weight.contiguous(), vectors_diff, b_t=ctx.transposed)
+        return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
+
+
+class SummedProducts(ParameterSums):
+    """What :class:`VectorProducts` computes, by torch's kernels, on any device.
+
+    Unlike torch's own function it adds the weights' gradient to the sum at once: in fully connected layers it is the
+    largest of all tensors, and fresh memory for it takes longer to get than the product itself.
+    """
+
+    @staticmethod
+    @override
+    def forward(
+        ctx: Any,
+        vectors: torch.Tensor,
+        weight: torch.Tensor,
+        bias: torch.Tensor | None,
+        transposed: bool,
+        in_place: bool,
+    ) -> torch.Tensor:
+        """Return the product; of few vectors in the weights' precision, whatever autocast asks for."""
+        few, ctx.kind = len(vectors) < FEW, vectors.dtype
+        vectors = vectors.to(weight.dtype) if few else vectors
+        ParameterSums.keep(ctx, vectors, (weight, bias), in_place)
+        ctx.transposed = transposed
+        with torch.autocast(weight.device.type, enabled=False) if few else nullcontext():
+            return F.linear(vectors, weight.t() if transposed else weight, bias)
+
+    @staticmethod
+    @once_differentiable
+    @override
+    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
+        """Return the gradients of vectors, weight and bias, where they are asked for."""
+        vectors, weight, _ = ctx.saved_tensors
+        weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
+        kind = tops_diff.dtype  # of the product, which autocast may have chosen
+        vectors = vectors.to(kind)
+        if weight_sums is not None:
+            factors = (vectors.t(), tops_diff) if ctx.transposed else (tops_diff.t(), vectors)
+            if weight_sums.dtype == kind:
+                weight_sums.addmm_(*factors)
+            else:
+                weight_sums += factors[0] @ factors[1]
+        if bias_sums is not None:
+            bias_sums += tops_diff.sum(0)
+        vectors_diff = None
+        if ctx.needs_input_grad[0]:
+            vectors_diff = (tops_diff @ (weight.t() if ctx.transposed else weight).to(kind)).to(ctx.kind)
         return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
 
 

@@ -196,6 +196,15 @@ class Layer(torch.nn.Module):
         self.setup()
         self.top_shapes: list[Shape] = [self.possible(s) for s in self.reshape(self.bottom_shapes)]
 
+    def __init_subclass__(cls, **named: Any) -> None:
+        """Where a class replaces ``forward``, do not let it inherit what was said of the forward pass it replaces."""
+        super().__init_subclass__(**named)
+        for name in ("prepare", "finishing", "fresh", "any_layout", "absorbs", "absorbs_before", "as_affine"):
+            owner = next(each for each in cls.__mro__ if name in vars(each))
+            told_of = getattr(owner, "forward", Layer.forward)
+            if owner is not Layer and told_of is not Layer.forward and cls.forward is not told_of:
+                setattr(cls, name, vars(Layer)[name])
+
     def construct(self) -> None:
         """Do what Caffe does in the layer's constructor, where that shows in the log."""
 
@@ -335,6 +344,14 @@ class Layer(torch.nn.Module):
         self.fit([tuple(b.shape) for b in bottoms])
         tops = self(*bottoms)
         return tops if isinstance(tops, tuple) else (tops,)
+
+    def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
+        """Run this layer and, where one kernel does their work too, some of those that follow.
+
+        Each of ``following`` has one bottom, the top of the layer before it, which nobody else reads. Returns how many
+        of them were run, and the tops of the last.
+        """
+        return 0, self.run(*bottoms)
 
     def fit(self, bottom_shapes: list[Shape]) -> None:
         """Reshape for bottoms of these shapes, if they are others than before."""

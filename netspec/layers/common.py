@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.products import ChosenRows, VectorProducts, prepared_vectors
+from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts, prepared_vectors
 from netspec.layers import fused
 from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
 from netspec.layers.registry import register
@@ -58,9 +58,10 @@ class InnerProduct(Layer):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed = self.param.inner_product_param.transpose
-        if self.is_exact(data, self.small):
-            vectors, in_place = data.reshape(-1, self.inputs), self.context.accumulate_in_place
-            return VectorProducts.apply(vectors, weight, bias, transposed, in_place).reshape(self.top_shapes[0])
+        exact, in_place = self.is_exact(data, self.small), self.context.accumulate_in_place
+        if exact or (in_place and torch.is_grad_enabled()):
+            vectors, products = data.reshape(-1, self.inputs), VectorProducts if exact else SummedProducts
+            return products.apply(vectors, weight, bias, transposed, in_place).reshape(self.top_shapes[0])
         return F.linear(data.flatten(self.axis), weight.t() if transposed else weight, bias)
 
     @property

@@ -87,7 +87,22 @@ class BatchNorm(Layer):
             data, mean = data - _along(mean, 1, data), torch.zeros_like(mean)
         return torch.batch_norm(data, None, None, mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
 
-    def _by_batch(self, data: torch.Tensor) -> torch.Tensor:
+    @override
+    def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
+        """Normalize a batch; torch's kernel also scales by channel, and its top may be overwritten by an activation."""
+        data, scale = bottoms[0], following[0] if following else None
+        self.fit([tuple(data.shape)])
+        exact = self.is_exact(data, self.small)
+        if exact or self.use_global_stats or not isinstance(scale, Scale) or not scale.by_channel:
+            return super().run_with(following, *bottoms)
+        top = self._by_batch(data, scale.blob(0), scale.blob(1) if len(scale.blobs) > 1 else None)
+        if len(following) > 1 and following[1].finishing() is F.relu_:  # its gradient does not read what it overwrites
+            return 2, (F.relu_(top),)
+        return 1, (top,)
+
+    def _by_batch(
+        self, data: torch.Tensor, factors: torch.Tensor | None = None, bias: torch.Tensor | None = None
+    ) -> torch.Tensor:
         eps, keep = self.param.batch_norm_param.eps, self.param.batch_norm_param.moving_average_fraction
         values = data.numel() // self.channels
         unbiased = 1.0
@@ -96,10 +111,10 @@ class BatchNorm(Layer):
             top = top.reshape(data.shape)
             unbiased = values / (values - 1) if values > 1 else 1.0
         else:
-            top, mean, variance = _normalize(data, eps)
+            top, mean, variance = _normalize(data, eps, factors, bias)
             if _far_from_zero(mean, variance, eps):
                 # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
-                top, _, variance = _normalize(data - _along(mean, 1, data), eps)
+                top, _, variance = _normalize(data - _along(mean, 1, data), eps, factors, bias)
             if values == 1:
                 variance = torch.zeros_like(variance)  # torch's unbiased variance is 0 / 0, Caffe's 0
         with torch.no_grad():
@@ -203,13 +218,16 @@ def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
     return data
 
 
-def _normalize(data: torch.Tensor, eps: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the normalized batch, its mean and its unbiased variance, by torch's own kernel.
+def _normalize(
+    data: torch.Tensor, eps: float, factors: torch.Tensor | None, bias: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the normalized batch, times factors, plus a bias, its mean and its unbiased variance, by torch's kernel.
 
     The statistics come out exact as that kernel's running ones, all weight on the present batch.
     """
-    mean, variance = data.new_zeros(2, data.shape[1]).unbind()
-    top = torch.batch_norm(data, None, None, mean, variance, True, 1.0, eps, torch.backends.cudnn.enabled)
+    exact_enough = torch.promote_types(data.dtype, torch.float32)
+    mean, variance = data.new_zeros(2, data.shape[1], dtype=exact_enough).unbind()
+    top = torch.batch_norm(data, factors, bias, mean, variance, True, 1.0, eps, torch.backends.cudnn.enabled)
     return top, mean, variance
 
 
@@ -341,7 +359,7 @@ class Scale(_Affine):
 
     @override
     def prepare(self, how: Preparation) -> Kernel:
-        if not self._by_channel:
+        if not self.by_channel:
             return super().prepare(how)
         scale, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         axes = (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
@@ -358,12 +376,13 @@ class Scale(_Affine):
         return finished(kernel, how.finish)
 
     @property
-    def _by_channel(self) -> bool:
+    def by_channel(self) -> bool:
+        """Whether it multiplies each channel by a learned factor."""
         return len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
 
     @override
     def as_affine(self) -> Affine | None:
-        if not self._by_channel:
+        if not self.by_channel:
             return None
         scale = self.blob_in_double(0)
         return scale, self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros_like(scale)
@@ -371,7 +390,7 @@ class Scale(_Affine):
     @property
     @override
     def absorbs_before(self) -> bool:
-        return self._by_channel
+        return self.by_channel
 
     @override
     def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
@@ -384,7 +403,7 @@ class Scale(_Affine):
 
     @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self._by_channel:
+        if self.by_channel:
             scale = self.blob(0)
             if code.affine(bottoms[0], scale, self.blob(1) if len(self.blobs) > 1 else torch.zeros_like(scale)):
                 return bottoms[0]

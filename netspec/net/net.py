@@ -26,6 +26,7 @@ from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.limits import amount, is_out_of_memory
 from netspec.limits import memory as memory_of_machine
+from netspec.net.chains import chains
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
 from netspec.net.options import BuildOptions
@@ -80,6 +81,7 @@ class Net(torch.nn.Module):
         self._overwritten = [
             is_overwritten(layer, node, plan) for layer, node in zip(self.layers, plan.nodes, strict=False)
         ]
+        self._chains = self._find_chains()
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
         self._given = [
@@ -154,6 +156,14 @@ class Net(torch.nn.Module):
         if len(layers) == len(self.plan.nodes):
             self._finish(list(layers.values()))
         return torch.nn.ModuleList(layers.values())
+
+    def _find_chains(self) -> list[list[int]]:
+        if len(self.layers) < len(self.plan.nodes):
+            return [[] for _ in self.plan.nodes]  # errors were collected: it will not run
+        blocked = [any(node.blocked) for node in self.plan.nodes]
+        weighted = [any(weights) for weights in self.loss_weights]
+        apart = [any(flags) for flags in zip(self._overwritten, blocked, weighted, strict=True)]
+        return chains(self.plan, list(self.layers), apart)
 
     def _log_wiring(self, node: Node) -> None:
         log.info("net.cpp:86", f"Creating Layer {node.name}")
@@ -245,23 +255,40 @@ class Net(torch.nn.Module):
         values: dict[int, torch.Tensor] = {}
         memories: dict[int, Memory] = {}
         loss: torch.Tensor | None = None
+        tops: tuple[torch.Tensor, ...] = ()
+        end = -1  # the layer whose tops are the last computed
         for i, node in enumerate(self.plan.nodes):
-            memory = memories.setdefault(self.plan.final[node.tops[0]], Memory()) if self._overwritten[i] else None
-            tops = self.run_layer(i, values, inputs, memory)
-            for v, top in zip(node.tops, tops, strict=False):
-                values[v] = top
-                if v in memories:
-                    memories[v].data = top.detach()
-            for top, weight in zip(tops, self.loss_weights[i], strict=True):
-                if weight:
-                    term = self.weighted_sum(top, weight)
-                    loss = term if loss is None else loss + term
+            if following := self._following(i, kept) if i > end else ():
+                run, tops = self.layers[i].run_with(following, *(values[v] for v in node.bottoms))
+                end = i + run
+            elif i > end:
+                memory = memories.setdefault(self.plan.final[node.tops[0]], Memory()) if self._overwritten[i] else None
+                tops = self.run_layer(i, values, inputs, memory)
+                end = i
+            if i == end:
+                for v, top in zip(node.tops, tops, strict=False):
+                    values[v] = top
+                    if v in memories:
+                        memories[v].data = top.detach()
+                for top, weight in zip(tops, self.loss_weights[i], strict=True):
+                    if weight:
+                        term = self.weighted_sum(top, weight)
+                        loss = term if loss is None else loss + term
             for v in self._last_use[i]:
                 if v not in kept:
-                    del values[v]
+                    values.pop(v, None)
+        tops = ()
         self.blobs = {self.plan.blobs[v]: values[v] for v in sorted(kept)}
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
+
+    def _following(self, i: int, kept: frozenset[int]) -> list[Layer]:
+        """Return the layers that may run with layer ``i``: nobody looks at what lies between."""
+        chain = self._chains[i]
+        if any(self.layers[k]._forward_hooks for k in (i, *chain)):
+            return []
+        seen = next((k for k in chain if self.plan.nodes[k].bottoms[0] in kept), None)
+        return [self.layers[k] for k in (chain if seen is None else chain[: chain.index(seen)])]
 
     def _run_prepared(
         self, programs: Programs, inputs: Mapping[str, Array], kept: frozenset[int]
@@ -286,7 +313,9 @@ class Net(torch.nn.Module):
         bottoms = []
         for v, blocked in zip(node.bottoms, node.blocked, strict=True):
             stop = blocked and not self.param.force_backward
-            bottoms.append(values[v].detach() if stop else values[v])
+            bottom = values[v].detach() if stop else values[v]
+            half = layer.is_loss and bottom.dtype in (torch.bfloat16, torch.float16)
+            bottoms.append(bottom.float() if half else bottom)  # losses are float32 in every precision
         if memory is not None and torch.is_grad_enabled():
             return run_overwritten(layer, bottoms[0], memory, node.in_place[0])
         return layer.run(*bottoms)

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 import torch
 
 from netspec.net.net import Net
+from netspec.solver import update
+from netspec.solver.precision import FP32, computing
 
 
 class Replicas:
@@ -26,9 +28,12 @@ class Replicas:
         """Copy the root's parameters, including BatchNorm's statistics, to every replica."""
         self._copy(everything=True)
 
-    def backward(self) -> None:
+    def backward(self, precision: str = FP32) -> None:
         """Add the gradients of one pass to each replica's own. The devices run in parallel."""
-        losses = [net.forward_loss()[0] for net in self.nets]
+        losses = []
+        for net in self.nets:
+            with computing(precision, net.device):
+                losses.append(net.forward_loss()[0])
         for loss in losses:
             if loss.requires_grad:
                 loss.backward()
@@ -36,6 +41,8 @@ class Replicas:
     @torch.no_grad()
     def reduce(self) -> None:
         """Make the root's gradients the mean over all devices."""
+        if not self.nets:
+            return
         for own, *theirs in zip(*(net.learnable for net in (self._root, *self.nets)), strict=True):
             if own.parameter.grad is None:
                 continue
@@ -46,8 +53,7 @@ class Replicas:
     def clear(self) -> None:
         """Clear the gradients of the last iteration."""
         for net in self.nets:
-            for learnable in net.learnable:
-                learnable.parameter.grad = None
+            update.clear(item.parameter for item in net.learnable)
 
     @torch.no_grad()
     def update(self) -> None:

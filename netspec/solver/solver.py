@@ -20,7 +20,7 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where
-from netspec.exact import SMALL
+from netspec.exact import NONE, SMALL
 from netspec.graph.filter import with_train_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
@@ -43,8 +43,10 @@ from netspec.solver.extra import (
     stamp_of,
     write_extra,
 )
+from netspec.solver.heap import keep_freed_memory
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.nan import bad_parameter, bad_top
+from netspec.solver.precision import FP32, check_precision, computing
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.tally import Outputs, Tally, as_scores, score_lines, scorers
@@ -68,6 +70,7 @@ def load_solver(
     action: Callable[[], str | None] | None = None,
     exact: str = SMALL,
     strict: bool = False,
+    precision: str = FP32,
     nan: str = "stop",
 ) -> Solver:
     """Build the solver of a prototxt and its nets, ready to run.
@@ -75,7 +78,7 @@ def load_solver(
     ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
     ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
     ``stages`` go to the training net. Several devices train side by side, the first being the root. For ``device``,
-    ``action`` and ``nan`` see :class:`Solver`. Raises SpecError for every fault of the files.
+    ``action``, ``precision`` and ``nan`` see :class:`Solver`. Raises SpecError for every fault of the files.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
@@ -104,6 +107,7 @@ def load_solver(
         exact=exact,
         strict=strict,
         action=action,
+        precision=precision,
         nan=nan,
     )
     if snapshot is not None:
@@ -152,13 +156,15 @@ class Solver:
         action: Callable[[], str | None] | None = None,
         nan: str = "stop",
         clock: Callable[[], float] = time.perf_counter,
+        precision: str = FP32,
     ) -> None:
         """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError.
 
         ``device`` overrides solver_mode and device_id; replicas of the training net run on ``others``. ``seed`` is used
         if there is no random_seed; without it one is drawn. ``action`` is called between iterations, also those of a
-        test: "stop" ends the training, "snapshot" takes one. ``nan`` says what a loss of
-        NaN or infinity does: "stop" raises SpecError, "warn" warns once. ``clock`` gives the seconds for "iter/s".
+        test: "stop" ends the training, "snapshot" takes one. ``nan`` says what a loss of NaN or infinity does: "stop"
+        raises SpecError, "warn" warns once. ``clock`` gives the seconds for "iter/s". In another ``precision`` than
+        "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order.
         """
         node = node or Place(Where("<solver>"))
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
@@ -189,7 +195,9 @@ class Solver:
         self._rule = rule
         self._device = device or choose_device(param, node)
         self._allow_python = allow_python
-        self._exact = exact
+        check_precision(precision)
+        self._precision = precision
+        self._exact = exact if precision == FP32 else NONE
         self._strict = strict
         drawn = int.from_bytes(os.urandom(4), "little") if seed is None else seed
         self._seed = param.random_seed if param.random_seed >= 0 else drawn
@@ -288,6 +296,7 @@ class Solver:
         Raises SpecError if a net has inputs: a solver cannot fill them.
         """
         self.check_inputs()
+        keep_freed_memory()
         self.stopped = False
         self.replicas.begin()
         self._losses.clear()
@@ -351,19 +360,19 @@ class Solver:
             wanted = self.param.debug_info and self._is_due(self.param.display)
             with self.debugged(self.net) if wanted else nullcontext():
                 loss, outputs = self.train_pass()
-            self.replicas.backward()
+            self.replicas.backward(self._precision)
             total += np.float32(loss.item())
         self.replicas.reduce()
         return float(total / np.float32(self.param.iter_size)), outputs
 
     def clear_gradients(self) -> None:
         """Clear the gradients, before an iteration sums them up."""
-        for learnable in self.net.learnable:
-            learnable.parameter.grad = None
+        update.clear(item.parameter for item in self.net.learnable)
 
     def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the training net forward and backward; return its loss and outputs."""
-        loss, outputs = self.net.forward_loss()
+        with computing(self._precision, self._device):
+            loss, outputs = self.net.forward_loss()
         if loss.requires_grad:
             loss.backward()
         return loss, outputs
@@ -394,12 +403,9 @@ class Solver:
             limit = log.number(self.param.clip_gradients)
             message = f"Gradient clipping: scaling down gradients (L2 norm {norm} > {limit}) by scale factor {factor}"
             log.info("sgd_solver.cpp:99", message)
-        update.normalize(diffs, self.param.iter_size)
         decays = [self.param.weight_decay * item.decay_mult for item in learnable]
-        update.regularize(diffs, weights, decays, self.param.regularization_type)
         rates = [rate * item.lr_mult for item in learnable]
-        self._rule.compute(self.param, diffs, rates, self.history, self.iteration)
-        update.subtract(weights, diffs)
+        update.move(self._rule, self.param, weights, diffs, self.history, rates, decays, self.iteration)
         self.replicas.update()
         self.iteration += 1
 

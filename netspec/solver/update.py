@@ -2,7 +2,8 @@
 
 As in Caffe, a solver overwrites the gradients step by step until they contain what is subtracted from the weights.
 The lists are in the order of the net's learnable parameters. ``torch._foreach_*`` does the same to each tensor of a
-list; on a GPU in one kernel.
+list; on a GPU in one kernel. All rules work number by number, so :func:`move` cuts the tensors into blocks that
+fit into a CPU's cache, and does all steps to one block before the next: memory is passed over only once.
 
 Caffe: src/caffe/solvers/*.cpp
 """
@@ -11,7 +12,7 @@ Caffe: src/caffe/solvers/*.cpp
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,17 @@ from netspec.exact.libm import power
 from netspec.proto.source_map import Place
 
 Tensors = list[torch.Tensor] | tuple[torch.Tensor, ...]
+BLOCK = 2**18  # numbers: of weights, gradients and history they are 3 MB, or 4 MB
+
+
+def clear(parameters: Iterable[torch.nn.Parameter]) -> None:
+    """Set all gradients to 0 where they are; a parameter without one has none afterward either.
+
+    Their memory is kept: memory that is given back to the system costs more to get again than the gradients themselves.
+    """
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    if gradients:
+        torch._foreach_zero_(gradients)
 
 
 def clip(diffs: Tensors, limit: float) -> tuple[float, float] | None:
@@ -77,6 +89,53 @@ class Rule:
     compute: Compute
     sets: int = 1
     momentum: bool = True
+
+
+def move(
+    rule: Rule,
+    param: Any,
+    weights: Tensors,
+    diffs: Tensors,
+    history: Tensors,
+    rates: Sequence[float],
+    decays: Sequence[float],
+    iteration: int,
+) -> None:
+    """Update the weights by their gradients, summed over ``iter_size`` passes (SGDSolver::ApplyUpdate).
+
+    The gradients then contain what was subtracted. ``rates`` and ``decays`` are each parameter's own.
+    """
+    flat = [[tensor.view(-1) for tensor in tensors] for tensors in (weights, diffs, history)]
+    for block in _blocks(flat[0]):
+        own_weights, own_diffs, own_history = (
+            [tensors[first + i][part] for first in range(0, len(tensors), len(weights)) for i, part in block]
+            for tensors in flat
+        )
+        own_rates, own_decays = ([numbers[i] for i, _ in block] for numbers in (rates, decays))
+        normalize(own_diffs, param.iter_size)
+        regularize(own_diffs, own_weights, own_decays, param.regularization_type)
+        rule.compute(param, own_diffs, own_rates, own_history, iteration)
+        subtract(own_weights, own_diffs)
+
+
+def _blocks(tensors: Tensors) -> Iterator[list[tuple[int, slice]]]:
+    """Yield blocks of about ``BLOCK`` numbers: which tensors, of one axis, and which part of each.
+
+    Tensors on a GPU make up one block, as each of its kernels costs time by itself.
+    """
+    block: list[tuple[int, slice]] = []
+    room = BLOCK
+    for i, tensor in enumerate(tensors):
+        longest = BLOCK if tensor.device.type == "cpu" else max(1, tensor.numel())
+        for start in range(0, tensor.numel(), longest):
+            part = slice(start, min(start + longest, tensor.numel()))
+            if block and tensor.device.type == "cpu" and part.stop - part.start > room:
+                yield block
+                block, room = [], BLOCK
+            block.append((i, part))
+            room -= part.stop - part.start
+    if block:
+        yield block
 
 
 def sgd(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:

@@ -17,6 +17,7 @@ from netspec.layers import fused
 from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.vision.layout import channels_side_by_side
 
 _CONVOLVE = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
 _DECONVOLVE = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
@@ -220,6 +221,8 @@ class Convolution(_SlidingFilter):
         if self.is_exact(maps, self.small):
             sliding, in_place = Filter(weight.shape[2:], *geometry), self.context.accumulate_in_place
             return ColumnProducts.apply(maps, weight, bias, sliding, self.group, in_place)
+        if torch.is_grad_enabled():  # else weights would be laid out anew for each product: this pays for large maps
+            maps = channels_side_by_side(maps) if maps.numel() > 2 * weight.numel() else maps.contiguous()
         return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
 
     @property
@@ -367,6 +370,16 @@ class Deconvolution(Convolution):
 
     @override
     def prepare(self, how: Preparation) -> Kernel:
+        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+        usual = self.channel_axis == 1 and self.spatial_axes == 2 and len(self.bottom_shapes) == 1
+        exact, large = self.is_exact(weight, self.small), self.multiply_adds() > SMALL_PRODUCT
+        if usual and not exact and large and how.pack and fused.suits(weight):
+            geometry = (self.stride, self.pad, self.dilation)
+            if self.group == 1:
+                return fused.deconvolution(weight, bias, *geometry, how)
+            fits = all(p < e for p, e in zip(self.pad, self.extent, strict=True))
+            if self.group == self.channels == self.num_output and fits and max(self.stride) <= 2:
+                return fused.spread_by_channel(self.bottom_shapes[0], weight, bias, *geometry, how)
         return Layer.prepare(self, how)
 
     onnx_op = "ConvTranspose"

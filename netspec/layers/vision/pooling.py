@@ -15,6 +15,7 @@ from netspec.exact.sums import Copies
 from netspec.layers.base import Kernel, Layer, Preparation, Shape, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.vision.layout import channels_side_by_side
 from netspec.proto.schema import TRAIN
 
 MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
@@ -107,6 +108,7 @@ def max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.
 
 def _native_max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
     kernel, stride, pad = windows.kernel, windows.stride, windows.pad
+    maps = channels_side_by_side(maps)
     if windows.known_to_torch:
         ceil = windows.round_mode == CEIL
         return F.max_pool2d(maps, kernel, stride, pad, ceil_mode=ceil, return_indices=True)

@@ -79,3 +79,28 @@ def test_frozen_parameters_get_no_gradient(net_of, in_place: bool) -> None:
     net = net_of(text, phase=0, accumulate_in_place=in_place)
     net.forward_loss(**images())[0].backward()
     assert [item.parameter.grad is None for item in net.learnable] == [True, False, False, True]
+
+
+@pytest.mark.parametrize("transposed", ["false", "true"])
+@pytest.mark.parametrize("exact", ["none", "small"])
+def test_an_inner_product_adds_up_in_memory_that_is_there(net_of, transposed: str, exact: str) -> None:
+    """No tensor as large as the weights is made in a pass, be the product small or too large to be exact."""
+    text = f"""
+        layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ dim: 2 dim: 600 }} }} }}
+        layer {{ name: "ip" type: "InnerProduct" bottom: "data" top: "ip" inner_product_param {{ num_output: 900
+                transpose: {transposed} weight_filler {{ type: "gaussian" }} }} }}
+        layer {{ name: "loss" type: "Reduction" bottom: "ip" top: "loss" loss_weight: 1
+                reduction_param {{ operation: SUMSQ }} }}"""
+    net = net_of(text, phase=0, exact=exact, accumulate_in_place=True)
+    data = torch.randn(2, 600)
+    net.forward_loss(data=data)[0].backward()
+    one = net.params["ip"][0].grad.clone()
+    with torch.profiler.profile(profile_memory=True) as profile:
+        net.forward_loss(data=data)[0].backward()
+    torch.testing.assert_close(net.params["ip"][0].grad, 2 * one)
+    events = profile.events()
+    assert events
+    assert max(event.self_cpu_memory_usage for event in events) < 600 * 900 * 4
+    reference = net_of(text, phase=0, exact="none")
+    reference.forward_loss(data=data)[0].backward()
+    torch.testing.assert_close(one, reference.params["ip"][0].grad)

@@ -28,6 +28,40 @@ def test_gemm_multiplies_and_adds_in_place(
 
 
 @pytest.mark.parametrize("dtype", TYPES)
+def test_gemm_multiplies_stacks_one_by_one(dtype: torch.dtype) -> None:
+    """Bit for bit what single products are; stacks may lie apart, as groups of channels do."""
+    a, b = torch.randn(3, 2, 4, 5, dtype=dtype)[:, 1], torch.randn(3, 5, 6, dtype=dtype)
+    c, one_by_one = torch.zeros(3, 4, 6, dtype=dtype), torch.zeros(3, 4, 6, dtype=dtype)
+    gemm(a, b, c)
+    for matrices in zip(a, b, one_by_one, strict=True):
+        gemm(*matrices)
+    assert torch.equal(c, one_by_one)
+    total, added = torch.ones(2, 4, 6, dtype=dtype)
+    gemm(a, b, total, add=True)
+    for first, second in zip(a, b, strict=True):
+        gemm(first, second, added, add=True)
+    assert torch.equal(total, added)
+    torch.testing.assert_close(total, 1 + (a @ b).sum(0))
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_add_sums_of_stacks(dtype: torch.dtype, axis: int) -> None:
+    a = torch.randn(3, 4, 5, dtype=dtype)
+    total, own = torch.ones(a.shape[2 - axis], dtype=dtype), torch.ones(3, a.shape[2 - axis], dtype=dtype)
+    add_sums(a, total, axis)
+    add_sums(a, own, axis)
+    torch.testing.assert_close(total, 1 + a.sum((0, 1 + axis)))
+    torch.testing.assert_close(own, 1 + a.sum(1 + axis))
+
+
+def test_a_matrix_with_gaps_is_no_matrix_for_blas() -> None:
+    a, c = torch.zeros(4, 8)[:, :4], torch.zeros(4, 4)
+    with pytest.raises(AssertionError, match="side by side"):
+        gemm(a, c, c)
+
+
+@pytest.mark.parametrize("dtype", TYPES)
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("shape", [(3, 5), (1, 4), (4, 1), (1, 1)])
 def test_add_sums(dtype: torch.dtype, axis: int, shape: tuple[int, int]) -> None:

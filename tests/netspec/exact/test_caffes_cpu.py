@@ -1,34 +1,32 @@
-"""The tests that compare bits, on the kernels with which Caffe computed the golden files: those for AVX-512."""
+"""The kernels of BLAS with which Caffe computed the golden files, those for AVX-512, are chosen where they run."""
 
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+import torch
 
+from netspec.exact.blas import CORE_TYPE
 from paths import ROOT
 
-CPU = Path("/proc/cpuinfo")
-COMPARING_BITS = [
-    "exact/test_blas.py",
-    "layers/test_golden.py",
-    "pycaffe/test_golden.py",
-    "solver/test_examples.py",
-    "solver/test_golden.py",
-]
+KERNELS = f"""
+import os, threadpoolctl
+import netspec.exact.blas
+found = [library for library in threadpoolctl.threadpool_info() if "scipy.libs" in library["filepath"]]
+print(found[0]["architecture"])
+print(os.environ.get("{CORE_TYPE}"))
+"""
 
 
 @pytest.mark.slow
-def test_bits_are_caffes_on_its_kind_of_cpu(same_blas: bool) -> None:
-    """OpenBLAS chooses its kernels when it is loaded, so that another process is needed to choose others."""
-    if same_blas:
-        pytest.skip("the tests themselves run on these kernels")
-    if not CPU.exists() or "avx512f" not in CPU.read_text():
-        pytest.skip("this CPU has no AVX-512")
-    tests = [str(ROOT / "tests" / "netspec" / name) for name in COMPARING_BITS]
-    environment = os.environ | {"OPENBLAS_CORETYPE": "SkylakeX"}
-    command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", *tests]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-4000:]
-    assert "another kind of CPU" not in done.stdout, done.stdout[-4000:]
+@pytest.mark.skipif(torch.backends.cpu.get_cpu_capability() != "AVX512", reason="this CPU has no AVX-512")
+@pytest.mark.parametrize(("wanted", "expected"), [(None, ["SkylakeX", "None"]), ("Haswell", ["Haswell", "Haswell"])])
+def test_the_kernels_are_caffes_unless_the_user_chose_others(wanted: str | None, expected: list[str]) -> None:
+    """OpenBLAS chooses its kernels when it is loaded, so that it takes another process to see which."""
+    environment = {name: value for name, value in os.environ.items() if name != CORE_TYPE}
+    environment |= {CORE_TYPE: wanted} if wanted else {}
+    done = subprocess.run(
+        [sys.executable, "-c", KERNELS], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == expected

@@ -132,6 +132,16 @@ def test_after_a_step_the_gradients_hold_what_was_subtracted(make):
     np.testing.assert_array_equal(np.array(layer.blobs[0].diff, np.float32), grad.numpy().ravel())
 
 
+@pytest.mark.parametrize("exact", ["none", "small"])
+def test_gradients_stay_where_they_are(make, exact):
+    """Fresh memory for the gradients of 70 million weights takes longer to get than the gradients themselves."""
+    solver = make(exact=exact)
+    solver.step(1)
+    first = [item.parameter.grad for item in solver.net.learnable]
+    solver.step(2)
+    assert all(item.parameter.grad is grad for item, grad in zip(solver.net.learnable, first, strict=True))
+
+
 def test_the_seed_decides_everything(make):
     first, second, third = make(), make(), make(settings=SETTINGS.replace("seed: 3", "seed: 4"))
     for solver in (first, second, third):

@@ -7,7 +7,8 @@ import torch
 from netspec.errors import Where
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
-from netspec.solver.update import RULES, Tensors, clip, find_rule, normalize, regularize, rule_faults
+from netspec.solver import update
+from netspec.solver.update import RULES, Tensors, clip, find_rule, move, normalize, regularize, rule_faults
 
 NOWHERE = Place(Where("s.prototxt"))
 SHAPES = [(3, 2), (4,)]
@@ -138,3 +139,23 @@ def test_the_type_is_known_in_any_case_of_letters():
 def test_what_caffe_refuses(fields: dict, message: str):
     (fault,) = rule_faults(SolverParameter(**fields), NOWHERE)
     assert re.search(message, str(fault))
+
+
+@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("size", [1, 3, 5, 7])
+def test_an_update_in_blocks_is_the_update(name, size, gradients, monkeypatch):
+    """Bit for bit, however tensors are cut or lie together in a block."""
+    param = SolverParameter(type=name, momentum=0.9 if RULES[name].momentum else 0, iter_size=3, rms_decay=0.9)
+
+    def moved() -> list[list[torch.Tensor]]:
+        weights = [torch.linspace(-1, 1, math.prod(shape)).view(shape) for shape in SHAPES]
+        history = [torch.zeros(shape) for shape in SHAPES * RULES[name].sets]
+        for iteration, diffs in enumerate(gradients):
+            diffs = [diff.clone() for diff in diffs]
+            move(RULES[name], param, weights, diffs, history, [0.1, 0.2], [0.01, 0], iteration)
+        return [weights, history, diffs]
+
+    whole = moved()
+    monkeypatch.setattr(update, "BLOCK", size)
+    for mine, theirs in zip(moved(), whole, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))

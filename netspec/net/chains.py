@@ -1,0 +1,29 @@
+"""Layers in a row that one kernel may compute together (``Layer.run_with``)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from netspec.graph.plan import Plan
+from netspec.layers.base import Layer
+
+LONGEST = 3  # BatchNorm, Scale, ReLU
+
+
+def chains(plan: Plan, layers: Sequence[Layer], apart: Sequence[bool]) -> list[list[int]]:
+    """Return, for each layer, the numbers of those after it that may run with it; each alone reads the one before.
+
+    ``apart`` says which layers must run by themselves. Tops that a caller wants to see are not looked at.
+    """
+    readers = Counter(v for node in plan.nodes for v in node.bottoms)
+    found: list[list[int]] = [[] for _ in plan.nodes]
+    for i, layer in enumerate(layers):
+        if type(layer).run_with is Layer.run_with or apart[i]:
+            continue
+        for k in range(i + 1, min(i + LONGEST, len(plan.nodes))):
+            tops = plan.nodes[k - 1].tops
+            if apart[k] or len(tops) != 1 or plan.nodes[k].bottoms != tops or readers[tops[0]] > 1:
+                break
+            found[i].append(k)
+    return found

@@ -1,0 +1,94 @@
+"""BatchNorm, Scale and ReLU run as one kernel in training, and nobody can tell but by the time it takes."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import torch
+
+from netspec.net.net import Net
+
+NET = """
+    layer { name: "data" type: "Input" top: "x" input_param { shape { dim: 4 dim: 3 dim: 40 dim: 40 } } }
+    layer { name: "conv" type: "Convolution" bottom: "x" top: "c"
+            convolution_param { num_output: 4 kernel_size: 3 bias_term: false weight_filler { type: "gaussian" } } }
+    layer { name: "bn" type: "BatchNorm" bottom: "c" top: "c" }
+    layer { name: "scale" type: "Scale" bottom: "c" top: "c"
+            scale_param { filler { type: "gaussian" std: 1 } bias_term: true bias_filler { type: "gaussian" std: 1 } } }
+    layer { name: "relu" type: "ReLU" bottom: "c" top: "c" }
+    layer { name: "loss" type: "Reduction" bottom: "c" top: "loss" reduction_param { operation: SUMSQ }
+            loss_weight: 0.01 }"""
+
+
+@contextmanager
+def calls(names: list[str], net: Net) -> Iterator[list[str]]:
+    """List the layers that run by themselves."""
+    seen: list[str] = []
+    plain = {name: layer.run for layer in net.layers if (name := layer.param.name) in names}
+    for layer in net.layers:
+        if layer.param.name in plain:
+            layer.run = lambda *b, n=layer.param.name: (seen.append(n), plain[n](*b))[1]  # type: ignore[method-assign]
+    yield seen
+
+
+def passed(net: Net, data: torch.Tensor) -> list[torch.Tensor]:
+    """Run twice, as statistics add up; return the learnable blobs and their gradients."""
+    for _ in range(2):
+        net.forward_loss(x=data)[0].backward()
+    gradients = [item.parameter.grad for item in net.learnable if item.parameter.grad is not None]
+    return [*(item.parameter.detach() for item in net.learnable), *gradients]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        NET,
+        NET.replace("ReLU", "Sigmoid"),
+        NET.replace('"ReLU" ', '"ReLU" relu_param { negative_slope: 0.5 } '),
+        NET.replace("bias_term: true", ""),
+        NET.replace("scale_param {", "scale_param { axis: 0"),
+        NET.replace('"Scale" bottom: "c" top: "c"', '"Scale" bottom: "c" top: "c" propagate_down: false'),
+    ],
+)
+def test_together_they_compute_what_each_computes(net_of, text: str) -> None:
+    data = torch.randn(4, 3, 40, 40, generator=torch.Generator().manual_seed(1))
+    together, alone = net_of(text, phase=0, exact="none"), net_of(text, phase=0, exact="none")
+    alone._chains = [[] for _ in alone.layers]
+    for mine, theirs in zip(passed(together, data), passed(alone, data), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-3)
+
+
+APART = (
+    NET.replace('"BatchNorm" bottom: "c" top: "c"', '"BatchNorm" bottom: "c" top: "n"')
+    .replace('"Scale" bottom: "c" top: "c"', '"Scale" bottom: "n" top: "s"')
+    .replace('"ReLU" bottom: "c" top: "c"', '"ReLU" bottom: "s" top: "r"')
+    .replace('"Reduction" bottom: "c"', '"Reduction" bottom: "r"')
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "keep", "hooked", "expected"),
+    [
+        (NET, (), False, []),
+        (NET, "all", False, []),  # each wrote over the one before
+        (APART, (), False, []),
+        (APART, "s", False, ["relu"]),
+        (APART, "all", False, ["scale", "relu"]),
+        (NET, (), True, ["scale", "relu"]),
+    ],
+)
+def test_they_run_together_unless_somebody_looks(net_of, text: str, keep, hooked: bool, expected: list[str]) -> None:
+    net = net_of(text, phase=0)
+    net.keep = keep
+    if hooked:
+        net.layers[4].register_forward_hook(lambda *_: None)
+    with calls(["scale", "relu"], net) as seen:
+        net.forward_loss(x=torch.randn(4, 3, 40, 40))
+    assert seen == expected
+
+
+def test_small_layers_are_computed_as_caffe_does(net_of) -> None:
+    net = net_of(NET.replace("40", "12"), phase=0)
+    with calls(["scale", "relu"], net) as seen:
+        net.forward_loss(x=torch.randn(4, 3, 12, 12))
+    assert seen == ["scale", "relu"]
