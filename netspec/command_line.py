@@ -21,6 +21,7 @@ from typing import Any
 
 from netspec import log
 from netspec.errors import SpecError
+from netspec.limits import amount, is_out_of_memory, memory
 
 DONE, FAULT, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130  # exit statuses
 SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
@@ -81,6 +82,11 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
         return FAULT
     except OSError as fault:
         print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
+        return FAULT
+    except (MemoryError, RuntimeError) as fault:
+        if not is_out_of_memory(fault):
+            raise
+        print(f"there is not enough memory: this machine has {amount(memory())}", file=sys.stderr)
         return FAULT
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

@@ -16,6 +16,11 @@ def memory() -> int:
         return 8 << 30
 
 
+def is_out_of_memory(fault: BaseException) -> bool:
+    """Say whether an exception means that there was no memory: torch raises a RuntimeError."""
+    return isinstance(fault, MemoryError) or (isinstance(fault, RuntimeError) and "allocate" in str(fault))
+
+
 def bomb(size: int, stored: int) -> str:
     """Return what to say of data of ``size`` bytes in a file of ``stored`` bytes that cannot be meant; "" if it can."""
     if size <= ALWAYS or (size <= MOST_PACKED * stored and size <= memory()):

@@ -59,6 +59,9 @@ def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
     except OSError as fault:
         print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
         return FAULT
+    except MemoryError:
+        print("there is not enough memory", file=sys.stderr)
+        return FAULT
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

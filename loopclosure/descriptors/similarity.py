@@ -198,7 +198,7 @@ def write_similarity(
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype("<f4")), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
         for _, block in progress(blocks, "similarity", -(-shape[0] // BLOCK_ROWS)):
-            file.write(np.ascontiguousarray(block, "<f4"))
+            file.write(np.ascontiguousarray(block, "<f4").data)
     return shape
 
 

@@ -36,8 +36,8 @@ def load_net(
     allow_python: bool = False,
     exact: str = SMALL,
     strict: bool = False,
-    write_files: bool = True,
     passes: Collection[str] = PASSES,
+    write_files: bool = True,
 ) -> Net:
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
 

@@ -24,6 +24,8 @@ from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
+from netspec.limits import amount, is_out_of_memory
+from netspec.limits import memory as memory_of_machine
 from netspec.net.chains import chains
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
@@ -131,6 +133,12 @@ class Net(torch.nn.Module):
             except SpecError as fault:
                 options.report(fault)
                 continue
+            except (MemoryError, RuntimeError) as fault:
+                if not is_out_of_memory(fault):
+                    raise
+                raise SpecError(
+                    f"its blobs need more memory than there is: this machine has {amount(memory_of_machine())}", at()
+                ) from None
             weights = _loss_weights(layer, options.report)
             layers[i] = layer
             self.loss_weights.append(weights)

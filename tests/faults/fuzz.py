@@ -1,0 +1,54 @@
+"""Coverage-guided damage: libFuzzer, through atheris, looks for inputs that lead a reader to new places.
+
+    pip install -e ".[fuzz]"
+    python tests/faults/fuzz.py FORMAT [libFuzzer's options, such as -runs=100000 or -max_total_time=60, and a corpus]
+
+What counts as a fault is said in mutate.py; its input is kept as ``crash-...`` in the working directory.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+atheris: Any = importlib.import_module("atheris")  # of the extra "fuzz"
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+with atheris.instrument_imports(include=["netspec", "loopclosure", "lmdb_build"]):
+    from faults.formats import FORMATS
+    from faults.mutate import ending
+    from netspec import log
+
+
+def main(words: list[str]) -> None:
+    name, *options = words or [""]
+    if name not in FORMATS:
+        raise SystemExit(f"name a format: {', '.join(FORMATS)}")
+    form = FORMATS[name]
+    log.logger.disabled = True
+    with tempfile.TemporaryDirectory() as place:
+        folder, seeds = Path(place, "read"), Path(place, "seeds")
+        folder.mkdir()
+        seeds.mkdir()
+        good = folder / f"good{form.suffix}"
+        form.write(good)
+        (seeds / "good").write_bytes((good / form.inside if form.inside else good).read_bytes())
+
+        def one(data: bytes) -> None:
+            if said := ending(form, folder, data):
+                os.write(2, f"{said}\n".encode())
+                raise AssertionError(said)
+
+        size = f"-max_len={4 * (seeds / 'good').stat().st_size}"
+        limits = ["-timeout=10", "-rss_limit_mb=3000", size]
+        atheris.Setup([sys.argv[0], *limits, *options, str(seeds)], one)
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
