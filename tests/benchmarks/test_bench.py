@@ -120,3 +120,10 @@ def test_an_environment_that_cannot_be_installed_is_a_fault(
     monkeypatch.setattr(environment.venv, "create", create)
     assert main(["forward", "lenet", "--with", "opencv4", "--rounds", "1"]) == 1
     assert capsys.readouterr().err.endswith("bench: cannot install the yardsticks: no such package\n")
+
+
+@pytest.mark.slow
+def test_growth_builds_and_runs_nets_of_a_thousand_layers(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["growth", "--layers", "17", "1002"]) == 0
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["| 17", "| 1002"]
