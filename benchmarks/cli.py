@@ -5,20 +5,20 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from benchmarks.report import Row
 from netspec.command_line import Commands, run
 
-FORWARD = ("netspec", "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe")
+ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
+FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
 TRAINING = ("netspec", "pytorch", "pycaffe")
-YARDSTICKS = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in an environment of their own
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit statuses are those of netspec."""
-    return run(parser(), list(sys.argv[1:] if argv is None else argv))
+    return run(parser(), list(sys.argv[1:] if argv is None else argv), (RuntimeError,))  # a worker that ended
 
 
 def parser() -> argparse.ArgumentParser:
@@ -29,10 +29,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list), or a prototxt")
     p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
     p.add_argument("--twin", help="the net of the catalogue whose PyTorch twin the prototxt has")
-    _add_common(p, FORWARD, FORWARD[:5])
+    _add_common(p, FORWARD, (*ENGINES, "pytorch", "opencv4"))
     p = commands.add("train", _train, "time training iterations: forward, backward, update")
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
     _add_common(p, TRAINING, TRAINING[:2])
+    p = commands.add("start", _start, "time processes that load a net and describe one image")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list), or a prototxt")
+    p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
+    _add_ways(p, (*ENGINES, "opencv4"), (*ENGINES[:3], "opencv4"))
     p = commands.add(
         "waiting", _waiting, "time two trainings side by side, as their OpenMP threads wait in several ways"
     )
@@ -58,12 +62,16 @@ class _Quiet(Commands):
 
 
 def _add_common(p: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
-    p.add_argument(
-        "--with", dest="ways", nargs="+", choices=known, default=list(default), help=f"default: {' '.join(default)}"
-    )
+    _add_ways(p, known, default)
     p.add_argument("--caffe", metavar="BINARY", help="also Caffe's own program")
     p.add_argument("--batch", type=int, nargs="+", default=[1], help="items of a batch, one or several (default: 1)")
     p.add_argument("--threads", type=int, nargs="+", default=[1], help="threads of a pass, one or several (default: 1)")
+
+
+def _add_ways(p: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
+    p.add_argument(
+        "--with", dest="ways", nargs="+", choices=known, default=list(default), help=f"default: {' '.join(default)}"
+    )
     p.add_argument("--rounds", type=int, default=9, help="rounds, in each of which every way has its turn (default: 9)")
     p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
 
@@ -103,24 +111,44 @@ def _growth(arguments: argparse.Namespace) -> None:
     print(table(arguments.layers))
 
 
-def _compare(arguments: argparse.Namespace, case_of: Any, suffix: str) -> None:
-    from benchmarks import environment, report
+def _start(arguments: argparse.Namespace) -> None:
+    from benchmarks.case import forward_case
+    from benchmarks.compare import starts_of
+
+    def rows(yardsticks: str | None) -> Iterator[list[Row]]:
+        for name in arguments.nets:
+            with forward_case(name, 1, arguments.weights, onnx=False) as case:
+                yield starts_of(case, arguments.ways, yardsticks, arguments.rounds)
+
+    _report(arguments, rows)
+
+
+def _compare(arguments: argparse.Namespace, case_of: Callable[[str, int], Any], suffix: str) -> None:
     from benchmarks.compare import rows_of
+
+    def rows(yardsticks: str | None) -> Iterator[list[Row]]:
+        for name in arguments.nets:
+            for batch in arguments.batch:
+                with case_of(name, batch) as case:
+                    for threads in arguments.threads:
+                        ways, caffe = arguments.ways, arguments.caffe
+                        yield rows_of(case, threads, ways, suffix, yardsticks, caffe, arguments.rounds)
+
+    _report(arguments, rows)
+
+
+def _report(arguments: argparse.Namespace, rows_of: Callable[[str | None], Iterator[list[Row]]]) -> None:
+    """Print a table for each list of rows, and what could not run; write all that there is so far."""
+    from benchmarks import environment, report
+    from benchmarks.compare import YARDSTICKS
 
     yardsticks = environment.python() if set(arguments.ways) & set(YARDSTICKS) else None
     described, rows = report.machine(yardsticks), []
-    for name in arguments.nets:
-        for batch in arguments.batch:
-            with ExitStack() as stack:
-                case = stack.enter_context(case_of(name, batch))
-                for threads in arguments.threads:
-                    found = rows_of(
-                        case, threads, arguments.ways, suffix, yardsticks, arguments.caffe, arguments.rounds
-                    )
-                    rows += found
-                    print(report.table(found), flush=True)
-                    for row in found:
-                        if row.fault:
-                            print(f"{row.name}: {row.fault}", file=sys.stderr)
-                    if arguments.json:
-                        report.write_json(arguments.json, rows, described)
+    for found in rows_of(yardsticks):
+        rows += found
+        print(report.table(found), flush=True)
+        for row in found:
+            if row.fault:
+                print(f"{row.name}: {row.fault}", file=sys.stderr)
+        if arguments.json:
+            report.write_json(arguments.json, rows, described)

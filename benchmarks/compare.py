@@ -6,9 +6,13 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from benchmarks.case import DECAY, MOMENTUM, RATE, Case
 from benchmarks.report import REFERENCES, Row
-from benchmarks.rounds import CaffeProgram, Contestant, Worker, difference, measure, ratio
+from benchmarks.rounds import CaffeProgram, Contestant, Pass, Starter, Worker, difference, measure, ratio
+
+YARDSTICKS = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in an environment of their own
 
 
 def rows_of(
@@ -19,22 +23,28 @@ def rows_of(
     contestants = [_worker(case, way, task, suffix, yardsticks) for way in ways]
     if caffe:
         contestants.append(CaffeProgram(caffe, task, training=bool(suffix)))
+    return _rows(case, threads, contestants, rounds)
+
+
+def _rows(case: Case, threads: int, contestants: Sequence[Contestant], rounds: int) -> list[Row]:
     able = [one for one in contestants if not one.fault]
     try:
-        seconds = measure(able, rounds, lambda k: _tell(case, threads, k, rounds))
+        times = measure(able, rounds, lambda k: _tell(case, threads, k, rounds))
     finally:
         for one in contestants:
             one.close()
     _tell(case, threads, rounds, rounds)
     expected = next((one.outputs for one in able if one.name == "netspec"), None)
+    seconds = {name: [clock for clock, _ in passes] for name, passes in times.items()}
     rows = []
     for one in contestants:
         own = seconds.get(one.name, [])
+        computing = [spent for _, spent in times.get(one.name, [])]
         ratios = {
             name: ratio(own, seconds[name]) for name in REFERENCES if own and name in seconds and name != one.name
         }
         off = difference(one.outputs, expected) if expected and one.name != "netspec" and one.outputs else None
-        rows.append(Row(case.name, case.batch, threads, one.name, own, ratios, off, one.fault))
+        rows.append(Row(case.name, case.batch, threads, one.name, own, computing, ratios, off, one.fault))
     return rows
 
 
@@ -47,6 +57,7 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
     outputs = sorted({blob for layer in message.layer for blob in layer.top} - read)
     return {
         **{name: str(getattr(case, name)) for name in ("prototxt", "caffemodel", "onnx", "inputs", "solver", "folder")},
+        "cache": str(case.folder / "cache"),
         **{"twin": case.twin, "outputs": outputs, "threads": threads},
         **{"rate": RATE, "momentum": MOMENTUM, "decay": DECAY},
     }
@@ -55,9 +66,36 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
 def _worker(case: Case, way: str, task: dict[str, Any], suffix: str, yardsticks: str | None) -> Contestant:
     if way == "pytorch" and case.twin is None:
         return _Absent(way, "there is no twin of this net; --twin names one that fits")
-    name, _, precision = way.partition("-")
-    python = yardsticks if yardsticks and name in ("opencv4", "onnxruntime", "openvino") else sys.executable
-    return Worker(way, python, {**task, "runs": name + suffix, "precision": precision or "fp32"})
+    name, options = parts(way)
+    return Worker(way, python_of(way, yardsticks), {**task, **options, "runs": name + suffix})
+
+
+def parts(way: str) -> tuple[str, dict[str, str]]:
+    """Return who runs ``netspec-openvino-bf16``, and by which engine, in which precision."""
+    name, *rest = way.split("-")
+    precision = rest.pop() if rest[-1:] == ["bf16"] else "fp32"
+    return name, {"engine": rest[0] if rest else "torch", "precision": precision}
+
+
+def python_of(way: str, yardsticks: str | None) -> str:
+    """Return the Python that has a way's library."""
+    return yardsticks if yardsticks and way in YARDSTICKS else sys.executable
+
+
+def starts_of(case: Case, ways: Sequence[str], yardsticks: str | None, rounds: int) -> list[Row]:
+    """Return a row for each way: the seconds of a process that loads the net and describes one image."""
+    import cv2
+
+    image = case.folder / "image.png"
+    with np.load(case.inputs) as arrays:
+        shape = arrays[arrays.files[0]].shape
+    cv2.imwrite(str(image), np.random.default_rng(0).integers(0, 256, (*shape[2:], 3), np.uint8))
+    task = {**task_of(case, 0), "image": str(image), "shape": shape}
+    contestants: list[Contestant] = []
+    for way in ways:
+        name, options = parts(way)
+        contestants.append(Starter(way, python_of(way, yardsticks), {**task, **options, "runs": name}))
+    return _rows(case, 0, contestants, rounds)
 
 
 class _Absent:
@@ -66,7 +104,7 @@ class _Absent:
     def __init__(self, name: str, fault: str) -> None:
         self.name, self.fault, self.outputs = name, fault, {}
 
-    def turn(self, passes: int) -> list[float]:
+    def turn(self, passes: int) -> list[Pass]:
         """Never called."""
         raise AssertionError(self.fault)
 

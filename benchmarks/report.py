@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import statistics
@@ -20,13 +21,18 @@ REFERENCES = ("pytorch", "opencv4", "caffe")
 
 @dataclass(frozen=True)
 class Row:
-    """How one way ran one net. ``seconds`` has each round; ``ratios`` are its times in those of the references."""
+    """How one way ran one net.
+
+    ``seconds`` and ``computing`` have each round: the time of a pass, and that of all its threads together; ``ratios``
+    are those of its ``seconds`` to the references'.
+    """
 
     net: str
     batch: int
     threads: int
     name: str
     seconds: list[float]
+    computing: list[float]
     ratios: Mapping[str, float]
     difference: float | None
     fault: str = ""
@@ -35,14 +41,25 @@ class Row:
 def table(rows: Sequence[Row]) -> str:
     """Return rows as a Markdown table."""
     references = [name for name in REFERENCES if any(name in row.ratios for row in rows)]
-    head = ["net", "batch", "threads", "run by", "ms", "best", *(f"/ {name}" for name in references), "off by"]
+    head = [
+        "net",
+        "batch",
+        "threads",
+        "run by",
+        "ms",
+        "best",
+        "CPU ms",
+        *(f"/ {name}" for name in references),
+        "off by",
+    ]
     lines = [head, ["---"] * len(head)]
     for row in rows:
         where = [row.net, str(row.batch), str(row.threads), row.name]
         if row.fault:
             lines.append([*where, *["-"] * (len(head) - 4)])
             continue
-        times = [f"{1e3 * value:.2f}" for value in (statistics.median(row.seconds), min(row.seconds))]
+        found = (statistics.median(row.seconds), min(row.seconds), statistics.median(row.computing))
+        times = ["-" if math.isnan(value) else f"{1e3 * value:.2f}" for value in found]
         ratios = [f"{row.ratios[name]:.2f}" if name in row.ratios else "-" for name in references]
         lines.append([*where, *times, *ratios, "-" if row.difference is None else f"{row.difference:.0e}"])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

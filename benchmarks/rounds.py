@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import re
 import statistics
@@ -19,6 +20,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 TURN, MOST = 0.4, 50  # seconds of a turn, and at most so many passes
 REST = 0.03  # seconds before a turn: threads of the one before may still spin
+Pass = tuple[float, float]  # seconds of the clock, and those that all threads together spent computing
 
 
 class Contestant(Protocol):
@@ -28,8 +30,8 @@ class Contestant(Protocol):
     fault: str
     outputs: dict[str, np.ndarray]
 
-    def turn(self, passes: int) -> list[float]:
-        """Return the seconds of so many passes."""
+    def turn(self, passes: int) -> list[Pass]:
+        """Return the times of so many passes."""
         ...
 
     def close(self) -> None:
@@ -63,14 +65,14 @@ class Worker:
         assert self.process.stdin is not None
         print(passes, file=self.process.stdin, flush=True)
 
-    def answer(self) -> list[float]:
-        """Return their seconds."""
+    def answer(self) -> list[Pass]:
+        """Return their times."""
         said = self._said()
         if isinstance(said, dict):
             raise RuntimeError(f"{self.name}: {said['fault']}")
-        return said
+        return [(clock, computing) for clock, computing in said]
 
-    def turn(self, passes: int) -> list[float]:
+    def turn(self, passes: int) -> list[Pass]:
         """See :class:`Contestant`."""
         self.tell(passes)
         return self.answer()
@@ -91,6 +93,40 @@ class Worker:
         return {"fault": lines[-1] if lines else f"ended with status {status}"}
 
 
+class Starter:
+    """Processes of benchmarks/start.py, one after the other; the time of importing torch is subtracted."""
+
+    def __init__(self, name: str, python: str, task: Mapping[str, Any]) -> None:
+        self.name, self.fault = name, ""
+        self.outputs: dict[str, np.ndarray] = {}
+        result = Path(task["folder"]) / f"{name}.npz"
+        self._command = [python, "-m", "benchmarks.start", json.dumps({**task, "result": str(result)})]
+        try:
+            self.turn(1)  # which also fills the cache
+        except RuntimeError as fault:
+            self.fault = str(fault)
+        else:
+            with np.load(result) as arrays:
+                self.outputs = {key: arrays[key] for key in arrays.files}
+
+    def turn(self, passes: int) -> list[Pass]:
+        """See :class:`Contestant`."""
+        return [self._start() for _ in range(passes)]
+
+    def _start(self) -> Pass:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        began = time.perf_counter()
+        done = subprocess.run(self._command, env=environment, capture_output=True, text=True, check=False)
+        seconds = time.perf_counter() - began
+        if done.returncode:
+            raise RuntimeError((done.stderr.strip().splitlines() or ["it failed"])[-1])
+        told = json.loads(done.stdout)
+        return seconds - told["torch"], told["computing"]
+
+    def close(self) -> None:
+        """See :class:`Contestant`."""
+
+
 class CaffeProgram:
     """The program ``caffe`` itself, begun anew at each turn; times are those in its log."""
 
@@ -105,12 +141,12 @@ class CaffeProgram:
         except (OSError, RuntimeError) as fault:
             self.fault = str(fault)
 
-    def turn(self, passes: int) -> list[float]:
+    def turn(self, passes: int) -> list[Pass]:
         """See :class:`Contestant`."""
         found = self._iterations(passes) if self.training else self._passes(passes)
         if not found:
             raise RuntimeError(f"{self.binary} logs no times that are known here")
-        return found
+        return [(seconds, math.nan) for seconds in found]
 
     def _passes(self, count: int) -> list[float]:
         log = self._log(["time", f"-model={self.task['prototxt']}", "-phase=TEST", f"-iterations={count}"])
@@ -143,19 +179,20 @@ class CaffeProgram:
         """See :class:`Contestant`."""
 
 
-def measure(contestants: Sequence[Contestant], rounds: int, tell: Callable[[int], object]) -> dict[str, list[float]]:
-    """Return, by name, the seconds of a pass in each round: the median of its turn.
+def measure(contestants: Sequence[Contestant], rounds: int, tell: Callable[[int], object]) -> dict[str, list[Pass]]:
+    """Return, by name, the times of a pass in each round: the medians of its turn.
 
     ``tell`` gets the number of each round before it begins.
     """
-    seconds: dict[str, list[float]] = {one.name: [] for one in contestants}
-    passes = {one.name: max(1, min(MOST, int(TURN / min(one.turn(1))))) for one in contestants}
+    times: dict[str, list[Pass]] = {one.name: [] for one in contestants}
+    passes = {one.name: max(1, min(MOST, int(TURN / one.turn(1)[0][0]))) for one in contestants}
     for k in range(rounds):
         tell(k)
         for one in contestants if k % 2 == 0 else reversed(contestants):
             time.sleep(REST)
-            seconds[one.name].append(statistics.median(one.turn(passes[one.name])))
-    return seconds
+            clock, computing = zip(*one.turn(passes[one.name]), strict=True)
+            times[one.name].append((statistics.median(clock), statistics.median(computing)))
+    return times
 
 
 def ratio(seconds: Sequence[float], others: Sequence[float]) -> float:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from benchmarks.case import training_case
 from benchmarks.compare import task_of
-from benchmarks.rounds import TURN, Worker, ratio
+from benchmarks.rounds import TURN, Pass, Worker, ratio
 
 VARIABLES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  # by which OpenMP runtimes are told how to wait
 
@@ -40,15 +40,19 @@ def compare(name: str, waits: Sequence[str], batch: int, threads: int, rounds: i
 def _measure(pairs: dict[str, list[Worker]], rounds: int) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
     alone: dict[str, list[float]] = {wait: [] for wait in pairs}
     paired: dict[str, list[float]] = {wait: [] for wait in pairs}
-    passes = max(1, int(4 * TURN / min(next(iter(pairs.values()))[0].turn(1))))
+    passes = max(1, int(4 * TURN / next(iter(pairs.values()))[0].turn(1)[0][0]))
     for _ in range(rounds):
         for wait, (worker, _) in pairs.items():
-            alone[wait].append(statistics.mean(worker.turn(passes)))
+            alone[wait].append(_mean(worker.turn(passes)))
         for wait, pair in pairs.items():
             for worker in pair:
                 worker.tell(passes)
-            paired[wait].append(statistics.mean(statistics.mean(worker.answer()) for worker in pair))
+            paired[wait].append(statistics.mean(_mean(worker.answer()) for worker in pair))
     return alone, paired
+
+
+def _mean(passes: Sequence[Pass]) -> float:
+    return statistics.mean(clock for clock, _ in passes)
 
 
 def _told(seconds: Sequence[float]) -> str:

@@ -28,6 +28,7 @@ from netspec.graph.filter import filter_net, with_state
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, read_solver
 from netspec.scores import Score, read_scores
+from netspec.whole_file import whole_file
 
 PHASES = {"train": TRAIN, "validation": TEST}
 PROGRESS = ("Iteration ", "    Test net output", "Snapshotting to", "Optimization Done")  # lines of the log to show
@@ -113,7 +114,8 @@ def compare(solvers: Sequence[str], out: Path, train: bool, gpu: str, say: Say) 
             _netspec([*words, *_on(gpu)], out / f"{entry.stem}.log", say)
         runs.append(_judged(entry, out, gpu.replace("all", "0").partition(",")[0], say))
     file = out / "runs.json"
-    file.write_text(json.dumps(runs, indent=1))
+    with whole_file(file) as unfinished:
+        unfinished.write_text(json.dumps(runs, indent=1))
     judged = read_runs(file)
     return text_table(judged), write_report(judged, out)
 

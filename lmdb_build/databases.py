@@ -12,9 +12,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -195,14 +197,27 @@ class _Workers:
             yield from map(work, items)
             return
         pending: deque[Future[T]] = deque()
-        for item in items:
-            pending.append(self._pool.submit(work, item))
-            if len(pending) >= self._count * _AHEAD:
+        try:
+            for item in items:
+                pending.append(self._pool.submit(work, item))
+                if len(pending) >= self._count * _AHEAD:
+                    yield pending.popleft().result()
+            while pending:
                 yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
+        except BrokenProcessPool:
+            raise SpecError("a process that reads images was killed; did the machine run out of memory?") from None
 
 
 def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the pool
+    for number in (signal.SIGINT, signal.SIGTERM):  # the parent ends the pool
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     cv2.setNumThreads(0)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent does, however that ends."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

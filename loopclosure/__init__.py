@@ -5,12 +5,16 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from loopclosure.detector.detector import LoopDetector, LoopResult
 
 __all__ = ["LoopDetector", "LoopResult"]
+
+# The most pixels of an image, which is read when OpenCV is loaded: a small file may unpack to gigabytes.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
 
 
 __path__.append(f"{__path__[0]}/moved")  # loopclosure.baselines, a former name

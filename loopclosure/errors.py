@@ -5,6 +5,26 @@ from __future__ import annotations
 import os
 
 
+def printable(text: str) -> str:
+    """Return a text in one line that moves no cursor: control characters are written as escapes.
+
+    Names come from files of strangers; raw, they could forge lines of a log, or talk to the terminal.
+    """
+    return text.translate(_ESCAPES)
+
+
+# C0 and C1 controls, separators of lines, and marks that turn the direction of writing.
+_CONTROLS = [
+    *(code for code in range(32) if chr(code) != "\t"),
+    *range(127, 160),
+    0x2028,
+    0x2029,
+    *range(0x202A, 0x202F),
+    *range(0x2066, 0x206A),
+]
+_ESCAPES = {code: repr(chr(code))[1:-1] for code in _CONTROLS}
+
+
 class InputError(ValueError):
     """A fault of a user's file or choice: what was found, what was expected, what to do, and where.
 
@@ -18,4 +38,4 @@ class InputError(ValueError):
         self.line = line
         self.column = column
         place = f"{self.file}:{line}:{column}" if line else self.file
-        super().__init__(f"{place}: {message}" if place else message)
+        super().__init__(printable(f"{place}: {message}" if place else message))

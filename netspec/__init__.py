@@ -28,6 +28,9 @@ _WAITS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 if "torch" not in sys.modules and not any(name in os.environ for name in _WAITS):
     os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
+# The most pixels of an image, which is read when OpenCV is loaded: a small file may unpack to gigabytes.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
+
 _HOMES = {
     "use_dialect": "netspec.dialects",
     "Net": "netspec.net.net",

@@ -12,7 +12,9 @@ import argparse
 import logging
 import os
 import re
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any
@@ -58,14 +60,15 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
     """Parse a command line, run the command, and return its exit status.
 
     A SpecError, an OSError or one of ``faults`` becomes one line on stderr and status 1. Wrong usage gives status 2,
-    Ctrl-C status 130.
+    Ctrl-C or SIGTERM status 130.
     """
     try:
         arguments = parser.parse_args(words)
     except SystemExit as end:  # argparse has printed the error, or its help
         return int(end.code or DONE)
     try:
-        with _logging(_level(arguments), arguments.log_form) if arguments.log_form else nullcontext():
+        shown = _logging(_level(arguments), arguments.log_form) if arguments.log_form else nullcontext()
+        with interruptible(), shown:
             return arguments.run(arguments) or DONE
     except (SpecError, *faults) as fault:
         print(fault, file=sys.stderr)
@@ -82,6 +85,32 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Make SIGTERM interrupt the block as Ctrl-C does; a second of either ends the process at once, with status 130.
+
+    Signals that the program around it handles or ignores are left alone.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    mine = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    before = {number: usual for number, usual in mine.items() if signal.getsignal(number) == usual}
+
+    def interrupt(*_: object) -> None:
+        for number in before:
+            signal.signal(number, lambda *_: os._exit(INTERRUPTED))
+        raise KeyboardInterrupt
+
+    try:
+        for number in before:
+            signal.signal(number, interrupt)
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class _GflagsParser(argparse.ArgumentParser):

@@ -26,6 +26,26 @@ class Where:
         return place
 
 
+def printable(text: str) -> str:
+    """Return a text in one line that moves no cursor: control characters are written as escapes.
+
+    Names come from files of strangers; raw, they could forge lines of a log, or talk to the terminal.
+    """
+    return text.translate(_ESCAPES)
+
+
+# C0 and C1 controls, separators of lines, and marks that turn the direction of writing.
+_CONTROLS = [
+    *(code for code in range(32) if chr(code) != "\t"),
+    *range(127, 160),
+    0x2028,
+    0x2029,
+    *range(0x202A, 0x202F),
+    *range(0x2066, 0x206A),
+]
+_ESCAPES = {code: repr(chr(code))[1:-1] for code in _CONTROLS}
+
+
 class SpecError(ValueError):
     """An error in a user's file: what was found, what was expected, what to do, and where.
 
@@ -35,7 +55,7 @@ class SpecError(ValueError):
     def __init__(self, message: str, where: Where | None = None) -> None:
         self.message = message
         self.where = where
-        super().__init__(f"{where}: {message}" if where else message)
+        super().__init__(printable(f"{where}: {message}" if where else message))
 
 
 class ForkFault(SpecError):

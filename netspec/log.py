@@ -15,12 +15,32 @@ from contextlib import contextmanager
 
 from typing_extensions import override
 
+from netspec.errors import printable
+
 logger = logging.getLogger("netspec")
+
+
+class _OneLine(logging.Filter):
+    """Makes each message one line, but for a text that follows the first line (:func:`dump`)."""
+
+    @override
+    def filter(self, record: logging.LogRecord) -> bool:
+        record.msg, record.args = printable(record.getMessage()) + getattr(record, "text", ""), ()
+        record.__dict__.pop("text", None)
+        return True
+
+
+logger.addFilter(_OneLine())
 
 
 def info(site: str, message: str) -> None:
     """Log one message of Caffe; ``site`` is the file and line in Caffe that prints it."""
     logger.info(message, extra={"site": site})
+
+
+def dump(site: str, title: str, text: str) -> None:
+    """Log a message of Caffe and, on the lines after it, a protobuf text, whose strings are escaped."""
+    logger.info(title, extra={"site": site, "text": "\n" + text})
 
 
 def warning(site: str, message: str) -> None:

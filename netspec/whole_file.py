@@ -1,37 +1,117 @@
-"""Files that are written atomically: if a run dies while it writes, the old file is still there.
+"""Files and folders that appear whole or not at all, and locks that end with their process.
 
-Also a check, before a long run, whether a file can be written.
+What is being written has a hidden name beside its path, ``.NAME.XXXXXXXX.unfinished``, and is locked. A killed run
+leaves it behind, unlocked; the next run that writes into the same folder removes it. Also a check, before a long run,
+whether a file can be written.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import re
+import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from netspec.errors import SpecError, Where
+
+try:
+    import fcntl
+except ImportError:  # Windows: there, a file that is open cannot be removed
+    fcntl: Any = None
+
+_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
+_swept: set[Path] = set()
 
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path`` to write to; it is renamed once the block is done and all is on disk.
 
-    Raises SpecError if it cannot be written. If the block fails, the temporary file is removed.
+    A symbolic link stays one; a pipe or a device gets the bytes. If the block fails, the temporary file is removed, and
+    what was at ``path`` is still there. Raises SpecError if it cannot be written.
     """
-    path = Path(path)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
+    real = Path(os.path.realpath(path))
     try:
-        yield unfinished
-        with unfinished.open("rb") as file:
-            os.fsync(file.fileno())
-        unfinished.replace(path)
+        if real.exists() and not real.is_file() and not real.is_dir():
+            with _copied_to(real) as unfinished:
+                yield unfinished
+            return
+        with _temporary(real) as unfinished:
+            with _created(unfinished) as held:
+                yield unfinished
+                os.fsync(held)
+                if fcntl is not None:
+                    unfinished.replace(real)  # while it is locked, so that no sweep removes it
+            if fcntl is None:
+                unfinished.replace(real)  # Windows renames no open file
+            sync_folder(real.parent)
     except OSError as fault:
         reason = os.strerror(fault.errno) if fault.errno else fault  # h5py's own text is a paragraph
-        raise SpecError(f"cannot be written: {reason}", Where(str(path))) from None
+        raise _fault(f"cannot be written: {reason}", path) from None
+
+
+@contextmanager
+def whole_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a new folder beside ``path`` to fill; it is renamed once the block is done and all is on disk.
+
+    If the block fails, it is removed. Raises OSError if it cannot be made or renamed.
+    """
+    real = Path(os.path.realpath(path))
+    with _temporary(real) as unfinished:
+        unfinished.mkdir()
+        held = None if fcntl is None else os.open(unfinished, os.O_RDONLY)  # Windows opens no folders
+        try:
+            if held is not None:
+                _lock(held)
+            yield unfinished
+            for file in unfinished.iterdir():
+                _sync(file)
+            sync_folder(unfinished)
+            unfinished.rename(real)
+            sync_folder(real.parent)
+        finally:
+            if held is not None:
+                os.close(held)
+
+
+@contextmanager
+def only_one(path: str | Path, advice: str) -> Iterator[None]:
+    """Hold the lock file ``path`` within the block; it is released whichever way the process ends.
+
+    Where the system or the file system has no locks, nothing is locked. Raises SpecError, which ends with ``advice``,
+    if another process holds it or it cannot be made.
+    """
+    path = Path(path)
+    try:
+        held, locked = _open_locked(path, os.O_CREAT | os.O_RDWR)
+    except OSError as fault:
+        raise _fault(f"cannot be written: {fault.strerror}", path) from None
+    try:
+        if not locked:
+            owner = os.read(held, 20).decode(errors="replace").strip()
+            of = f" (process {owner})" if owner.isdigit() else ""
+            raise _fault(f"is held by another run{of}; {advice}", path)
+        os.ftruncate(held, 0)
+        os.write(held, f"{os.getpid()}\n".encode())
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows removes no open file: it stays, unlocked
+                path.unlink()
     finally:
-        unfinished.unlink(missing_ok=True)
+        os.close(held)
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to disk, where the system can: a rename is otherwise lost with the power."""
+    with suppress(OSError):  # Windows opens no folders, and some file systems do not sync them
+        _sync(folder)
 
 
 def why_unwritable(path: str | Path) -> str:
@@ -51,6 +131,109 @@ def why_unwritable(path: str | Path) -> str:
         return fault.strerror or str(fault)
     if path.is_dir():
         return os.strerror(errno.EISDIR)
-    if os.access(path, os.W_OK) if path.exists() else os.access(folder, os.W_OK | os.X_OK):
+    renamed_over = not path.exists() or path.is_file()  # a pipe or a device is not
+    if (not path.exists() or os.access(path, os.W_OK)) and (not renamed_over or os.access(folder, os.W_OK | os.X_OK)):
         return ""
     return os.strerror(errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES)
+
+
+@contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """Yield a name for what becomes ``path``, and remove what is still there at the end; sweep the folder first."""
+    _sweep(path.parent)
+    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.unfinished")
+    try:
+        yield unfinished
+    finally:
+        _remove(unfinished)
+
+
+@contextmanager
+def _created(path: Path) -> Iterator[int]:
+    """Create a file and lock it; yield its descriptor."""
+    held, _ = _open_locked(path, os.O_CREAT | os.O_EXCL | os.O_RDWR)
+    try:
+        yield held
+    finally:
+        os.close(held)
+
+
+def _open_locked(path: Path, flags: int) -> tuple[int, bool]:
+    """Open a file and lock it; return its descriptor, and False if another process holds the lock.
+
+    Another process may remove the file before it is locked here: then it is opened again.
+    """
+    while True:
+        held = os.open(path, flags, 0o666)
+        locked = _lock(held) is not False
+        with suppress(FileNotFoundError):
+            if not locked or os.path.samestat(os.fstat(held), path.stat()):
+                return held, locked
+        os.close(held)
+
+
+def _lock(descriptor: int) -> bool | None:
+    """Lock an open file; return False if another process holds it, None if there are no locks here."""
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what killed runs left in a folder, once per process."""
+    if folder in _swept:
+        return
+    _swept.add(folder)
+    with suppress(OSError):
+        for name in os.listdir(folder):
+            if _LEFTOVER.fullmatch(name) and _is_abandoned(folder / name):
+                _remove(folder / name)
+
+
+def _is_abandoned(path: Path) -> bool:
+    """Say whether nobody holds the lock of an unfinished file; without locks, only an open file cannot be removed."""
+    if fcntl is None:
+        return True
+    try:
+        held = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        return _lock(held) is True
+    finally:
+        os.close(held)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _copied_to(device: Path) -> Iterator[Path]:
+    """Yield a temporary name; copy what was written there into a pipe or a device."""
+    with TemporaryDirectory() as folder:
+        yield Path(folder, device.name)
+        with Path(folder, device.name).open("rb") as source, device.open("wb") as target:
+            shutil.copyfileobj(source, target)
+
+
+def _fault(message: str, path: str | Path) -> Exception:
+    return SpecError(message, Where(str(path)))

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
+from loopclosure.whole_file import whole_file
 
 ROOT_FOLDER = (
     "root folder"  # this setting is the folder that image names are relative to, itself relative to the list's folder
@@ -44,9 +45,10 @@ def write_pair_list(path: Path, pairs: Iterable[tuple[str, str, int]], settings:
         lines.append(f"{_quoted(first)} {_quoted(second)} {label}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", path) from error
+        raise InputError(f"cannot be written: {error.strerror}", path) from error
+    with whole_file(path) as unfinished:
+        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_pair_list(path: Path) -> list[ListedPair]:

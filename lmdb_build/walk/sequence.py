@@ -31,6 +31,7 @@ from loopclosure.places.trajectory import (
     write_groundtruth,
     write_rgb_list,
 )
+from loopclosure.whole_file import whole_file
 
 Array = NDArray[np.float64]
 
@@ -100,7 +101,8 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     camera = walk.camera
     calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "
     calibration += f"{camera.centre[0]:g} {camera.centre[1]:g} {camera.width} {camera.height}\n"
-    (folder / "calibration.txt").write_text(calibration, encoding="utf-8")
+    with whole_file(folder / "calibration.txt") as unfinished:
+        unfinished.write_text(calibration, encoding="utf-8")
     write_groundtruth(
         folder / "groundtruth.txt", Trajectory(walk.start_s + pose_times, poses.positions, poses.quaternions)
     )

@@ -51,7 +51,7 @@ def add_to(commands: Commands) -> None:
     how.add_argument(
         "--describe",
         default="loopclosure.descriptors.thumbnails:Thumbnailer",
-        metavar="MODULE:FUNCTION",
+        metavar="MODULE|FILE.py:FUNCTION",
         help="image (H, W, 3) BGR -> descriptor (default: %(default)s)",
     )
     how.add_argument("--features", metavar="F.npz", help="descriptors computed beforehand (netspec extract --images)")

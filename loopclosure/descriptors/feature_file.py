@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from loopclosure.arrays import read_npz
 from loopclosure.descriptors.whitening import Whitening
 from loopclosure.errors import InputError
 
@@ -87,12 +87,7 @@ class Features:
 def read_features(path: str | Path) -> Features:
     """Read a features.npz; without an array ``features``, its only other array, named after a blob, is taken."""
     path = Path(path)
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        reason = "no such file" if not path.exists() else f"cannot be read ({error})"
-        raise InputError(f"{reason}; expected the .npz that netspec extract --images writes", path) from error
+    arrays = read_npz(path, "the .npz that netspec extract --images writes")
     candidates = [name for name in arrays if name not in BESIDE_FEATURES]
     chosen = "features" if "features" in arrays else candidates[0] if len(candidates) == 1 else ""
     if not chosen:
@@ -104,13 +99,22 @@ def read_features(path: str | Path) -> Features:
             f'"{chosen}" has shape {features.shape}, {features.dtype}; expected (images, dimensions)', path
         )
     features = features.reshape(len(features), -1).astype(np.float32)
-    names = [str(name) for name in arrays.get("names", np.zeros(0, str))]
+    names = [str(name) for name in arrays.get("names", np.zeros(0, str)).reshape(-1)]
     stamps = arrays.get("stamps")
+    if stamps is not None and (stamps.ndim != 1 or stamps.dtype.kind not in "fiu"):
+        raise InputError(f'"stamps" has shape {stamps.shape}, {stamps.dtype}; expected one number per image', path)
     for what, values in (("names", names), ("stamps", stamps)):
         if values is not None and len(values) not in (0, len(features)):
             raise InputError(f"has {len(features)} descriptors but {len(values)} {what}", path)
-    seconds = float(arrays["seconds_per_image"]) if "seconds_per_image" in arrays else float("nan")
-    views = len(arrays["zooms"]) if "zooms" in arrays else 1
+    seconds = _number(arrays, "seconds_per_image", path)
+    views = arrays["zooms"].size if "zooms" in arrays else 1
     if not views or features.shape[1] % views:
         raise InputError(f"has {features.shape[1]} numbers per image, which cannot be {views} views", path)
     return Features(path, features, names, stamps, seconds, views)
+
+
+def _number(arrays: dict[str, np.ndarray], name: str, path: Path) -> float:
+    values = arrays.get(name, np.array(np.nan))
+    if values.size != 1 or values.dtype.kind not in "fiu":
+        raise InputError(f'"{name}" has shape {values.shape}, {values.dtype}; expected a number', path)
+    return float(values.item())

@@ -19,6 +19,7 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
+from loopclosure.whole_file import whole_file
 
 METRICS = ("euclidean", "cosine")
 # 1024 x 16384 scores in float32 are 64 MiB, for a sequence of any length.
@@ -192,29 +193,24 @@ def write_similarity(
 ) -> tuple[int, int]:
     """Write all scores (Q, R) as an .npy file of float32, block by block; return its shape."""
     shape = (len(queries), len(queries) if references is None else len(references))
-    try:
-        matrix = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", path) from error
     blocks = similarity_blocks(queries, references, metric)
-    for start, block in progress(blocks, "similarity", -(-shape[0] // BLOCK_ROWS)):
-        matrix[start : start + len(block)] = block
-    matrix.flush()
+    with whole_file(path) as unfinished, unfinished.open("wb") as file:
+        header = {"descr": np.lib.format.dtype_to_descr(np.dtype("<f4")), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+        for _, block in progress(blocks, "similarity", -(-shape[0] // BLOCK_ROWS)):
+            file.write(np.ascontiguousarray(block, "<f4"))
     return shape
 
 
 def write_top_k(path: str | Path, found: TopK) -> None:
     """Write the best references of each query as CSV: query, rank from 1, reference, score."""
-    try:
-        with Path(path).open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(["query", "rank", "reference", "score"])
-            for query, (indices, scores) in enumerate(zip(found.indices, found.scores, strict=True)):
-                for rank, (reference, score) in enumerate(zip(indices, scores, strict=True), start=1):
-                    if reference >= 0:
-                        writer.writerow([query, rank, reference, f"{score:.9g}"])
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", path) from error
+    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["query", "rank", "reference", "score"])
+        for query, (indices, scores) in enumerate(zip(found.indices, found.scores, strict=True)):
+            for rank, (reference, score) in enumerate(zip(indices, scores, strict=True), start=1):
+                if reference >= 0:
+                    writer.writerow([query, rank, reference, f"{score:.9g}"])
 
 
 def _pair(queries: np.ndarray, references: np.ndarray | None, metric: str) -> tuple[Descriptors, Descriptors]:

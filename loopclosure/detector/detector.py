@@ -20,14 +20,17 @@ from typing import Any
 
 import numpy as np
 
+from loopclosure.arrays import check_array, from_json, read_npz
 from loopclosure.descriptors.similarity import check_metric, squared_distances
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.precision_recall import PrecisionRecall, curve
+from loopclosure.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
 FIRST_CAPACITY = 256  # frames; doubled when full
 FORMAT = 1  # of the file that save writes
+SAVED = "a file that LoopDetector.save wrote"
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,8 @@ class DetectorSettings:
         ):
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; expected {least} or more")
+        if self.threshold is not None and np.isnan(self.threshold):
+            raise InputError("threshold is nan; expected a number")
         if self.consistency_window < 0:
             raise InputError(f"consistency_window is {self.consistency_window}; expected 0 or more")
 
@@ -245,39 +250,30 @@ class LoopDetector:
             arrays["descriptors"] = np.concatenate(
                 [np.zeros((0, 128), np.uint8), *(f.descriptors for f in frames.local)]
             )
-        path = Path(path)
-        try:
-            with path.open("wb") as stream:
-                np.savez(stream, about=np.array(json.dumps(about)), **arrays)
-        except OSError as error:
-            raise InputError(f"cannot be written ({error.strerror})", path) from error
+        with whole_file(path) as unfinished, unfinished.open("wb") as stream:
+            np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
     @classmethod
     def load(cls, path: str | Path, describe: Describe | None = None) -> LoopDetector:
-        """Read what ``save`` wrote; ``describe`` must be the one that the detector was made with."""
+        """Read what ``save`` wrote; ``describe`` must be the one that the detector was made with.
+
+        Raises InputError for any other file.
+        """
+        arrays = read_npz(path, SAVED)
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
             about = json.loads(str(arrays["about"]))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            reason = f"cannot be read ({error})" if Path(path).exists() else "no such file"
-            raise InputError(f"{reason}; expected a file that LoopDetector.save wrote", path) from error
-        if about["format"] != FORMAT:
-            raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
-        check = None if about["check"] is None else GeometricCheck(**about["check"])
-        detector = cls(describe, DetectorSettings(**about["settings"]), check=check)
-        count = len(arrays["rows"])
-        rows = arrays["rows"].reshape(count, detector.settings.views, -1) if count else np.zeros((0, 0, 0), np.float32)
-        frames = _Frames(count, rows, np.square(rows).sum(-1), arrays["stamps"], arrays["poses"])
-        if check is not None:
-            ends = np.cumsum(arrays["points_of_frame"])[:-1]
-            pieces = zip(np.split(arrays["points"], ends), np.split(arrays["descriptors"], ends), strict=True)
-            frames.local = [LocalFeatures(points, descriptors) for points, descriptors in pieces][: frames.count]
-        detector._frames = frames
-        detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
-        for loop in about["loops"]:
-            loop["candidates"] = [(int(number), float(score)) for number, score in loop["candidates"]]
-            detector.loops.append(LoopResult(**loop))
+            if about["format"] != FORMAT:
+                raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
+            check = None if about["check"] is None else from_json(GeometricCheck, about["check"])
+            detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check)
+            detector._frames = _frames(arrays, detector.settings.views, check is not None)
+            detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
+            detector.loops = [_loop(found, len(detector)) for found in about["loops"]]
+        except InputError as fault:
+            raise fault if fault.file else InputError(fault.message, path) from None
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"cannot be read ({reason}); expected {SAVED}", path) from None
         return detector
 
     def _checked(self, descriptor: Sequence[float] | np.ndarray, stamp: float | None) -> np.ndarray:
@@ -377,3 +373,36 @@ def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | Non
     values = values.copy()
     values[3:] /= np.linalg.norm(values[3:])
     return values
+
+
+def _frames(arrays: dict[str, np.ndarray], views: int, checked: bool) -> _Frames:
+    """Return the frames of a saved detector. Raises ValueError where the arrays do not fit together."""
+    count = len(arrays["rows"])
+    check_array(arrays, "rows", "f", (count, arrays["rows"].size // count if count else 0))
+    check_array(arrays, "stamps", "f", (count,), finite=False)
+    check_array(arrays, "poses", "f", (count, 7), finite=False)
+    rows = arrays["rows"].reshape(count, views, -1) if count else np.zeros((0, 0, 0), np.float32)
+    frames = _Frames(count, rows, np.square(rows).sum(-1), arrays["stamps"], arrays["poses"])
+    if checked:
+        check_array(arrays, "points_of_frame", "i", (count,))
+        ends = np.cumsum(arrays["points_of_frame"])
+        points = int(ends[-1]) if count else 0
+        if min(arrays["points_of_frame"], default=0) < 0:
+            raise ValueError('"points_of_frame" has a negative number')
+        check_array(arrays, "points", "f", (points, 2))
+        check_array(arrays, "descriptors", "u", (points, 128))
+        pieces = zip(np.split(arrays["points"], ends), np.split(arrays["descriptors"], ends), strict=True)
+        frames.local = [LocalFeatures(points, descriptors) for points, descriptors in pieces][:count]
+    return frames
+
+
+def _loop(found: Any, count: int) -> LoopResult:
+    """Return a saved loop of a detector of ``count`` frames. Raises ValueError, LookupError or TypeError."""
+    candidates = [(int(number), float(score)) for number, score in found["candidates"]]
+    loop = LoopResult(**{**found, "candidates": candidates})
+    ends = (loop.query_id, loop.accepted)
+    if not all(isinstance(end, int) and 0 <= end < count for end in ends) or not isinstance(loop.score, float):
+        raise ValueError(f"a loop of frames {ends} among {count}")
+    if not isinstance(loop.inliers, int | None) or not isinstance(loop.stamp, float | int | None):
+        raise ValueError(f"a loop with {loop.inliers!r:.20} inliers at {loop.stamp!r:.20} s")
+    return loop

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.detector.detector import LoopResult
 from loopclosure.errors import InputError
+from loopclosure.whole_file import whole_file
 
 RelativePose = Callable[[int, int], np.ndarray | None]
 
@@ -56,7 +57,7 @@ def write_loops_csv(
     """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as stream:
+    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(
             ["query_id", "match_id", "score", "inliers", "query_stamp", "match_stamp", "query_name", "match_name"]
@@ -104,7 +105,8 @@ def write_g2o(
         lines.append(f"EDGE_SE3:QUAT {loop.accepted} {loop.query_id} {_numbers(step)} {closure.information()}")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    with whole_file(path) as unfinished:
+        unfinished.write_text("\n".join(lines) + "\n", encoding="ascii")
     return left_out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import sys
 from collections.abc import Iterator
@@ -30,6 +31,8 @@ from loopclosure.places.image_list import list_images
 from loopclosure.places.same_place import same_place
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Poses, associate, read_groundtruth
 from loopclosure.progress import Progress, silent
+
+OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
 
 
 @dataclass(frozen=True)
@@ -59,12 +62,16 @@ class Recording:
             return
         wanted = iter(self.numbers.tolist())
         following = next(wanted, None)
+        number = -1
         for number, (seconds, image) in enumerate(video_frames(self.source)):
             if number == following:
                 yield image, seconds
                 following = next(wanted, None)
                 if following is None:
                     return
+        if following is not None:
+            message = f"ends after {number + 1} frames, though frame {following} is wanted and it says that it has it"
+            raise InputError(f"{message}; give --stop {number + 1}", self.source)
 
 
 def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Recording:
@@ -167,21 +174,19 @@ def judged_by_poses(detector: LoopDetector) -> str:
 
 
 def load_describe(specification: str, options: dict[str, str]) -> Describe:
-    """Return the ``describe`` function that ``module:name`` names.
+    """Return the ``describe`` function that ``module:name`` or ``FILE.py:name`` names.
 
     A class, or a function if there are options, is called with ``options`` as keywords and must return the ``describe``
-    function. Modules are also searched for in the working directory.
+    function. A module is one of an installed package: what lies in the working directory runs only if its path is
+    given.
     """
-    module_name, colon, name = specification.partition(":")
-    if not colon or not name:
-        raise InputError(f'"{specification}" does not name a function; expected module:function')
-    sys.path.insert(0, os.getcwd())
+    module_name, colon, name = specification.rpartition(":")
+    if not colon or not name or not module_name:
+        raise InputError(f'"{specification}" does not name a function; expected module:function or FILE.py:function')
     try:
-        target: Any = importlib.import_module(module_name)
-    except ImportError as error:
+        target: Any = _file_module(Path(module_name)) if module_name.endswith(".py") else _installed_module(module_name)
+    except (ImportError, SyntaxError, OSError) as error:
         raise InputError(f'cannot import "{module_name}" of --describe {specification}: {error}') from error
-    finally:
-        sys.path.pop(0)
     for part in name.split("."):
         if not hasattr(target, part):
             raise InputError(f'"{module_name}" has no "{name}" (--describe {specification})')
@@ -194,6 +199,35 @@ def load_describe(specification: str, options: dict[str, str]) -> Describe:
     if not callable(target):
         raise InputError(f"--describe {specification} is a {type(target).__name__}, which cannot be called")
     return cast(Describe, target)
+
+
+def _installed_module(name: str) -> Any:
+    here, top = Path.cwd(), name.partition(".")[0]
+    found = importlib.util.find_spec(top)
+    origins = [] if found is None else [found.origin, *(found.submodule_search_locations or ())]
+    near = [here / f"{top}.py", here / top / "__init__.py", here / top]
+    lies_here = any(origin and Path(origin) in near for origin in origins)
+    if top not in OWN and (lies_here or (found is None and any(path.exists() for path in near))):
+        path = "/".join(name.split(".")) + ".py"
+        raise InputError(
+            f'"{name}" lies in the working directory, not in an installed package; name its file: ./{path}'
+        )
+    return importlib.import_module(name)
+
+
+def _file_module(path: Path) -> Any:
+    """Run a file as a module; what it imports from its own folder comes after the installed packages."""
+    spec = importlib.util.spec_from_file_location(f"_describe_{path.stem}", path)
+    assert spec is not None, "the path ends in .py"
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    sys.path.append(str(path.resolve().parent))
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(path.resolve().parent))
+    return module
 
 
 def views_of(describe: Describe | None, features: Features | None) -> int:

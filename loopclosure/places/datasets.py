@@ -16,6 +16,7 @@ from loopclosure.places.masks import read_coordinates, read_place_pairs, read_tr
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
+from loopclosure.whole_file import whole_file
 
 # Ten seconds are common for TUM's 30 Hz sequences; the other sets have no time.
 TUM_EXCLUSION = Exclusion(seconds=10.0)
@@ -222,8 +223,9 @@ def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
             images = read_bgr(left), read_bgr(right)
             if images[0].shape[0] != images[1].shape[0]:
                 raise InputError(f"is {images[1].shape[0]} pixels high, {left.name} {images[0].shape[0]}", right)
-            if not cv2.imwrite(str(path), np.hstack(images)):
-                raise InputError("cannot be written", path)
+            _, picture = cv2.imencode(".png", np.hstack(images))
+            with whole_file(path) as unfinished:
+                unfinished.write_bytes(picture.tobytes())
         joined.append(path)
     return joined
 

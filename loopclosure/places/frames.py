@@ -68,7 +68,10 @@ def read_bgr(path: str | Path) -> np.ndarray:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f"no such image ({error.strerror})", path) from None
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    except cv2.error:  # too large, for example
+        image = None
     if image is None:
         raise InputError("is not a readable image", path)
     return image

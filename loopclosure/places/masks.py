@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import scipy.io
-import scipy.sparse
 
+from loopclosure.arrays import read_npy
 from loopclosure.errors import InputError
+from loopclosure.places.mat_file import read_mat
 
 # The FAB-MAP sets call it truth; several papers' derived files GT.
 TRUTH_KEYS = ("truth", "gt", "groundtruth", "ground_truth")
@@ -89,11 +88,7 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
     if suffix == ".mat":
         return _read_mat(path, keys, what)
     if suffix == ".npy":
-        try:
-            values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise InputError(f"cannot be read as .npy ({error}); expected {what}", path) from error
-        return _numeric(values, path)
+        return _numeric(read_npy(path, what), path)
     if suffix in (".txt", ".csv", ".dat"):
         return _read_text(path, what, last_columns)
     if suffix in LOSSLESS_SUFFIXES:
@@ -109,18 +104,7 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
 
 
 def _read_mat(path: Path, keys: tuple[str, ...], what: str) -> np.ndarray:
-    try:
-        content: dict[str, Any] = scipy.io.loadmat(str(path))
-    except NotImplementedError as error:
-        raise InputError("is a MATLAB 7.3 file; save it again in MATLAB with -v7", path) from error
-    except Exception as error:  # a broken file can make loadmat raise anything
-        raise InputError(f"cannot be read as .mat ({error}); expected {what}", path) from error
-    matrices = {}
-    for name, value in content.items():
-        if scipy.sparse.issparse(value):
-            value = value.toarray()
-        if not name.startswith("__") and isinstance(value, np.ndarray) and value.ndim == 2 and value.size > 1:
-            matrices[name] = value
+    matrices = read_mat(path)
     named = [name for key in keys for name in matrices if name.lower() == key]
     if not named and len(matrices) == 1:
         named = list(matrices)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
+from loopclosure.whole_file import whole_file
 
 # TUM's own associate.py takes 0.02 s; with 30 Hz images and motion capture at 100 Hz a gap of 0.03 s does no harm.
 MAX_DIFFERENCE_S = 0.03
@@ -157,7 +158,8 @@ def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame]) -> Non
     """Write ``rgb.txt`` with TUM's three comment lines; stamps with microseconds."""
     lines = ["# color images", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
     lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with whole_file(Path(path)) as unfinished:
+        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
@@ -171,7 +173,8 @@ def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> N
         trajectory.stamps, trajectory.positions, trajectory.quaternions, strict=True
     ):
         lines.append(f"{stamp:.6f} " + " ".join(f"{value:.6f}" for value in (*position, *quaternion)))
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with whole_file(Path(path)) as unfinished:
+        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def associate(

@@ -13,6 +13,7 @@ import numpy as np
 
 from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, PrecisionRecall
+from loopclosure.whole_file import whole_file
 
 EXPLANATION = {
     ALL_PAIRS: "every judged pair of frames is a sample",
@@ -29,7 +30,8 @@ def write_files(evaluation: Evaluation, folder: Path, command: str = "") -> None
         _write_curves_csv(outcome, folder / f"curve_{slug}.csv")
         _write_matches_csv(evaluation, outcome, folder / f"matches_{slug}.csv")
     text = json.dumps(summary(evaluation, command), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")
+    with whole_file(folder / "report.json") as unfinished:
+        unfinished.write_text(text + "\n", "utf-8")
 
 
 def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
@@ -133,7 +135,7 @@ def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> 
 
 
 def _write_csv(path: Path, rows: list[list[str]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as stream:
+    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as stream:
         csv.writer(stream).writerows(rows)
 
 

@@ -22,6 +22,7 @@ from loopclosure.places.frames import read_bgr
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import plots
 from loopclosure.report.files import EXPLANATION, share, write_files
+from loopclosure.whole_file import whole_file
 
 PAIRS_SHOWN = 4
 PICTURE_HEIGHT = 120  # pixels of the pictures of pairs
@@ -63,7 +64,9 @@ def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", co
         pictures["map"] = plots.maps(evaluation)
     encoded = {name: _save(figure, folder / f"{name}.png") for name, figure in pictures.items()}
     page = folder / "report.html"
-    page.write_text(_page(evaluation, encoded, title or f"Loop closure on {evaluation.data.name}", command), "utf-8")
+    text = _page(evaluation, encoded, title or f"Loop closure on {evaluation.data.name}", command)
+    with whole_file(page) as unfinished:
+        unfinished.write_text(text, "utf-8")
     write_files(evaluation, folder, command)
     return page
 
@@ -179,7 +182,8 @@ def _save(figure: Figure, path: Path) -> str:
     """Write a figure as PNG and return the same bytes in base64."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
-    path.write_bytes(stream.getvalue())
+    with whole_file(path) as unfinished:
+        unfinished.write_bytes(stream.getvalue())
     return base64.b64encode(stream.getvalue()).decode("ascii")
 
 

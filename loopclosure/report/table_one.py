@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from loopclosure.errors import InputError
 from loopclosure.report.pair_metrics import PairMetrics, judge_pairs, pair_distances
+from loopclosure.whole_file import whole_file
 
 # Qiu et al., IEEE IV 2018, Table I. The paper gives neither the threshold nor the recall.
 PAPER = (
@@ -133,7 +134,7 @@ def write_report(runs: Sequence[Run], folder: Path) -> list[Path]:
     """Write ``table.csv``, ``losses.png`` (the paper's Figure 3) and ``distances.png``; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in ("table.csv", "losses.png", "distances.png")]
-    with paths[0].open("w", newline="") as file:
+    with whole_file(paths[0]) as unfinished, unfinished.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         writer.writerows(run.cells() for run in runs)

@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from loopclosure.arrays import check_array, from_json, read_npz
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
+from loopclosure.whole_file import whole_file
 from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
 
@@ -49,7 +51,7 @@ class WordModel:
     def save(self, path: Path) -> None:
         """Write the model to ``path``, a .npz file."""
         settings = {"format": FORMAT, "extractor": asdict(self.vocabulary.extractor), "made": self.vocabulary.made}
-        with open(path, "wb") as file:
+        with whole_file(path) as unfinished, unfinished.open("wb") as file:
             np.savez_compressed(
                 file,
                 settings=json.dumps(settings),
@@ -65,21 +67,29 @@ class WordModel:
     @classmethod
     def load(cls, path: Path) -> WordModel:
         """Read a model that :meth:`save` wrote; InputError for any other file."""
+        expected = "a word model; give another name, and a new one is written there"
+        file = read_npz(path, expected)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                settings = json.loads(str(file["settings"]))
-                if settings["format"] != FORMAT:
-                    raise InputError(f"a word model of format {settings['format']}; format {FORMAT} is known", path)
-                tree = WordTree(*(file[name] for name in ("parent", "marginal", "given_present", "given_absent")))
-                vocabulary = Vocabulary(file["centres"], Extractor(**settings["extractor"]), settings["made"])
-                images = [Path(image) for image in file["training_images"].tolist()]
-                return cls(vocabulary, file["training_words"], images, tree)
+            settings = json.loads(str(file["settings"]))
+            if settings["format"] != FORMAT:
+                raise InputError(f"a word model of format {settings['format']}; format {FORMAT} is known", path)
+            count, dimensions = file["centres"].shape
+            images = [Path(image) for image in file["training_images"].tolist()]
+            check_array(file, "centres", "f", (count, dimensions))
+            check_array(file, "training_words", "iu", (len(images), count))
+            check_array(file, "parent", "iu", (count,))
+            for name in ("marginal", "given_present", "given_absent"):
+                check_array(file, name, "f", (count,))
+            parents = file["parent"]
+            if len(parents) and (parents.min() < 0 or parents.max() >= count):
+                raise ValueError("a word's parent is no word")
+            tree = WordTree(*(file[name] for name in ("parent", "marginal", "given_present", "given_absent")))
+            vocabulary = Vocabulary(file["centres"], from_json(Extractor, settings["extractor"]), settings["made"])
+            return cls(vocabulary, file["training_words"], images, tree)
         except InputError:
             raise
-        except OSError as error:
-            raise InputError(f"cannot read the word model: {error.strerror or error}", path) from None
-        except (KeyError, TypeError, ValueError):
-            raise InputError("not a word model; give another name, and a new one is written there", path) from None
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
+            raise InputError(f"not {expected} ({' '.join(str(error).split())})", path) from None
 
 
 @dataclass(frozen=True)

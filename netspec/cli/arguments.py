@@ -152,7 +152,7 @@ def bar(description: str, unit: str) -> Callable[[Any], Any]:
     return lambda items: tqdm(items, desc=description, unit=unit, disable=not sys.stderr.isatty(), leave=False)
 
 
-def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str) -> Any:
+def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str, write_files: bool = True) -> Any:
     """Return the net of ``--model``, on the device of ``--gpu``; the sites are where Caffe logs the device."""
     from netspec.net.build import load_net
 
@@ -169,6 +169,7 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
         device=chosen,
         allow_python=arguments.allow_python_layers,
         exact=arguments.exact,
+        write_files=write_files,
         passes=arguments.passes,
     )
 

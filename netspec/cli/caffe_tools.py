@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import logging
-from pathlib import Path
 
 from netspec import log
 from netspec.cli.arguments import add_shapes, device, positive
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
 from netspec.errors import SpecError
+from netspec.whole_file import whole_file
 
 
 def add_to(commands: Commands) -> None:
@@ -110,10 +110,8 @@ def _upgrade_solver_text(arguments: argparse.Namespace) -> None:
 
 
 def _write(path: str, data: bytes) -> None:
-    try:
-        Path(path).write_bytes(data)
-    except OSError as fault:
-        raise SpecError(f"{path}: cannot be written: {fault.strerror}") from None
+    with whole_file(path) as unfinished:
+        unfinished.write_bytes(data)
 
 
 def _layers(arguments: argparse.Namespace) -> None:

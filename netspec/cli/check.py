@@ -8,6 +8,7 @@ import sys
 
 from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, stages
 from netspec.cli.run import Commands
+from netspec.errors import printable
 from netspec.proto.schema import PHASES
 
 
@@ -46,7 +47,7 @@ def _check(arguments: argparse.Namespace) -> int:
         passes=arguments.passes if arguments.plan else None,
     )
     for line in dict.fromkeys(line for part in checked for line in part.advice):
-        print(f"warning: {line}", file=sys.stderr)
+        print(f"warning: {printable(line)}", file=sys.stderr)
     faults = dict.fromkeys(str(fault) for part in checked for fault in part.faults)
     if faults:
         print("\n".join(faults), file=sys.stderr)
@@ -57,7 +58,7 @@ def _check(arguments: argparse.Namespace) -> int:
         print(json.dumps(next(iter(found.values())) if len(found) == 1 else found))
         return 0
     for label, net in nets:
-        print(f"{label}: {net.name or 'a net without a name'}\n{table(net)}\n")
+        print(f"{label}: {printable(net.name) or 'a net without a name'}\n{table(net)}\n")
         if arguments.plan:
             print(plan_text(net) + "\n")
     return 0

@@ -62,7 +62,7 @@ def _test(arguments: argparse.Namespace) -> None:
 def _time(arguments: argparse.Namespace) -> None:
     from netspec.check.measure import time_forward, time_net
 
-    net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343")
+    net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343", write_files=False)
     engine = run_by(net, arguments, None)
     if engine is net:
         time_net(net, arguments.iterations)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -47,11 +48,23 @@ class _Verbose(argparse.Action):
 
 @contextmanager
 def signals(effects: Mapping[signal.Signals, str]) -> Iterator[Callable[[], str | None]]:
-    """Yield a function to call between iterations: it returns the effect of a received signal, or None."""
+    """Yield a function to call between iterations: it returns the effect of a received signal, or None.
+
+    A second signal that stops ends the process at once.
+    """
     came: list[str] = []
+    stopping = False
     before = {}
+
+    def receive(effect: str) -> None:
+        nonlocal stopping
+        if effect == "stop" and stopping:
+            os._exit(command_line.INTERRUPTED)
+        stopping |= effect == "stop"
+        came.append(effect)
+
     for number, effect in effects.items():
-        handler = signal.SIG_IGN if effect == "none" else lambda *_, effect=effect: came.append(effect)
+        handler = signal.SIG_IGN if effect == "none" else lambda *_, effect=effect: receive(effect)
         before[number] = signal.signal(number, handler)
     try:
         yield lambda: came.pop(0) if came else None

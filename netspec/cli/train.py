@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from netspec.scores import Score, Scores, Snapshot, read_scores
 if TYPE_CHECKING:
     from netspec.solver.solver import Solver
 
+NAN = ("stop", "warn")
 EFFECTS = ("stop", "snapshot", "none")
 
 
@@ -26,13 +28,17 @@ def add_to(commands: Commands) -> None:
     p.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
     p.add_argument("--solver", help="the solver's prototxt")
     p.add_argument("--snapshot", help="a .solverstate to resume from")
+    p.add_argument("--resume", action="store_true", help="resume from the newest whole snapshot, if there is any")
     p.add_argument("--weights", help="weights to start from, several separated by commas")
     p.add_argument(
         "--scores", metavar="F.json", help="write the scores of each test and the snapshots taken to this file"
     )
+    p.add_argument("--nan", choices=NAN, default="stop", help="what a loss of NaN or infinity does (default: stop)")
     add_device(p)
     add_state(p, phase=None)
-    p.add_argument("--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop)")
+    p.add_argument(
+        "--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C and SIGTERM do (default: stop)"
+    )
     p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="what SIGHUP does (default: snapshot)")
     add_python(p)
     add_exact(p)
@@ -56,7 +62,13 @@ def _train(arguments: argparse.Namespace) -> None:
         raise WrongUsage("need one solver definition: netspec train solver.prototxt")
     if arguments.snapshot and arguments.weights:
         raise WrongUsage("give a snapshot to resume training or weights to fine-tune, not both")
-    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGHUP: arguments.sighup_effect}
+    if arguments.resume and arguments.snapshot:
+        raise WrongUsage("--resume looks for the snapshot; leave out --snapshot")
+    if arguments.resume and (found := _newest(path)):
+        arguments.snapshot, arguments.weights = str(found), None
+    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: arguments.sigint_effect}
+    if hasattr(signal, "SIGHUP"):  # Windows has none
+        effects[signal.SIGHUP] = arguments.sighup_effect
     with signals(effects) as action:
         solver = load_solver(
             path,
@@ -70,16 +82,42 @@ def _train(arguments: argparse.Namespace) -> None:
             exact=arguments.exact,
             strict=arguments.strict,
             precision=arguments.precision,
+            nan=arguments.nan,
         )
         if arguments.scores:
             _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
         log.info("caffe.cpp:239", "Starting Optimization")
         total, first, hidden = solver.param.max_iter, solver.iteration, not sys.stderr.isatty()
-        with tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False) as bar:
+        bar = tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False)
+        with _sole_writer(solver), bar:
             solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
             solver.solve()
         solver.close()
     log.info("caffe.cpp:250", "Optimization Done.")
+
+
+def _newest(solver: str) -> Path | None:
+    """Return the newest whole snapshot of a solver, or None, which is said."""
+    from netspec.proto.text import read_solver
+    from netspec.solver.extra import newest_pair
+
+    prefix = read_solver(solver).snapshot_prefix
+    found = newest_pair(prefix)
+    if found is None:
+        log.logger.info(f'no snapshot to resume from with the prefix "{prefix}": the training starts')
+    return found
+
+
+def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
+    """Refuse a second training that would write snapshots of the same names."""
+    from netspec.solver.checks import check_prefix
+    from netspec.whole_file import only_one
+
+    if not (solver.param.snapshot or solver.param.snapshot_after_train):
+        return nullcontext()
+    check_prefix(solver.param, solver.node)
+    prefix = solver.param.snapshot_prefix
+    return only_one(f"{prefix}.lock", f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
 
 
 def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:

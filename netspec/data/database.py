@@ -8,23 +8,24 @@ Caffe: src/caffe/util/db_lmdb.cpp, src/caffe/util/db_leveldb.cpp
 from __future__ import annotations
 
 import os
-import shutil
 import threading
-import time
 import weakref
 from abc import ABC, abstractmethod
+from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from types import ModuleType, TracebackType
 
 import lmdb
 
 from netspec import log
+from netspec.data.lmdb_file import LmdbFile, Record
 from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault_at
+from netspec.whole_file import whole_folder
 
 BACKENDS = ("lmdb", "leveldb")
 _SCAN = 4096  # keys listed ahead of the requested one
-_PATIENCE = 1.0  # seconds
 _FIRST_MAP_SIZE = 1 << 20  # Caffe's
 _COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a batch stays in memory until it is committed
 
@@ -42,7 +43,7 @@ class Reader(ABC):
 
     @abstractmethod
     def record(self, i: int) -> bytes:
-        """Return the value of record ``i``."""
+        """Return the value of record ``i``; raises SpecError where the database is damaged or was changed."""
 
 
 # A database cannot be opened twice in a process, but two nets (training and test, for example) may use the same one.
@@ -95,56 +96,47 @@ def _kind(source: str) -> str:
 
 
 class _LmdbReader(Reader):
-    """An LMDB, opened without locks, so that it works on read-only media and in forked workers."""
+    """An LMDB, read without locks, so that it works on read-only media and in forked workers."""
 
     def __init__(self, source: str) -> None:
-        size = os.path.getsize(os.path.join(source, "data.mdb"))
-        if not size:
+        path = os.path.join(source, "data.mdb")
+        if not os.path.getsize(path):
             raise ValueError("has an empty data.mdb, so it was never written")
-        if fault := pointer_fault_at(os.path.join(source, "data.mdb")):
+        if fault := pointer_fault_at(path):
             raise ValueError(f"has a data.mdb that {fault}")
-        self._env = _open_lmdb(source)
-        stat = self._env.stat()
-        pages = 2 + stat["branch_pages"] + stat["leaf_pages"] + stat["overflow_pages"]
-        if size < pages * stat["psize"]:  # a read beyond the end of a mapped file kills the process
-            raise ValueError(f"is truncated: data.mdb has {size} bytes, expected at least {pages * stat['psize']}")
-        self._length: int = stat["entries"]
-        self._keys: list[bytes] = []
+        self._source = source
+        self._file = LmdbFile(path)
+        self._coming = self._file.records()
+        self._records: list[Record] = []
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
-        return self._length
+        return len(self._file)
 
     def key(self, i: int) -> bytes:
-        if i >= len(self._keys):
-            self._list_keys(i + _SCAN)
-        return self._keys[i]
+        return self._record(i).key
 
     def record(self, i: int) -> bytes:
-        with self._env.begin() as transaction:
-            value = transaction.get(self.key(i))
-        assert value is not None, "the database changed while it was read"
-        return value
-
-    def _list_keys(self, upto: int) -> None:
-        """Continue from the last known key: on a slow disk, listing all keys of a large database takes minutes."""
-        with self._lock, self._env.begin() as transaction, transaction.cursor() as cursor:
-            more = cursor.set_key(self._keys[-1]) and cursor.next() if self._keys else cursor.first()
-            while more and len(self._keys) < upto:
-                self._keys.append(cursor.key())
-                more = cursor.next()
-
-
-def _open_lmdb(source: str) -> lmdb.Environment:
-    """Open an environment, with retries: a reader that another thread has just released may still be closing."""
-    patience = time.monotonic() + _PATIENCE
-    while True:
+        record = self._record(i)
         try:
-            return lmdb.open(source, readonly=True, lock=False, readahead=True, max_spare_txns=64)
-        except lmdb.Error as fault:
-            if "already open" not in str(fault) or time.monotonic() > patience:
-                raise ValueError(f"cannot be opened as an LMDB ({fault})") from None
-            time.sleep(0.001)
+            return self._file.value(record)
+        except (ValueError, OSError) as fault:
+            raise self._fault(fault) from None
+
+    def _record(self, i: int) -> Record:
+        """Return a record, listing those before it: on a slow disk, listing a large database takes minutes."""
+        if i >= len(self._records):
+            with self._lock:
+                try:
+                    self._records += islice(self._coming, max(0, i + _SCAN - len(self._records)))
+                except (ValueError, OSError) as fault:
+                    raise self._fault(fault) from None
+        if i >= len(self._records):
+            raise self._fault(ValueError("is damaged: it has fewer records than announced"))
+        return self._records[i]
+
+    def _fault(self, fault: ValueError | OSError) -> SpecError:
+        return SpecError(f'database "{self._source}" {fault}')
 
 
 class _LevelDbReader(Reader):
@@ -188,18 +180,20 @@ class Writer:
         if backend.lower() not in BACKENDS:
             raise SpecError(f'unknown backend "{backend}"; expected one of: {", ".join(BACKENDS)}', Where(path))
         self._backend = backend.lower()
-        folder, name = os.path.split(self.path)
-        self._partial = os.path.join(folder, f".{name}.{os.getpid()}.partial")
+        self._end = ExitStack()
         self._store: _LmdbStore | _LevelDbStore | None = None
 
     def __enter__(self) -> Writer:
         if os.path.lexists(self.path):
             raise SpecError("already exists; remove it or choose another name for the database", Where(self.path))
         try:
-            os.makedirs(self._partial)
-            self._store = (_LmdbStore if self._backend == "lmdb" else _LevelDbStore)(self._partial)
+            os.makedirs(os.path.dirname(self.path) or ".", exist_ok=True)
+            with ExitStack() as stack:
+                unfinished = stack.enter_context(whole_folder(self.path))
+                self._store = (_LmdbStore if self._backend == "lmdb" else _LevelDbStore)(str(unfinished))
+                stack.callback(self._store.close)
+                self._end = stack.pop_all()
         except (OSError, ValueError, lmdb.Error) as fault:
-            shutil.rmtree(self._partial, ignore_errors=True)
             raise SpecError(f"cannot write a database here ({fault})", Where(self.path)) from None
         _log_opened(self._backend, self.path)
         return self
@@ -224,18 +218,16 @@ class Writer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        assert self._store is not None
         try:
             if kind is None:
                 self.commit()
-            self._store.close()
-            if kind is None:
-                os.rename(self._partial, self.path)
+            self._store = None
+            self._end.__exit__(kind, error, trace)
         except (lmdb.Error, OSError) as fault:
             raise SpecError(f"cannot rename the finished database to its path ({fault})", Where(self.path)) from None
-        finally:
-            self._store = None
-            shutil.rmtree(self._partial, ignore_errors=True)
+        except SpecError as fault:
+            self._end.__exit__(type(fault), fault, None)
+            raise
 
 
 class _LmdbStore:
@@ -271,7 +263,6 @@ class _LmdbStore:
                 self._env.set_mapsize(2 * self._env.info()["map_size"])
 
     def close(self) -> None:
-        self._env.sync(True)
         self._env.close()
 
 

@@ -6,8 +6,11 @@ Caffe: src/caffe/layers/hdf5_data_layer.cpp, src/caffe/layers/hdf5_output_layer.
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,7 +20,7 @@ from netspec.data.images import list_lines
 from netspec.data.random_words import permutation
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.errors import SpecError, Where
-from netspec.lfs import pointer_fault_at
+from netspec.hdf5_file import new_hdf5, open_hdf5
 
 _FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may span two
 
@@ -48,6 +51,7 @@ class Hdf5Source:
             raise SpecError(f'the list "{list_file}" names no HDF5 file', where or Where(list_file))
         self._tops = tuple(tops)
         self._files = [name for name, _ in named]
+        self._places = [place for _, place in named]
         self._row_shapes = _row_shapes(*named[0], self._tops)[1]
         counts = [self._rows_of(name, place) for name, place in named]
         self._starts = np.cumsum([0, *counts])
@@ -98,8 +102,12 @@ class Hdf5Source:
         return np.concatenate(rows)
 
     def _load_file(self, file: int) -> Arrays:
-        with h5py.File(self._files[file]) as opened:
-            return tuple(np.asarray(opened[top], np.float32) for top in self._tops)
+        with open_hdf5(self._files[file], self._places[file]) as opened:
+            arrays = tuple(opened.values(top).astype(np.float32) for top in self._tops)
+            rows = int(self._starts[file + 1] - self._starts[file])
+            if any(array.shape != (rows, *shape) for array, shape in zip(arrays, self._row_shapes, strict=True)):
+                raise SpecError("was changed by another program while it was read")
+            return arrays
 
     def _rows_of(self, name: str, place: Where) -> int:
         count, shapes = _row_shapes(name, place, self._tops)
@@ -111,60 +119,92 @@ class Hdf5Source:
 
 def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list[Shape]]:
     """Return the number of rows and the shape of a row of each dataset."""
-    try:
-        with h5py.File(name) as file:
-            datasets: list[h5py.Dataset] = []
-            for top in tops:
-                dataset = file.get(top)
-                if not isinstance(dataset, h5py.Dataset):
-                    found = ", ".join(f'"{key}"' for key in file) or "nothing"
-                    message = f'HDF5 file "{name}" has no dataset "{top}", the name of a top; it has {found}'
-                    raise SpecError(message, place)
-                datasets.append(dataset)
-                if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
-                    raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', place)
-            counts = [len(dataset) for dataset in datasets]
-            if min(counts) != max(counts) or not counts[0]:
-                raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', place)
-            return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
-    except OSError as fault:
-        raise SpecError(f'HDF5 file "{name}" {pointer_fault_at(name) or f"cannot be read: {fault}"}', place) from None
+    with open_hdf5(name, place) as file:
+        datasets: list[h5py.Dataset] = []
+        for top in tops:
+            dataset = file.dataset(top)
+            if dataset is None:
+                found = ", ".join(f'"{key}"' for key in file.names()) or "nothing"
+                raise SpecError(f'has no dataset "{top}", the name of a top; it has {found}')
+            datasets.append(dataset)
+            if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
+                raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', place)
+        counts = [len(dataset) for dataset in datasets]
+        if min(counts) != max(counts) or not counts[0]:
+            raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', place)
+        return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
 
 
 class Hdf5Sink:
     """A new HDF5 file with the growing datasets ``data`` and ``label``, both 4-D as Caffe writes them.
 
-    Caffe stops at the second batch, because its datasets then exist; here batches are appended. The file is readable
-    after each call. Raises SpecError if the file cannot be written or a batch has another shape than those before it.
+    Caffe stops at the second batch, because its datasets then exist; here batches are appended. The file appears when
+    the sink is closed, or is no longer used; without a batch there is none. Raises SpecError, and leaves an older file
+    as it was, if the file cannot be written or a batch has another shape than those before it.
     """
 
     NAMES = ("data", "label")
 
     def __init__(self, path: str, where: Where | None = None) -> None:
         self._path, self._where = path, where
-        try:
-            self._file = h5py.File(path, "w")
-        except OSError as fault:
-            raise SpecError(f'HDF5 file "{path}" cannot be written: {fault}', where) from None
+        self._writing: AbstractContextManager[h5py.File] | None = None
+        self._unused: Any = None
 
     def append(self, data: np.ndarray, label: np.ndarray) -> None:
         """Add the rows of a batch."""
         log.info("hdf5_output_layer.cpp:31", f"Saving HDF5 file {self._path}")
-        for name, values in zip(self.NAMES, (data, label), strict=True):
-            rows = values.reshape(values.shape + (1,) * (4 - values.ndim)).astype(np.float32)
-            if name not in self._file:
-                self._file.create_dataset(name, data=rows, maxshape=(None, *rows.shape[1:]), chunks=True)
-                continue
-            dataset = self._file[name]
-            assert isinstance(dataset, h5py.Dataset)
-            if dataset.shape[1:] != rows.shape[1:]:
-                message = f'rows of "{name}" had shape {dataset.shape[1:]} in earlier batches, found {rows.shape[1:]}'
-                raise SpecError(message, self._where)
-            dataset.resize(len(dataset) + len(rows), axis=0)
-            dataset[-len(rows) :] = rows
-        self._file.flush()
+        if self._writing is None:
+            self._open()
+        try:
+            for name, values in zip(self.NAMES, (data, label), strict=True):
+                self._append(name, values.reshape(values.shape + (1,) * (4 - values.ndim)).astype(np.float32))
+        except SpecError as fault:
+            self._end(fault)
+            raise
         log.info("hdf5_output_layer.cpp:36", f"Successfully saved {len(data)} rows")
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Make the file appear."""
+        self._end()
+
+    def _open(self) -> None:
+        writing = new_hdf5(self._path)
+        with self._said_here():
+            self._file = writing.__enter__()
+        self._writing = writing
+        self._unused = weakref.finalize(self, _end_unused, writing)
+
+    def _append(self, name: str, rows: np.ndarray) -> None:
+        if name not in self._file:
+            self._file.create_dataset(name, data=rows, maxshape=(None, *rows.shape[1:]), chunks=True)
+            return
+        dataset = self._file[name]
+        assert isinstance(dataset, h5py.Dataset)
+        if dataset.shape[1:] != rows.shape[1:]:
+            message = f'rows of "{name}" had shape {dataset.shape[1:]} in earlier batches, found {rows.shape[1:]}'
+            raise SpecError(message, self._where)
+        dataset.resize(len(dataset) + len(rows), axis=0)
+        dataset[-len(rows) :] = rows
+
+    def _end(self, fault: SpecError | None = None) -> None:
+        """End the file that is being written: it appears, or after a fault it is removed."""
+        writing, self._writing = self._writing, None
+        if writing is not None:
+            self._unused.detach()
+            with self._said_here():
+                writing.__exit__(None if fault is None else type(fault), fault, None)
+
+    @contextmanager
+    def _said_here(self) -> Iterator[None]:
+        """Give a fault the place in the prototxt that names the file."""
+        try:
+            yield
+        except SpecError as fault:
+            raise SpecError(f'HDF5 file "{self._path}" {fault.message}', self._where) from None
+
+
+def _end_unused(writing: AbstractContextManager[h5py.File]) -> None:
+    try:
+        writing.__exit__(None, None, None)
+    except SpecError as fault:
+        log.logger.warning(fault)

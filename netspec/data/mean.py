@@ -6,6 +6,7 @@ Caffe: src/caffe/data_transformer.cpp, tools/compute_image_mean.cpp
 from __future__ import annotations
 
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -38,6 +39,8 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
         raise SpecError(f'mean file "{path}" is not a BlobProto with a mean image ({fault})', where) from None
     if mean.ndim != 3 and not (mean.ndim == 4 and mean.shape[0] == 1):
         raise SpecError(f'mean file "{path}" contains a blob of shape {mean.shape}, expected one image', where)
+    if not np.all(np.isfinite(mean)):
+        raise SpecError(f'mean file "{path}" has a NaN or an infinity', where)
     return mean.reshape(mean.shape[-3:]).astype(np.float32)
 
 
@@ -50,10 +53,12 @@ def read_mean_option(text: str) -> np.ndarray:
     if not text.endswith(".npy"):
         return read_mean(text, Where("--mean"))
     try:
-        mean = np.load(text, allow_pickle=False)
-    except (OSError, ValueError) as fault:
-        raise SpecError(f"cannot be read as an array: {fault}", Where(text)) from None
-    return mean.astype(np.float32)
+        mapped = np.load(text, mmap_mode="r", allow_pickle=False)  # the size of the file limits that of the array
+        if not np.all(np.isfinite(mapped)):
+            raise ValueError("it has a NaN or an infinity")
+        return np.array(mapped, np.float32)
+    except (OSError, ValueError, TypeError, EOFError, SyntaxError, OverflowError, TokenError) as fault:
+        raise SpecError(f"cannot be read as an array: {' '.join(str(fault).split())}", Where(text)) from None
 
 
 def center(mean: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -157,6 +157,8 @@ class DatabaseSource(_ImageSource):
         try:
             datum = parse_datum(self._reader.record(record))
             return _Item(self._name(record), self._transform.decode(datum), datum.label, self._where)
+        except SpecError as fault:  # of the database itself
+            raise SpecError(fault.message, fault.where or self._where) from None
         except ValueError as fault:
             raise SpecError(f'record "{self._name(record)}" {fault}', self._where) from None
 

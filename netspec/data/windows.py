@@ -70,7 +70,7 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
             values = [float(word) for word in line.split()]
         except ValueError:
             values = []
-        if len(values) != count:
+        if len(values) != count or not all(map(math.isfinite, values)):
             raise SpecError(f'found "{line}", expected {what}', place)
         return values
 

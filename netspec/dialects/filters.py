@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.layers import register
-from netspec.layers.base import Shape
+from netspec.layers.base import Kernel, Layer, Preparation, Shape
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision import convolution
 from netspec.proto.schema import has, value
@@ -87,6 +87,14 @@ class Convolution(convolution.Convolution):
         if any(self.sides):
             bottoms = tuple(F.pad(bottom, self.sides) for bottom in bottoms)
         return super().forward(*bottoms)
+
+    absorbs = convolution.Convolution.absorbs
+    fresh = True
+    any_layout = True
+
+    @override
+    def prepare(self, how: Preparation) -> Kernel:
+        return Layer.prepare(self, how) if any(self.sides) else super().prepare(how)
 
     @override
     def onnx_geometry(self) -> dict[str, Any]:

@@ -98,6 +98,7 @@ message DetectionOutputParameter {
   optional bool visualize = 10 [default = false];
   optional float visualize_threshold = 11;
   optional string save_file = 12;
+  optional float objectness_score = 13 [default = 0.01];
 }
 message MultiBoxLossParameter {
   enum LocLossType { L2 = 0; SMOOTH_L1 = 1; }
@@ -509,18 +510,23 @@ class PriorBox(Layer):
 class DetectionOutput(Layer):
     """Decode the predicted boxes, and of each class keep those of high confidence that overlap none of a higher one.
 
+    With five bottoms it is RefineDet's: the priors are refined first, and those that show no object with a confidence
+    of ``objectness_score`` are left out.
+
     bottom[0]  predicted boxes (N, 4 P) for P priors; (N, 4 P num_classes) where share_location is false
     bottom[1]  confidences (N, P num_classes)
     bottom[2]  priors and variances (1, 2, 4 P)
-    bottom[3]  optional, not used: the images, which the fork draws the boxes into
+    bottom[3]  optional, not used: the images, which the fork draws the boxes into; RefineDet's: confidences (N, 2 P) of
+               no object and of one
+    bottom[4]  RefineDet's: the boxes (N, 4 P) that the priors are refined by
     top[0]     (1, 1, D, 7): image, label, confidence, xmin, ymin, xmax, ymax of D detections; D is 1 before the first
                pass. Where nothing is found, a row (image, -1, -1, ...) for each image. Brings no gradient.
-    Fork: src/caffe/layers/detection_output_layer.cpp
+    Fork: src/caffe/layers/detection_output_layer.cpp, also of sfzhang15/RefineDet
     """
 
-    bottoms = (3, 4)
+    bottoms = (3, 5)
     counted_axis = 2
-    label_bottoms = frozenset({0, 1, 2, 3})
+    label_bottoms = frozenset(range(5))
     ignores = frozenset(
         f"detection_output_param.{name}"
         for name in ("save_output_param", "visualize", "visualize_threshold", "save_file")
@@ -543,18 +549,27 @@ class DetectionOutput(Layer):
         """Return the shape of one detection; the predictions must suit the priors."""
         param = value(self.param, "detection_output_param")
         self.priors = check_predictions(self, bottom_shapes, self.kinds, param.num_classes)
+        for i, each in ((3, 2), (4, 4)) if len(bottom_shapes) == 5 else ():
+            if math.prod(bottom_shapes[i]) != bottom_shapes[0][0] * self.priors * each:
+                message = f"found a bottom of shape {bottom_shapes[i]}, expected ({bottom_shapes[0][0]}, {each} P)"
+                raise self.error(f"{message} for {self.priors} priors", "bottom", i)
         return [(1, 1, 1, 7)]
 
     @override
-    def forward(self, loc: torch.Tensor, conf: torch.Tensor, prior: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+    def forward(self, loc: torch.Tensor, conf: torch.Tensor, prior: torch.Tensor, *more: torch.Tensor) -> torch.Tensor:
         param = value(self.param, "detection_output_param")
         priors, variances = as_array(prior).reshape(2, self.priors, 4)
         codes = as_array(loc).reshape(-1, self.priors, self.kinds, 4)
         scores = as_array(conf).reshape(-1, self.priors, param.num_classes)
         scale = None if param.variance_encoded_in_target else variances
+        refined = [priors] * len(codes)
+        if len(more) == 2:
+            objects, steps = (as_array(bottom).reshape(len(codes), self.priors, -1) for bottom in more)
+            scores = scores * (objects[..., 1:] >= np.float32(param.objectness_score))
+            refined = [decode(each, priors, scale, param.code_type) for each in steps]
         rows = []
         for i in range(len(codes)):
-            boxes = [decode(codes[i, :, kind], priors, scale, param.code_type) for kind in range(self.kinds)]
+            boxes = [decode(codes[i, :, kind], refined[i], scale, param.code_type) for kind in range(self.kinds)]
             rows.append(self._detect(i, boxes, scores[i]))
         found = np.concatenate(rows)
         if not len(found):
@@ -590,6 +605,8 @@ class DetectionOutput(Layer):
         nms = param.nms_param
         if nms.eta < 1:
             raise self.refusal("ONNX", "its non-maximum suppression has a fixed threshold: eta must be 1")
+        if len(bottoms) == 5:
+            raise self.refusal("ONNX", "its priors are refined")
         classes = [label for label in range(param.num_classes) if label != param.background_label_id]
         boxes, scores = self._onnx_boxes_and_scores(graph, bottoms, classes)
         lowest = graph.constant(float(np.finfo(np.float32).min))
@@ -690,6 +707,8 @@ class DetectionOutput(Layer):
         nms = param.nms_param
         if nms.eta < 1:
             raise self.refusal("PyTorch", "its non-maximum suppression has a fixed threshold: eta must be 1")
+        if len(bottoms) == 5:
+            raise self.refusal("PyTorch", "its priors are refined")
         if param.code_type != CENTER_SIZE or not param.share_location:
             raise self.refusal("PyTorch", "it is exported for code_type: CENTER_SIZE and share_location: true")
         code.function(decode_boxes)

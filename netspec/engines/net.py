@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from netspec.engines.runners import Unable, tell_unable
 from netspec.exact import SMALL
 from netspec.export.convert import Source
 from netspec.graph.steps import PASSES
+from netspec.layers.learned import Stamp, is_lent, stamp
 from netspec.net import build
 from netspec.net.net import Array, Net
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -41,8 +43,8 @@ def load_net(
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
 
     A warning names the layers that the weights lack; with ``strict`` that is an error.
-    ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
     ``passes`` are what may speed up a net of phase TEST that runs without gradients (netspec/graph/steps.py).
+    ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
     ``engine`` is "torch", "onnxruntime" or "openvino" (docs/engines.md), ``precision`` "fp32", or "bf16" where the
     engine has it, ``cache`` the folder that keeps exported models (None: the user's cache folder, False: none).
     Raises SpecError for every fault of the files.
@@ -80,8 +82,8 @@ class EngineNet(torch.nn.Module):
     """A net that an engine runs: ``net`` is the torch one, which reads the data and has the parameters.
 
     Outputs carry no gradient; a pass whose input asks for one is torch's, and so is every pass once the engine turned
-    out to be unable. Changes of parameters are seen, and the net is exported anew, unless they are made through
-    ``.data`` or an array that shares the memory: torch does not count those.
+    out to be unable. Where parameters were changed the net is exported anew; as long as somebody holds memory through
+    which they could change unseen (``.data``, an array), torch runs the net.
     """
 
     def __init__(
@@ -93,9 +95,9 @@ class EngineNet(torch.nn.Module):
         self._blobs: dict[str, torch.Tensor] = {}
         self._model: Model | None = None
         self._opened_for: tuple[Any, ...] | None = None
-        self._as_loaded = self._versions()
+        self._as_loaded = self._exported = self._stamps()
         self._readers = [i for i, layer in enumerate(net.layers) if layer.reads_data]
-        self._unable = False
+        self._unable, self._told = False, False
 
     def __getattr__(self, name: str) -> Any:
         """Return what the torch net has."""
@@ -130,7 +132,8 @@ class EngineNet(torch.nn.Module):
     def forward_loss(self, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
         wants_gradient = any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs.values())
-        if not self._unable and not wants_gradient and set(inputs) == set(self.net.inputs):
+        usable = not self._unable and not wants_gradient and set(inputs) == set(self.net.inputs)
+        if usable and not self._are_lent():
             try:
                 return self._pass(inputs)
             except Unable as fault:
@@ -139,6 +142,14 @@ class EngineNet(torch.nn.Module):
         loss, outputs = self.net.forward_loss(**inputs)
         self._blobs = self.net.blobs
         return loss, outputs
+
+    def _are_lent(self) -> bool:
+        """Return whether the parameters may change unseen; say so once."""
+        lent = any(is_lent(parameter) for parameter in self.net.parameters())
+        if lent and not self._told:
+            self._told = True
+            tell_unable(self._choice, "parameters may change unseen while their memory is held, by .data or an array")
+        return lent
 
     def _pass(self, inputs: Mapping[str, Array]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         losses = self._losses()
@@ -175,20 +186,22 @@ class EngineNet(torch.nn.Module):
             weighted.update({blob: w for blob, w in zip(layer.param.top, row, strict=False) if w})
         return weighted
 
-    def _versions(self) -> tuple[int, ...]:
-        return tuple(parameter._version for parameter in self.net.parameters())
+    def _stamps(self) -> tuple[Stamp, ...]:
+        return tuple(stamp(parameter) for parameter in self.net.parameters())
 
     def _current(self, blobs: tuple[str, ...]) -> Model:
         """Return the model of the net as it is, with these blobs."""
-        versions = self._versions()
-        if self._model is None or self._opened_for != (versions, blobs):
-            self._model = Model(self._choice, self._origin(versions, blobs), lambda path: self._write(path, blobs))
-            self._opened_for = (versions, blobs)
+        if self._model is None or self._opened_for != (self._stamps(), blobs):
+            self._model = Model(self._choice, self._origin(blobs), lambda path: self._write(path, blobs))
+            if self._as_loaded == self._exported:
+                self._as_loaded = self._stamps()
+            self._opened_for = (self._stamps(), blobs)  # the export, too, counts as handing them out
         return self._model
 
-    def _origin(self, versions: tuple[int, ...], blobs: tuple[str, ...]) -> Origin | None:
+    def _origin(self, blobs: tuple[str, ...]) -> Origin | None:
         """Return what the net is made of; None where its parameters are no longer, or never were, those of files."""
-        if versions != self._as_loaded or (not self._weights and versions):
+        self._exported = self._stamps()
+        if self._exported != self._as_loaded or (not self._weights and self._exported):
             return None
         shapes = {blob: self.net.shapes[blob] for blob in self._data_blobs()}
         options = {"level": self._level, "stages": self._stages, "blobs": blobs, "shapes": shapes}
@@ -205,6 +218,7 @@ class EngineNet(torch.nn.Module):
             net = Source(self._path, (), "TEST", self._level, self._stages, shapes).net()
             net.share_weights_with(self.net)
         write_model(net, path, [blob for blob in blobs if blob not in self._data_blobs()])
+        gc.collect()  # the writer's parts refer to each other, and to arrays that share the parameters' memory
 
 
 def _array(value: Array) -> np.ndarray:

@@ -17,6 +17,7 @@ from netspec.errors import SpecError
 from netspec.export.preprocess import Preprocess
 from netspec.export.shapes import Fixed, NetShapes, settled
 from netspec.layers.base import Layer
+from netspec.layers.learned import values_of
 from netspec.layers.targets import Sizes
 from netspec.net.net import Net
 from netspec.whole_file import whole_file
@@ -138,7 +139,7 @@ class _Writer:
         """Add a learned blob, one for all layers that share it; return its name."""
         key = (blob.data_ptr(), shape)
         if key not in self._blobs:
-            self._blobs[key] = self.store(blob.detach().cpu().float().reshape(shape).numpy(), name)
+            self._blobs[key] = self.store(values_of(blob).cpu().float().reshape(shape).numpy(), name)
         return self._blobs[key]
 
     def add_input(self, value: int, blob: str) -> str:
@@ -246,7 +247,7 @@ class _Steps:
         return tuple(self.writer.add(op, inputs, outputs, self.name, attributes))
 
     def constant(self, values: Any) -> str:
-        array = values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+        array = values_of(values).cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
         if array.dtype != bool:
             array = array.astype(np.int64 if array.dtype.kind in "iu" else np.float32)
         return self.writer.store(array, f"{self.name}/constant")

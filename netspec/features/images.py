@@ -12,7 +12,7 @@ import numpy as np
 
 from netspec import log
 from netspec.data.blobs import Shape
-from netspec.data.datum import planar
+from netspec.data.datum import decode_pixels, planar
 from netspec.engines.choice import TORCH, Choice
 from netspec.engines.model import Model, Origin
 from netspec.engines.runners import Unable, tell_unable
@@ -24,7 +24,6 @@ from netspec.features.views import middle
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
 from netspec.graph.steps import PASSES
-from netspec.lfs import pointer_fault_at
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
@@ -212,10 +211,12 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
 
 
 def _read(path: Path, channels: int) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR if channels == 3 else cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise SpecError(pointer_fault_at(path) or "cannot be read as an image", Where(str(path)))
-    return image
+    try:
+        return decode_pixels(path.read_bytes(), channels == 3)
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
+    except ValueError as fault:
+        raise SpecError(str(fault), Where(str(path))) from None
 
 
 def fitted(image: np.ndarray, shape: Shape) -> np.ndarray:

@@ -7,6 +7,7 @@ An explicit loss_weight of a blob counts as one use; the first of its copies the
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 
 from netspec.errors import SpecError, did_you_mean
 from netspec.graph import Report, raise_fault
@@ -14,6 +15,8 @@ from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 
 Top = tuple[int, int]  # layer index, top index
+MOST_NAMES = 20  # blobs that an error names
+MOST_HINTS = 20  # unknown blobs for which similar names are looked for: that takes time for each blob there is
 
 
 def insert_splits(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> tuple[NetParameter, SourceMap]:
@@ -49,6 +52,12 @@ def insert_splits(net: NetParameter, source: SourceMap, report: Report = raise_f
     return split, source.with_layers(places)
 
 
+def _names(blobs: Mapping[str, object]) -> str:
+    """Return the names of the blobs so far, in a large net those of the last."""
+    more = f"{len(blobs) - MOST_NAMES} more, " if len(blobs) > MOST_NAMES else ""
+    return more + ", ".join([*blobs][-MOST_NAMES:]) or "none"
+
+
 def _blob_name(layer: str, blob: str, top: int, copy: int) -> str:
     return f"{blob}_{layer}_{top}_split_{copy}"
 
@@ -61,13 +70,14 @@ def _count_uses(
     producer: dict[tuple[int, int], Top] = {}
     uses: Counter[Top] = Counter()
     weights: dict[Top, float] = {}
+    unknown = 0
     for i, layer in enumerate(net.layer):
         for j, blob in enumerate(layer.bottom):
             if blob not in latest:
                 where = source.at(i, "bottom", j, layer=layer.name, type=layer.type)
-                known = ", ".join(latest) or "none"
-                hint = did_you_mean(blob, list(latest))
-                report(SpecError(f'unknown bottom blob "{blob}"{hint or ";"} available: {known}', where))
+                unknown += 1
+                hint = did_you_mean(blob, list(latest)) if unknown <= MOST_HINTS else ""
+                report(SpecError(f'unknown bottom blob "{blob}"{hint or ";"} available: {_names(latest)}', where))
                 continue
             producer[i, j] = latest[blob]
             uses[latest[blob]] += 1

@@ -21,6 +21,7 @@ import torch
 from typing_extensions import override
 
 from netspec.data.blobs import Shape
+from netspec.data.random_words import derived
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL, switch
 from netspec.graph import Report, raise_fault
@@ -97,14 +98,19 @@ class Random:
 
     def restart(self, seed: int) -> None:
         """Begin anew, from another seed."""
-        self.seed = seed
+        self.seed = self._now = seed
         self._generators: dict[str, torch.Generator] = {}
+
+    def begin(self, what: str) -> None:
+        """Go on with draws that follow from the seed and the name of a part of a run, whatever was drawn before."""
+        self._now = derived(self.seed, what)
+        self._generators.clear()
 
     def on(self, device: torch.device | str = "cpu") -> torch.Generator:
         """Return the generator of ``device`` (made at its first use)."""
         key = str(device)
         if key not in self._generators:
-            self._generators[key] = torch.Generator(device).manual_seed(self.seed)
+            self._generators[key] = torch.Generator(device).manual_seed(self._now)
         return self._generators[key]
 
 
@@ -118,12 +124,12 @@ class Context:
 
     ``at(*path)`` is the place in the prototxt of a field of this layer; ``report`` gets the faults after which building
     can go on (the default raises the first). ``device`` is where blobs are made; on ``meta`` they have shapes and no
-    values, and no file is written. Where ``open_data`` is false, a layer that reads files must not: its tops'
-    shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``. Of ``ranks`` nets
-    that train side by side the layer's net is number ``rank``. ``random`` is this net's own; from ``data_seed``, which
-    is the same for all ranks, follow the draws of the layers that read records. ``exact`` says which sums are to be
-    Caffe's to the last bit (netspec/exact); with ``accumulate_in_place``, layers that sum up their parameters'
-    gradients themselves add them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
+    values. No file is written there, nor where ``write_files`` is false. Where ``open_data`` is false, a layer that
+    reads files must not: its tops' shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks
+    for ``--shape``. Of ``ranks`` nets that train side by side the layer's net is number ``rank``. ``random`` is this
+    net's own; from ``data_seed``, which is the same for all ranks, follow the draws of the layers that read records.
+    ``exact`` says which sums are to be Caffe's to the last bit (netspec/exact); with ``accumulate_in_place``, layers
+    that sum up their parameters' gradients themselves add them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
     """
 
     phase: int = TEST
@@ -133,6 +139,7 @@ class Context:
     report: Report = raise_fault
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     open_data: bool = True
+    write_files: bool = True
     given_shapes: Mapping[str, Shape] = field(default_factory=dict)
     allow_python: bool = False
     rank: int = 0
@@ -189,6 +196,15 @@ class Layer(torch.nn.Module):
         self.setup()
         self.top_shapes: list[Shape] = [self.possible(s) for s in self.reshape(self.bottom_shapes)]
 
+    def __init_subclass__(cls, **named: Any) -> None:
+        """Where a class replaces ``forward``, do not let it inherit what was said of the forward pass it replaces."""
+        super().__init_subclass__(**named)
+        for name in ("prepare", "finishing", "fresh", "any_layout", "absorbs", "absorbs_before", "as_affine"):
+            owner = next(each for each in cls.__mro__ if name in vars(each))
+            told_of = getattr(owner, "forward", Layer.forward)
+            if owner is not Layer and told_of is not Layer.forward and cls.forward is not told_of:
+                setattr(cls, name, vars(Layer)[name])
+
     def construct(self) -> None:
         """Do what Caffe does in the layer's constructor, where that shows in the log."""
 
@@ -231,6 +247,17 @@ class Layer(torch.nn.Module):
 
     def restart(self) -> None:
         """Return to the first record, where the layer reads any."""
+
+    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+        """Return what the layer remembers from one pass to the next, besides its blobs."""
+        return {}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Remember what :meth:`running_state` returned. Raises SpecError if that does not fit."""
+        if set(state) != set(self.running_state()):
+            raise self.error(
+                f"found {', '.join(state)} to remember, expected {', '.join(self.running_state()) or 'nothing'}"
+            )
 
     def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
         """Return what the tops of all batches of a test say together; for layers that gather.

@@ -7,15 +7,16 @@ functions do the same.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch.nn import functional as F
 
-from netspec.layers.base import Kernel, Preparation, finished
+from netspec.layers.base import Kernel, Preparation, Shape, finished
 from netspec.layers.learned import values_of
 
-_CONVOLVE, _MULTIPLY = "_convolution_pointwise", "_linear_pointwise"
+_NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
 
 
 def _ops() -> Any:
@@ -25,7 +26,7 @@ def _ops() -> Any:
 def suits(weight: torch.Tensor) -> bool:
     """Return whether there are such kernels for weights like these."""
     here = weight.device.type == "cpu" and weight.dtype == torch.float32 and weight.numel() > 0
-    return here and torch.backends.mkldnn.is_available() and hasattr(_ops(), _CONVOLVE) and hasattr(_ops(), _MULTIPLY)
+    return here and torch.backends.mkldnn.is_available() and all(hasattr(_ops(), name) for name in _NEEDED)
 
 
 def has_bfloat16() -> bool | None:
@@ -46,8 +47,8 @@ def convolution(
     """Return a convolution by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
     geometry = [list(pad), list(stride), list(dilation), group]
     side_by_side = torch.channels_last
-    weight = how.memo(f"weight {geometry}", lambda: _laid_out(values_of(weight), geometry))
-    bias = None if bias is None else how.memo("bias", values_of(bias).clone)
+    weight = how.memo(f"filters {tuple(weight.shape)} {geometry}", lambda: _laid_out(values_of(weight), geometry))
+    bias = _kept(bias, how)
     call, relu = _ops()._convolution_pointwise.default, how.finish is F.relu_
     arguments = (*geometry, "relu" if relu else "none", [], "")
 
@@ -57,14 +58,74 @@ def convolution(
     return finished(kernel, None if relu else how.finish)
 
 
+def deconvolution(
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    stride: Sequence[int],
+    pad: Sequence[int],
+    dilation: Sequence[int],
+    how: Preparation,
+) -> Kernel:
+    """Return a transposed convolution by fixed weights (C, num_output, kernel_h, kernel_w).
+
+    An activation is another pass here: in the same one oneDNN falls back to a slow kernel.
+    """
+    geometry = [list(pad), [0, 0], list(stride), list(dilation), 1]
+    lay_out, call = _ops()._reorder_convolution_transpose_weight, _ops()._convolution_transpose_pointwise.default
+    weight = how.memo(
+        f"spread {tuple(weight.shape)} {geometry}", lambda: lay_out(values_of(weight).contiguous(), *geometry, [])
+    )
+    bias = _kept(bias, how)
+
+    def kernel(maps: torch.Tensor) -> torch.Tensor:
+        return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *geometry, "none", [], "")
+
+    return finished(kernel, how.finish)
+
+
+def spread_by_channel(
+    shape: Shape,
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    stride: Sequence[int],
+    pad: Sequence[int],
+    dilation: Sequence[int],
+    how: Preparation,
+) -> Kernel:
+    """Return a transposed convolution by weights (C, 1, kernel_h, kernel_w), each channel of (N, C, H, W) by itself.
+
+    oneDNN's own is slow. A convolution does the same on maps with ``stride`` - 1 zeros between the pixels, with the
+    filters turned around.
+    """
+    (count, channels, *size), (down, across) = shape, stride
+    frame = weight.new_zeros(count, channels, *((n - 1) * s + 1 for n, s in zip(size, stride, strict=True)))
+    frame = frame.detach().contiguous(memory_format=torch.channels_last)
+    pixels = frame[:, :, ::down, ::across]
+    frames = [d * (k - 1) - p for k, d, p in zip(weight.shape[2:], dilation, pad, strict=True)]
+    turned = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
+    convolve = convolution(values_of(weight).flip(2, 3), bias, (1, 1), frames, dilation, channels, turned)
+
+    def kernel(maps: torch.Tensor) -> torch.Tensor:
+        pixels.copy_(maps)
+        return convolve(frame)
+
+    return kernel
+
+
+def _kept(bias: torch.Tensor | None, how: Preparation) -> torch.Tensor | None:
+    return None if bias is None else how.memo("bias", values_of(bias).clone)
+
+
 def _laid_out(weight: torch.Tensor, geometry: Sequence[Any]) -> torch.Tensor:
     return _ops()._reorder_convolution_weight(weight.contiguous(), *geometry, [])
 
 
 def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernel:
     """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
-    weight = how.memo("weight", lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
-    bias = None if bias is None else how.memo("bias", values_of(bias).clone)
+    weight = how.memo(
+        f"rows {tuple(weight.shape)}", lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous())
+    )
+    bias = _kept(bias, how)
     call, relu = _ops()._linear_pointwise.default, how.finish is F.relu_
     arguments = ("relu" if relu else "none", [], "")
     return finished(lambda vectors: call(vectors, weight, bias, *arguments), None if relu else how.finish)

@@ -6,7 +6,7 @@ Caffe: src/caffe/layers/recurrent_layer.cpp, which unrolls the time steps into a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -154,6 +154,19 @@ class Recurrent(Layer):
             return torch.stack(outputs), *(s.unsqueeze(0) for s in last)
         self.state = last
         return (torch.stack(outputs),)
+
+    @override
+    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+        return {"state": self.state}
+
+    @override
+    def resume(self, state: Mapping[str, Any]) -> None:
+        super().resume(state)
+        found: tuple[torch.Tensor, ...] = state["state"]
+        shape = (self.bottom_shapes[0][1], self.hidden)
+        if found and [s.shape for s in found] != [shape] * len(self.state_names):
+            raise self.error(f"found states of shapes {[tuple(s.shape) for s in found]}, expected {shape}")
+        self.state = found
 
     @override
     def multiply_adds(self) -> int:

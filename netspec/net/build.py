@@ -36,6 +36,7 @@ def load_net(
     allow_python: bool = False,
     exact: str = SMALL,
     strict: bool = False,
+    write_files: bool = True,
     passes: Collection[str] = PASSES,
 ) -> Net:
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
@@ -43,11 +44,13 @@ def load_net(
     A warning names the layers that the weights lack; with ``strict`` that is an error.
     ``passes`` are what may speed up a net of phase TEST that runs without gradients (netspec/graph/steps.py).
     ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
-    Raises SpecError for every fault of the files.
+    Without ``write_files`` no layer writes one. Raises SpecError for every fault of the files.
     """
     net, source = parse_net(path)
     number = PHASES[phase] if isinstance(phase, str) else PhaseValue(phase)
-    options = BuildOptions(torch.device(device), seed, allow_python=allow_python, exact=exact, passes=passes)
+    options = BuildOptions(
+        torch.device(device), seed, allow_python=allow_python, exact=exact, write_files=write_files, passes=passes
+    )
     built = build_net(with_state(net, number, level, stages), source, options)
     if weights is not None:
         load_weights(built, weights, strict)
@@ -63,7 +66,7 @@ def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None
 def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
     """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
-        log.info("net.cpp:53", "Initializing net from parameters: \n" + write_text(filtered).rstrip("\n"))
+        log.dump("net.cpp:53", "Initializing net from parameters: ", write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source, options.report)
     built = Net(make_plan(split, source, options.report), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])

@@ -117,6 +117,7 @@ class Net(torch.nn.Module):
                 report=options.report,
                 device=options.device,
                 open_data=options.open_data,
+                write_files=options.write_files,
                 given_shapes=options.given_shapes or {},
                 allow_python=options.allow_python,
                 rank=options.rank,

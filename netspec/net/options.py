@@ -21,6 +21,7 @@ class BuildOptions:
     """How a net is built.
 
     ``seed`` None draws one; ``open_data`` False opens no data (``given_shapes``: the tops of data layers, by blob);
+    with ``write_files`` False, no layer writes one;
     ``report`` gets each error (the default raises the first); ``allow_python`` lets Python layers run code. This net is
     number ``rank`` of ``ranks`` nets that train in parallel: its data layers read their share of the records, and draw
     from ``data_seed``, which must be the same for all ranks (None: from ``seed``).
@@ -34,6 +35,7 @@ class BuildOptions:
     seed: int | None = None
     data_seed: int | None = None
     open_data: bool = True
+    write_files: bool = True
     given_shapes: Mapping[str, Shape] | None = None
     report: Report = raise_fault
     allow_python: bool = False

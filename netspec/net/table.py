@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from netspec.errors import printable
+
 if TYPE_CHECKING:
     from netspec.net.net import Net
 
@@ -40,7 +42,15 @@ def table(net: Net) -> str:
         totals = [total + cost for total, cost in zip(totals, (parameters, memory, work), strict=True)]
         shapes = _listed("x".join(map(str, shape)) or "scalar" for shape in layer.top_shapes)
         blobs = [_listed(net.plan.blobs[v] for v in values) for values in (node.bottoms, node.tops)]
-        rows.append((node.name, node.type, *blobs, shapes, *_printed(parameters, memory, work, shared)))
+        rows.append(
+            (
+                printable(node.name),
+                printable(node.type),
+                *map(printable, blobs),
+                shapes,
+                *_printed(parameters, memory, work, shared),
+            )
+        )
     rows.append(("total", "", "", "", "", *_printed(totals[0], totals[1], totals[2])))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(_line(row, widths) for row in rows)

@@ -5,6 +5,7 @@ Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -19,6 +20,7 @@ from netspec import log
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
 from netspec.graph import Report, raise_fault
+from netspec.hdf5_file import Hdf5Group, new_hdf5, open_hdf5
 from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.proto.binary import read_net_binary
@@ -26,6 +28,7 @@ from netspec.proto.schema import NetParameter
 from netspec.whole_file import whole_file
 
 MOST_NAMES = 20  # layers that a warning names
+MOST_BYTES = 2**31 - 1  # of a protobuf message
 Copies = list[tuple[Layer, int, np.ndarray]]  # the layer, the blob's number in it, the values
 
 
@@ -124,14 +127,39 @@ def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
 
 def write_binary(net: Net, path: str | Path, diff: bool = False) -> None:
     """Do what :func:`save_weights` does in Caffe's binary form, whatever the file's name."""
+    if (size := binary_bytes(net, diff)) > MOST_BYTES:
+        raise SpecError(f"cannot be written: {too_large(size)}", Where(str(path)))
     with whole_file(path) as unfinished:
         unfinished.write_bytes(net_to_proto(net, diff).SerializeToString(deterministic=True))
 
 
+def binary_bytes(net: Net, diff: bool = False) -> int:
+    """Return about how many bytes the weights take in Caffe's binary form: those of their numbers."""
+    numbers = sum(math.prod(shape) for layer in net.layers for shape in layer.blob_shapes)
+    return (2 if diff else 1) * np.dtype(np.float32).itemsize * numbers
+
+
+def too_large(size: int) -> str:
+    """Return what is wrong with a binary file of so many bytes, and the remedy."""
+    return f"{size / 2**30:.2f} GiB are more than the 2 GiB of a binary file; set snapshot_format: HDF5"
+
+
 def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
     """Do what :func:`save_weights` does in HDF5, whatever the file's name."""
-    with whole_file(path) as unfinished:
-        _to_hdf5(net, unfinished, diff)
+    shared = _shared(net)
+    with new_hdf5(path) as file:
+        data = file.create_group("data")
+        diffs = file.create_group("diff") if diff else None
+        for layer in net.layers:
+            name = layer.param.name
+            group = data.require_group(name)
+            for j in range(len(layer.blobs)):
+                if (name, j) not in shared:
+                    group.create_dataset(str(j), data=_values(layer, j))
+            if diffs is not None:
+                group = diffs.require_group(name)
+                for j in range(len(layer.blobs)):
+                    group.create_dataset(str(j), data=_gradient(layer, j))
 
 
 def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
@@ -180,10 +208,10 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
     targets = _layers_by_name(net)
     shared = _shared(net)
     copies: Copies = []
-    with _opened(path) as file:
-        data = file.get("data")
-        if not isinstance(data, h5py.Group):
-            raise SpecError("this is not a weights file: the HDF5 file has no group /data", Where(str(path)))
+    with open_hdf5(path) as file:
+        data = file.group("data")
+        if data is None:
+            raise SpecError("this is not a weights file: the HDF5 file has no group /data")
         for name, arrays in _layer_groups(data):
             target = targets.get(name)
             if target is None:
@@ -202,42 +230,20 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
                 if array.shape != target.blob_shapes[j]:
                     report(_wrong_shape(path, name, j, array.shape, target.blob_shapes[j]))
                     continue
-                copies.append((target, j, array[()]))
+                copies.append((target, j, array[()].astype(np.float32)))
     return copies
 
 
-def _opened(path: Path) -> h5py.File:
-    try:
-        return h5py.File(path, "r")
-    except OSError as fault:  # it begins like an HDF5 file
-        raise SpecError(f"cannot be read: {fault}", Where(str(path))) from None
-
-
-def _layer_groups(data: h5py.Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
+def _layer_groups(data: Hdf5Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
     """Yield the layers, in Caffe's (alphabetical) order; a layer with a slash in its name is a group within a group."""
-    for name, group in data.items():
-        if isinstance(group, h5py.Group):
-            arrays = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
-            if arrays or not len(group):
+    for name in data.names():
+        group = data.group(name)
+        if group is not None:
+            found = {key: group.dataset(key) for key in group.names()}
+            arrays = {key: dataset for key, dataset in found.items() if dataset is not None}
+            if arrays or not found:
                 yield prefix + name, arrays
             yield from _layer_groups(group, f"{prefix}{name}/")
-
-
-def _to_hdf5(net: Net, path: Path, diff: bool) -> None:
-    shared = _shared(net)
-    with h5py.File(path, "w") as file:
-        data = file.create_group("data")
-        diffs = file.create_group("diff") if diff else None
-        for layer in net.layers:
-            name = layer.param.name
-            group = data.require_group(name)
-            for j in range(len(layer.blobs)):
-                if (name, j) not in shared:
-                    group.create_dataset(str(j), data=_values(layer, j))
-            if diffs is not None:
-                group = diffs.require_group(name)
-                for j in range(len(layer.blobs)):
-                    group.create_dataset(str(j), data=_gradient(layer, j))
 
 
 # The net's side

@@ -6,12 +6,12 @@ Caffe: python/caffe/draw.py
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from netspec.errors import SpecError
 from netspec.pycaffe import extras
 from netspec.pycaffe.proto import caffe_pb2
+from netspec.whole_file import whole_file
 
 NEURON_LAYER_STYLE = {"shape": "record", "fillcolor": "#90EE90", "style": "filled"}
 LAYER_STYLE_DEFAULT = {"shape": "record", "fillcolor": "#6495ED", "style": "filled"}
@@ -30,7 +30,9 @@ def draw_net_to_file(
 ) -> None:
     """Draw a net into a file, in the format of its ending; ``.raw``, ``.dot`` and ``.gv`` are Graphviz' own text."""
     extension = filename[filename.rfind(".") + 1 :]
-    Path(filename).write_bytes(draw_net(caffe_net, rankdir, extension, phase, display_lrm))
+    picture = draw_net(caffe_net, rankdir, extension, phase, display_lrm)
+    with whole_file(filename) as unfinished:
+        unfinished.write_bytes(picture)
 
 
 def draw_net(

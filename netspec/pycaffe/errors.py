@@ -1,19 +1,73 @@
-"""What the code of a Python layer raises while a net is built passes through as it is."""
+"""Errors of programs that were written for pycaffe: where Caffe would end the process, an exception with its words.
+
+What the code of a Python layer raises while a net is built passes through as it is.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from netspec.errors import SpecError
 
+_LABELS = (
+    "outer_num_ * inner_num_ == bottom[1]->count() ({1} vs. {0}) Number of labels must match number of predictions; "
+    "e.g., if softmax axis == 1 and prediction shape is (N, C, H, W), label count (number of labels) must be N*H*W, "
+    "with integer values in {{0, 1, ..., C-1}}."
+)
+#: What our messages say, and the check of Caffe's that fails there.
+_CHECKS = [
+    (r'unknown layer type "(.*?)"', "registry.count(type) == 1 (0 vs. 1) Unknown layer type: {0}"),
+    (
+        r"has (\d+) values from axis \d+ on, expected (\d+)",
+        "K_ == new_K ({1} vs. {0}) Input size incompatible with inner product parameters.",
+    ),
+    (
+        r"does not fit the filters, made for (\d+) channels",
+        "bottom[0]->shape(channel_axis_) == channels_ Input size incompatible with convolution kernel.",
+    ),
+    (r"found (\d+) labels, shape .* for (\d+) predictions", _LABELS),
+    (
+        r"expected equal shapes except along axis",
+        "top_shape[j] == bottom[i]->shape(j) All inputs must have the same shape, except at concat_axis.",
+    ),
+    (r"expected equal shapes$", "bottom[0]->shape() == bottom[i]->shape()"),
+    (r"kernel_size .* is missing", "kernel_shape_data[i] > 0 Filter dimensions must be nonzero."),
+    (
+        r"expected a binary NetParameter",
+        "ReadProtoFromBinaryFile(param_file, param) Failed to parse NetParameter file: {file}",
+    ),
+]
+_WORDS = [(r'unknown bottom blob "(.*?)"', "Unknown bottom blob '{0}' (layer '{layer}'")]
+
+
+class CheckError(SpecError):
+    """A fault at which Caffe ends the process. The text has the check that fails there, after our own sentence."""
+
 
 @contextmanager
-def original_errors() -> Iterator[None]:
-    """Raise the exception that a Python layer's code has raised, in place of the fault that netspec makes of it."""
+def caffes_errors() -> Iterator[None]:
+    """Raise a :class:`CheckError` for a SpecError of which Caffe's words are known.
+
+    The exception that a Python layer's code has raised comes in place of the fault that netspec makes of it.
+    """
     try:
         yield
     except SpecError as fault:
         if isinstance(fault.__cause__, Exception):
             raise fault.__cause__ from fault
-        raise
+        words = None if isinstance(fault, CheckError) else _caffes_words(fault)
+        if words is None:
+            raise
+        raise CheckError(f"{fault.message} ({words})", fault.where) from None
+
+
+def _caffes_words(fault: SpecError) -> str | None:
+    where = fault.where
+    known = {"file": where.file if where else "", "layer": where.layer if where else ""}
+    for table, prefix, end in ((_CHECKS, "Check failed: ", ""), (_WORDS, "", ")")):
+        for pattern, words in table:
+            if found := re.search(pattern, fault.message):
+                return prefix + words.format(*found.groups(), **known) + end
+    return None

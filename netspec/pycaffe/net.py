@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from netspec import log
-from netspec.errors import did_you_mean
+from netspec.dialects import use_dialects_of
+from netspec.errors import ForkFault, did_you_mean
 from netspec.graph.filter import with_state
+from netspec.layers import layer_class
 from netspec.layers.utility import pycaffe_shim
 from netspec.layers.utility.live_blobs import Blob, BlobVec
 from netspec.layers.utility.python import Python
@@ -22,9 +24,10 @@ from netspec.net import net as core
 from netspec.net.build import build_net
 from netspec.net.weights import load_weights, write_binary, write_hdf5
 from netspec.proto.schema import PhaseValue
+from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net
 from netspec.pycaffe import mode
-from netspec.pycaffe.errors import original_errors
+from netspec.pycaffe.errors import caffes_errors
 from netspec.pycaffe.named import Named
 from netspec.pycaffe.passes import Passes
 
@@ -44,8 +47,9 @@ class Net:
     """A net and its blobs in memory.
 
     ``Net(file, phase, level=0, stages=None, weights=None)`` builds the net of a prototxt for a phase (TRAIN or TEST),
-    ``Net(file, weights, phase)`` is the older form. Raises RuntimeError for a file that is not there, SpecError (a
-    ValueError) for every other fault of the files; what the code of a Python layer raises passes through.
+    ``Net(file, weights, phase)`` is the older form. The dialects that the prototxt needs are switched on. Raises
+    RuntimeError for a file that is not there, SpecError (a ValueError) for every other fault of the files; what the
+    code of a Python layer raises passes through.
 
     ``blobs`` maps names to blobs, ``params`` layer names to learnable blobs, both in the order of the layers. The
     arrays ``data`` and ``diff`` of a blob are its memory: what is written to them counts in the next pass.
@@ -64,8 +68,8 @@ class Net:
         for path in (network_file, *([] if weights is None else [weights])):
             if not Path(path).is_file():
                 raise RuntimeError(f"Could not open file {path}")
-        with original_errors():
-            net, source = parse_net(network_file)
+        with caffes_errors():
+            net, source = _read(network_file)
             self._hold(
                 build_net(with_state(net, PhaseValue(phase), level or 0, stages or ()), source, mode.build_options())
             )
@@ -152,7 +156,8 @@ class Net:
         return {name: self.blobs[name].diff for name in dict.fromkeys(wanted)}
 
     def _forward(self, start: int, end: int) -> float:
-        return self.passes.forward(start, end).item()
+        with caffes_errors():
+            return self.passes.forward(start, end).item()
 
     def _backward(self, start: int, end: int) -> None:
         self.passes.backward(start, end)
@@ -226,7 +231,8 @@ class Net:
 
     def reshape(self) -> None:
         """Give every blob the shape that follows from those of the inputs."""
-        self.passes.reshape()
+        with caffes_errors():
+            self.passes.reshape()
 
     def clear_param_diffs(self) -> None:
         """Set the gradients of the learnable blobs to 0; :meth:`backward` adds to them."""
@@ -266,7 +272,8 @@ class Net:
         if not Path(weights).is_file():
             raise RuntimeError(f"Could not open file {weights}")
         self.passes.upload()
-        load_weights(self.passes.net, weights)
+        with caffes_errors():
+            load_weights(self.passes.net, weights)
 
     def load_hdf5(self, weights: FilePath) -> None:
         """Copy the weights of an HDF5 file into the layers of the same names."""
@@ -302,6 +309,20 @@ class Net:
     def set_device(self, device_id: int) -> None:
         """Set the GPU for nets to come."""
         mode.set_device(device_id)
+
+
+def _read(network_file: FilePath) -> tuple[Any, SourceMap]:
+    """Return the net of a prototxt and where its parts stand; switch on the dialects that it needs."""
+    try:
+        net, source = parse_net(network_file)
+        if all(layer_class(layer.type) for layer in net.layer):
+            return net, source
+    except ForkFault:
+        pass
+    used = use_dialects_of(Path(network_file).read_text("utf-8", "surrogateescape"), str(network_file))
+    if used:
+        log.logger.info(f"{network_file}: switched on the layers and fields of {' and '.join(used)}")
+    return parse_net(network_file)
 
 
 def _older_form(network_file: FilePath, weights: FilePath, phase: int | None) -> tuple[int, FilePath, int]:

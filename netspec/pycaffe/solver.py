@@ -18,7 +18,7 @@ from netspec.net import net as core
 from netspec.proto.text import parse_solver
 from netspec.pycaffe import mode
 from netspec.pycaffe.debug import debug_info
-from netspec.pycaffe.errors import original_errors
+from netspec.pycaffe.errors import caffes_errors
 from netspec.pycaffe.net import Net
 from netspec.solver import solver as core_solver
 from netspec.solver.nets import TRAIN_NET
@@ -99,9 +99,15 @@ class Solver:
         param, node = parse_solver(solver_file)
         if self.type_name:
             param.type = self.type_name
-        with original_errors():
+        with caffes_errors():
             self._training = _Training(
-                param, node, device=mode.device(), allow_python=True, exact=mode.exact(), seed=mode.solver_seed()
+                param,
+                node,
+                device=mode.device(),
+                allow_python=True,
+                exact=mode.exact(),
+                seed=mode.solver_seed(),
+                nan="warn",  # as Caffe goes on: a script may look for itself
             )
         self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
         self._training.on_start = lambda: self._call(0)
@@ -137,11 +143,13 @@ class Solver:
         if resume_file:
             log.info("solver.cpp:296", f"Restoring previous solver status from {resume_file}")
             self.restore(resume_file)
-        self._training.solve()
+        with caffes_errors():
+            self._training.solve()
 
     def step(self, iterations: int) -> None:
         """Train for some iterations."""
-        self._training.step(int(iterations))
+        with caffes_errors():
+            self._training.step(int(iterations))
 
     def restore(self, state_file: str | Path) -> None:
         """Go on from a .solverstate, and from its weights."""

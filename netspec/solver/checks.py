@@ -12,7 +12,7 @@ from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Place
 from netspec.solver.lr_policy import policy_faults
 from netspec.solver.update import rule_faults
-from netspec.whole_file import why_unwritable
+from netspec.whole_file import whole_file, why_unwritable
 
 REGULARIZATIONS = ("L2", "L1")
 _AT_LEAST_ONE = ("average_loss", "iter_size")
@@ -53,10 +53,11 @@ def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_i
     reason = why_unwritable(probe)
     if try_it and not reason:
         try:
-            probe.touch()
+            with whole_file(probe) as unfinished:
+                unfinished.write_bytes(b"tried")
             probe.unlink()
-        except OSError as fault:
-            reason = fault.strerror or str(fault)
+        except SpecError as fault:
+            reason = fault.message.removeprefix("cannot be written: ")
     if reason:
         advice = "make sure that the directory exists and is writeable"
         message = f'cannot write to snapshot prefix "{param.snapshot_prefix}": {reason}; {advice}'

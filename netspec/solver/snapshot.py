@@ -5,16 +5,16 @@ Caffe: SGDSolver::SnapshotSolverState, RestoreSolverState (src/caffe/solvers/sgd
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
+from netspec.hdf5_file import Hdf5Group, hdf5_in, open_hdf5
 from netspec.proto.binary import read_binary
 from netspec.proto.schema import SolverState
 from netspec.whole_file import whole_file
@@ -36,9 +36,21 @@ class State:
 
 
 def read_state(path: str | Path) -> State:
-    """Read a .solverstate or .solverstate.h5, Caffe's or ours. Raises SpecError."""
-    if h5py.is_hdf5(path):
-        return _read_hdf5(path)
+    """Read a .solverstate or .solverstate.h5, Caffe's or ours.
+
+    Raises SpecError for any other file, and for a state that no training can have been in.
+    """
+    state = _read_hdf5(path) if h5py.is_hdf5(path) else _read_binary(path)
+    for name, value in (("iter", state.iteration), ("current_step", state.current_step)):
+        if value < 0:
+            raise SpecError(f"found {name} {value}, expected at least 0", Where(str(path)))
+    for i, array in enumerate(state.history):
+        if not np.all(np.isfinite(array)):
+            raise SpecError(f"history blob {i} has a NaN or an infinity; the training had diverged", Where(str(path)))
+    return state
+
+
+def _read_binary(path: str | Path) -> State:
     proto = read_binary(path, SolverState)
     history = []
     for i, blob in enumerate(proto.history):
@@ -77,44 +89,61 @@ def merge_shared(history: list[np.ndarray], owners: Sequence[int]) -> list[np.nd
     return merged
 
 
-def write_state(path: str | Path, state: State) -> None:
-    """Write the state atomically. Raises SpecError if it cannot be written."""
+def write_state(path: str | Path, state: State, before: Callable[[Path], object] = lambda unfinished: None) -> None:
+    """Write the state atomically; ``before`` is called with the finished file, before it appears at its path.
+
+    Raises SpecError if it cannot be written.
+    """
     with whole_file(path) as unfinished:
         if str(path).endswith(".h5"):
             _write_hdf5(unfinished, state)
-            return
-        proto = SolverState(iter=state.iteration, learned_net=state.learned_net, current_step=state.current_step)
-        proto.history.extend(blobs.from_array(array) for array in state.history)
-        unfinished.write_bytes(proto.SerializeToString(deterministic=True))
+        else:
+            proto = SolverState(iter=state.iteration, learned_net=state.learned_net, current_step=state.current_step)
+            proto.history.extend(blobs.from_array(array) for array in state.history)
+            unfinished.write_bytes(proto.SerializeToString(deterministic=True))
+        before(unfinished)
 
 
-def find_learned_net(state: State, path: str | Path) -> Path | None:
-    """Return the file of the state's weights: as written, else beside the state; None if the state has no weights."""
+def find_learned_net(state: State, path: str | Path) -> Path:
+    """Return the file of the state's weights: beside the state, else as written. Raises SpecError if there is none."""
     if not state.learned_net:
-        return None
+        raise SpecError("names no weights to resume with", Where(str(path)))
     written = Path(state.learned_net)
     beside = Path(path).parent / written.name
-    for candidate in (written, beside):
+    for candidate in (beside, written):
         if candidate.is_file():
             return candidate
-    raise SpecError(f"its weights are neither at {written} nor at {beside}", Where(str(path)))
+    raise SpecError(f"its weights are neither at {beside} nor at {written}", Where(str(path)))
 
 
 def _read_hdf5(path: str | Path) -> State:
-    with h5py.File(path, "r") as opened:
-        file: Any = opened
+    with open_hdf5(path) as file:
         for name in ("iter", "current_step", "history"):
-            if name not in file:
-                raise SpecError(f"this is not a solver state: the HDF5 file has no /{name}", Where(str(path)))
-        history = file["history"]
-        learned_net = file["learned_net"][()].decode() if "learned_net" in file else ""
-        arrays = [history[str(i)][()] for i in range(len(history))]
-        return State(int(file["iter"][0]), learned_net, int(file["current_step"][0]), arrays)
+            if name not in file.names():
+                raise SpecError(f"this is not a solver state: the HDF5 file has no /{name}")
+        history = file.group("history")
+        if history is None:
+            raise SpecError("this is not a solver state: /history is not a group")
+        learned_net = bytes(file.values("learned_net").item()).decode() if "learned_net" in file.names() else ""
+        arrays = [_floats(history, str(i)) for i in range(len(history.names()))]
+        iteration, step = (_whole_number(file, name) for name in ("iter", "current_step"))
+        return State(iteration, learned_net, step, arrays)
+
+
+def _floats(group: Hdf5Group, name: str) -> np.ndarray:
+    return group.values(name).astype(np.float32)
+
+
+def _whole_number(group: Hdf5Group, name: str) -> int:
+    values = group.values(name)
+    if values.size != 1 or values.dtype.kind not in "iu":
+        raise SpecError(f"/{name} is not one whole number")
+    return int(values.item())
 
 
 def _write_hdf5(path: Path, state: State) -> None:
     learned_net = state.learned_net.encode()
-    with h5py.File(path, "w") as file:
+    with hdf5_in(path) as file:
         file.create_dataset("iter", data=np.array([state.iteration], np.int32))
         file.create_dataset("learned_net", data=np.array(learned_net, f"S{len(learned_net) + 1}"))
         file.create_dataset("current_step", data=np.array([state.current_step], np.int32))

@@ -5,6 +5,7 @@ Caffe: src/caffe/solver.cpp; the sites in the log calls are the lines of that fi
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import deque
@@ -24,15 +25,27 @@ from netspec.graph.filter import with_train_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
-from netspec.net.weights import load_weights, save_weights
+from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, save_weights, too_large
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
 from netspec.solver import nets, update
 from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
 from netspec.solver.debug import debug_info
+from netspec.solver.extra import (
+    Extra,
+    Stamp,
+    check_pair,
+    path_beside,
+    read_extra,
+    resume,
+    running_state,
+    stamp_of,
+    write_extra,
+)
 from netspec.solver.heap import keep_freed_memory
 from netspec.solver.lr_policy import learning_rate, next_step
+from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.precision import FP32, check_precision, computing
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
@@ -58,13 +71,14 @@ def load_solver(
     exact: str = SMALL,
     strict: bool = False,
     precision: str = FP32,
+    nan: str = "stop",
 ) -> Solver:
     """Build the solver of a prototxt and its nets, ready to run.
 
     ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
     ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
     ``stages`` go to the training net. Several devices train side by side, the first being the root. For ``device``,
-    ``action`` and ``precision`` see :class:`Solver`. Raises SpecError for every fault of the files.
+    ``action``, ``precision`` and ``nan`` see :class:`Solver`. Raises SpecError for every fault of the files.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
@@ -82,16 +96,19 @@ def load_solver(
         log.info("caffe.cpp:197", "Use CPU.")
     else:
         log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in chosen))
+    extra = None if snapshot is None else read_extra(snapshot)
     solver = Solver(
         param,
         node,
         device=chosen[0],
         others=chosen[1:],
+        seed=None if extra is None else extra.seed,
         allow_python=allow_python,
         exact=exact,
         strict=strict,
         action=action,
         precision=precision,
+        nan=nan,
     )
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
@@ -137,6 +154,7 @@ class Solver:
         seed: int | None = None,
         strict: bool = False,
         action: Callable[[], str | None] | None = None,
+        nan: str = "stop",
         clock: Callable[[], float] = time.perf_counter,
         precision: str = FP32,
     ) -> None:
@@ -144,11 +162,12 @@ class Solver:
 
         ``device`` overrides solver_mode and device_id; replicas of the training net run on ``others``. ``seed`` is used
         if there is no random_seed; without it one is drawn. ``action`` is called between iterations, also those of a
-        test: "stop" ends the training, "snapshot" takes one. ``clock`` gives the seconds for "iter/s". In another
-        ``precision`` than "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order.
+        test: "stop" ends the training, "snapshot" takes one. ``nan`` says what a loss of NaN or infinity does: "stop"
+        raises SpecError, "warn" warns once. ``clock`` gives the seconds for "iter/s". In another ``precision`` than
+        "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order.
         """
         node = node or Place(Where("<solver>"))
-        log.info("solver.cpp:45", "Initializing solver from parameters: \n" + write_text(param).rstrip("\n"))
+        log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         check_settings(param, node)
         if param.snapshot:
             check_prefix(param, node)
@@ -166,6 +185,10 @@ class Solver:
         self.scores: list[Outputs] = []
         self.stopped = False
         self._losses: deque[float] = deque(maxlen=param.average_loss)
+        self._losses_before: list[float] = []  # of a training that is resumed
+        self._nan, self._told_nan = nan, False
+        self._last_snapshot = ""
+        self._states_before_test: list[dict[str, Any]] = []
         self._displayed = (clock(), 0)
         self._waited = 0.0
         rule = update.find_rule(param.type)
@@ -192,6 +215,7 @@ class Solver:
         for i, test in enumerate(tests):
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
             self.test_nets.append(self._build(test, test.label, self._device))
+        self._check_size()
         read = frozenset[str]().union(*(layer.solver_reads for net in self.test_nets for layer in net.layers))
         for line in fields_without_effect(param, node, read):
             log.warning("solver.cpp:45", line)
@@ -226,6 +250,17 @@ class Solver:
             load_weights(net, files, self._strict)
         return net
 
+    def _check_size(self) -> None:
+        """Raise SpecError now, not after days, where a snapshot could not be written."""
+        writes = self.param.snapshot or self.param.snapshot_after_train
+        if not writes or self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5"):
+            return
+        history = self._rule.sets * sum(item.parameter.nbytes for item in self.net.learnable)
+        size = max(binary_bytes(self.net, self.param.snapshot_diff), history)
+        if size > MOST_BYTES:
+            message = f"a snapshot cannot be written: {too_large(size)}"
+            raise SpecError(message, self.node.find("snapshot_format"))
+
     @property
     def loss(self) -> float:
         """The training loss, a mean over the last ``average_loss`` iterations of this call of :meth:`step`."""
@@ -257,7 +292,7 @@ class Solver:
         log.info("solver.cpp:332", "Optimization Done.")
 
     def step(self, iterations: int) -> None:
-        """Run some iterations. The window of the averaged loss starts again.
+        """Run some iterations. The window of the averaged loss starts again, unless the training was just resumed.
 
         Raises SpecError if a net has inputs: a solver cannot fill them.
         """
@@ -266,6 +301,8 @@ class Solver:
         self.stopped = False
         self.replicas.begin()
         self._losses.clear()
+        self._losses.extend(self._losses_before)
+        self._losses_before = []
         self._displayed = (self.clock(), self.iteration)
         self._waited = self._seconds_waited()
         for _ in range(iterations):
@@ -273,9 +310,13 @@ class Solver:
                 self.test_all()
                 if self.stopped:
                     return
+            for net in (self.net, *self.replicas.nets):
+                net.random.begin(f"iteration {self.iteration}")
             self.on_start()
             loss, outputs = self._forward_backward()
             self._losses.append(loss)
+            if not math.isfinite(loss):
+                self._tell_nan(f"the loss is {loss}")
             if self._is_due(self.param.display):
                 self._display(outputs)
             self.on_gradients()
@@ -287,6 +328,20 @@ class Solver:
             if request == "stop":
                 self.stopped = True
                 return
+
+    def _tell_nan(self, what: str) -> None:
+        """Stop, or warn, and say where the NaN or infinity is."""
+        found = bad_parameter(self.net)
+        if not found and self._nan == "stop":
+            found = bad_top(self.net, self.param.iter_size, f"iteration {self.iteration}")
+        first = f"; the first NaN or infinity is in {found}" if found else ""
+        message = f"Iteration {self.iteration}: {what}{first}"
+        if self._nan == "stop":
+            kept = f"; the last good snapshot is {self._last_snapshot}" if self._last_snapshot else ""
+            raise SpecError(f"{message}{kept}; lower base_lr, or go on with --nan warn", self.node.where)
+        if not self._told_nan:
+            log.logger.warning(f"{message}; the training goes on")
+        self._told_nan = True
 
     def check_inputs(self) -> None:
         """Raise SpecError where a net has inputs: nobody would fill them."""
@@ -384,15 +439,18 @@ class Solver:
     def test_all(self) -> None:
         """Run every test net for its test_iter batches with the current weights."""
         self.scores = [{} for _ in self.test_nets]
+        self._states_before_test = [running_state(net) for net in self.test_nets]
         for i in range(len(self.test_nets)):
             if not self.stopped:
                 self._test(i)
+        self._states_before_test = []
 
     @torch.no_grad()
     def _test(self, i: int) -> None:
         log.info("solver.cpp:347", f"Iteration {self.iteration}, Testing net (#{i})")
         net, batches = self.test_nets[i], self.param.test_iter[i]
         net.share_weights_with(self.net)
+        net.random.begin(f"test at iteration {self.iteration}")
         tally = Tally(scorers(net, self.param))
         for _ in range(batches):
             while request := self.action():
@@ -417,6 +475,8 @@ class Solver:
 
         With ``snapshot_format: HDF5`` both end in ``.h5``. Raises SpecError if they cannot be written.
         """
+        if self._nan == "stop" and bad_parameter(self.net):
+            self._tell_nan("the weights cannot be saved")
         hdf5 = self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5")
         form, ending = ("HDF5", ".h5") if hdf5 else ("binary proto", "")
         stem = f"{self.param.snapshot_prefix}_iter_{self.iteration}"
@@ -426,17 +486,31 @@ class Solver:
         site = "sgd_solver.cpp:296" if hdf5 else "sgd_solver.cpp:284"
         log.info(site, f"Snapshotting solver state to {form} file {state}")
         history = [values.cpu().numpy() for values in self.history]
-        write_state(state, State(self.iteration, model, self.current_step, history))
+        weights = stamp_of(model)
+        write_state(
+            state,
+            State(self.iteration, model, self.current_step, history),
+            before=lambda unfinished: write_extra(path_beside(state), self._extra(weights, stamp_of(unfinished))),
+        )
+        self._last_snapshot = state
         self.on_snapshot(model)
         return model, state
+
+    def _extra(self, weights: Stamp, state: Stamp) -> Extra:
+        """Return what Caffe's state lacks. During a test, it is as before: the test is run again after a resume."""
+        training = [running_state(net) for net in (self.net, *self.replicas.nets)]
+        testing = self._states_before_test or [running_state(net) for net in self.test_nets]
+        return Extra(self._seed, list(self._losses), training + testing, weights, state)
 
     def restore(self, path: str | Path) -> None:
         """Resume from a .solverstate or .solverstate.h5, of Caffe or of netspec, and from its weights.
 
-        As in Caffe the data layers start again at their first record. Raises SpecError, and changes nothing, if the
-        state does not fit this solver's type and net.
+        With the file ``X.solverstate.extra`` beside it the training goes on as if it had never stopped; without it, as
+        in Caffe, the data layers start again at their first record. Raises SpecError, and changes nothing, if the state
+        does not fit this solver's type and net.
         """
         where = Where(str(path))
+        extra = read_extra(path)
         state = self._of_today(read_state(path), where)
         if len(state.history) != len(self.history):
             found, expected = len(state.history), len(self.history)
@@ -448,8 +522,9 @@ class Solver:
             if not _same_shape(tuple(mine.shape), theirs.shape):
                 raise SpecError(f"history blob {i} has shape {theirs.shape}, expected {tuple(mine.shape)}", where)
         learned_net = find_learned_net(state, path)
-        if learned_net is not None:
-            load_weights(self.net, learned_net)
+        if extra is not None:
+            check_pair(path, learned_net, extra)
+        load_weights(self.net, learned_net, strict=True)
         log.info("sgd_solver.cpp:336", "SGDSolver: restoring history")
         for mine, theirs in zip(self.history, state.history, strict=True):
             mine.copy_(torch.tensor(theirs).view(mine.shape))
@@ -458,6 +533,27 @@ class Solver:
         for net in (self.net, *self.test_nets):
             net.restart_data()
         self.replicas.restart_data()
+        if extra is None:
+            log.logger.info(f"{path} is Caffe's: the data starts again at its first record, with other random numbers")
+        else:
+            self._go_on(extra, Where(str(path_beside(path))))
+
+    def _go_on(self, extra: Extra, where: Where) -> None:
+        """Go on in the data where a training stopped, with the losses of its average."""
+        nets = (self.net, *self.replicas.nets, *self.test_nets)
+        if len(extra.nets) != len(nets):
+            log.logger.warning(f"{where}: is of {len(extra.nets)} nets, not {len(nets)}: the data starts again")
+            return
+        try:
+            for net, states in zip(nets, extra.nets, strict=True):
+                resume(net, states)
+        except SpecError as fault:
+            raise SpecError(fault.message, where) from None
+        self._losses_before = extra.losses
+        if extra.seed == self._seed:
+            log.logger.info(f"{where}: the training goes on as if it had never stopped")
+        else:
+            log.logger.warning(f"{where}: random_seed was {extra.seed}: the random numbers are others from here on")
 
     def _of_today(self, state: State, where: Where) -> State:
         """Return a state in today's form, where it has a history for each layer that shares a parameter."""

@@ -1,6 +1,7 @@
 """tools/bench: its rounds, its tables, its words for what cannot run."""
 
 import json
+import math
 import shutil
 import sys
 from pathlib import Path
@@ -20,9 +21,9 @@ class Clock:
     def __init__(self, name: str, seconds: float, turns: list[str]) -> None:
         self.name, self.seconds, self.turns, self.fault, self.outputs = name, seconds, turns, "", {}
 
-    def turn(self, passes: int) -> list[float]:
+    def turn(self, passes: int) -> list[tuple[float, float]]:
         self.turns.append(self.name)
-        return [self.seconds] * passes
+        return [(self.seconds, 2 * self.seconds)] * passes
 
     def close(self) -> None:
         pass
@@ -32,7 +33,7 @@ def test_all_take_their_turn_in_every_round_in_either_order() -> None:
     turns: list[str] = []
     found = measure([Clock("a", 0.1, turns), Clock("b", 0.2, turns)], 3, lambda k: None)
     assert turns == ["a", "b", "a", "b", "b", "a", "a", "b"]  # the first two say how many passes a turn has
-    assert found == {"a": [0.1] * 3, "b": [0.2] * 3}
+    assert found == {"a": [(0.1, 0.2)] * 3, "b": [(0.2, 0.4)] * 3}
 
 
 def test_a_ratio_is_that_of_times_in_the_same_round() -> None:
@@ -48,16 +49,16 @@ def test_a_difference_is_relative_and_needs_equal_shapes() -> None:
 
 def test_a_table_has_the_ratios_of_what_ran_and_a_line_for_what_did_not() -> None:
     rows = [
-        Row("lenet", 1, 2, "netspec", [1e-3, 3e-3, 2e-3], {"pytorch": 0.5}, None),
-        Row("lenet", 1, 2, "pytorch", [4e-3] * 3, {}, 1e-7),
-        Row("lenet", 1, 2, "opencv4", [], {}, None, "it cannot"),
+        Row("lenet", 1, 2, "netspec", [1e-3, 3e-3, 2e-3], [5e-3] * 3, {"pytorch": 0.5}, None),
+        Row("lenet", 1, 2, "pytorch", [4e-3] * 3, [math.nan] * 3, {}, 1e-7),
+        Row("lenet", 1, 2, "opencv4", [], [], {}, None, "it cannot"),
     ]
     lines = table(rows).splitlines()
-    assert lines[0] == "| net | batch | threads | run by | ms | best | / pytorch | off by |"
+    assert lines[0] == "| net | batch | threads | run by | ms | best | CPU ms | / pytorch | off by |"
     assert lines[2:] == [
-        "| lenet | 1 | 2 | netspec | 2.00 | 1.00 | 0.50 | - |",
-        "| lenet | 1 | 2 | pytorch | 4.00 | 4.00 | - | 1e-07 |",
-        "| lenet | 1 | 2 | opencv4 | - | - | - | - |",
+        "| lenet | 1 | 2 | netspec | 2.00 | 1.00 | 5.00 | 0.50 | - |",
+        "| lenet | 1 | 2 | pytorch | 4.00 | 4.00 | - | - | 1e-07 |",
+        "| lenet | 1 | 2 | opencv4 | - | - | - | - | - |",
     ]
 
 
@@ -127,3 +128,15 @@ def test_growth_builds_and_runs_nets_of_a_thousand_layers(capsys: pytest.Capture
     assert main(["growth", "--layers", "17", "1002"]) == 0
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
     assert [row[0] for row in rows] == ["| 17", "| 1002"]
+
+
+@pytest.mark.slow
+def test_starts_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnxruntime")
+    out = tmp_path / "start.json"
+    ways = ["--with", "netspec", "netspec-onnxruntime"]
+    assert main(["start", "squeezenet", *ways, "--rounds", "2", "--json", str(out)]) == 0
+    assert "| squeezenet | 1 | 0 | netspec-onnxruntime |" in capsys.readouterr().out
+    rows = json.loads(out.read_text())["rows"]
+    assert all(min(row["seconds"]) > 0 and min(row["computing"]) > 0 for row in rows)
+    assert rows[1]["difference"] < 1e-4

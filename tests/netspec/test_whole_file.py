@@ -1,41 +1,171 @@
-"""Files that appear whole, and whether one could be written."""
+"""Files that appear whole, locks, and whether a file could be written: in netspec and, the same, in loopclosure."""
 
 import os
+import signal
+import subprocess
+import sys
+import threading
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-from netspec.errors import SpecError
-from netspec.whole_file import whole_file, why_unwritable
+import loopclosure.whole_file
+import netspec.whole_file
+from paths import ROOT
+
+PACKAGES = (netspec.whole_file, loopclosure.whole_file)
 
 
-def test_why_no_file_can_be_written(tmp_path: Path) -> None:
+@pytest.fixture(params=PACKAGES, ids=["netspec", "loopclosure"])
+def package(request: pytest.FixtureRequest) -> ModuleType:
+    return request.param
+
+
+def test_the_two_wings_write_files_in_one_way() -> None:
+    """They may not import each other; a change of one of the modules is to be made in the other."""
+    ours, theirs = (Path(package.__file__ or "").read_text() for package in PACKAGES)
+    ours = ours.replace("from netspec.errors import SpecError, Where", "from loopclosure.errors import InputError")
+    ours = ours.replace("SpecError(message, Where(str(path)))", "InputError(message, path)")
+    assert ours.replace("SpecError", "InputError") == theirs
+
+
+def test_why_no_file_can_be_written(package: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert why_unwritable(tmp_path / "new") == ""
-    assert why_unwritable(tmp_path / "file") == ""
-    assert why_unwritable(tmp_path) == "Is a directory"
-    assert why_unwritable(tmp_path / "gone" / "new") == "No such file or directory"
-    assert why_unwritable(tmp_path / "file" / "new") == "Not a directory"
-    assert why_unwritable(tmp_path / ("n" * 300)) == "File name too long"
+    why = package.why_unwritable
+    assert why(tmp_path / "new") == ""
+    assert why(tmp_path / "file") == ""
+    assert why(tmp_path) == "Is a directory"
+    assert why(tmp_path / "gone" / "new") == "No such file or directory"
+    assert why(tmp_path / "file" / "new") == "Not a directory"
+    assert why(tmp_path / ("n" * 300)) == "File name too long"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
 
 
-def test_a_folder_without_leave_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_without_leave_to_write(package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)  # root may write everywhere
-    assert why_unwritable(tmp_path / "new") == "Permission denied"
+    assert package.why_unwritable(tmp_path / "new") == "Permission denied"
     (tmp_path / "old").touch()
-    assert why_unwritable(tmp_path / "old") == ""
+    assert package.why_unwritable(tmp_path / "old") == "Permission denied"  # to replace it writes into the folder
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) == tmp_path)
+    assert package.why_unwritable(tmp_path / "old") == "Permission denied"
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_what_was_there(package: ModuleType, tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("old")
 
     def write() -> None:
-        with whole_file(path) as unfinished:
+        with package.whole_file(path) as unfinished:
             unfinished.write_text("new")
             raise OSError("disk full")
 
-    with pytest.raises(SpecError, match="cannot be written: disk full"):
+    with pytest.raises(ValueError, match="file: cannot be written: disk full"):
         write()
     assert [path.read_text(), *tmp_path.iterdir()] == ["old", path]
+
+
+def test_the_file_and_its_folder_are_on_disk_before_the_block_ends(
+    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[tuple[bool, list[str]]] = []
+
+    def sync(descriptor: int) -> None:
+        is_folder = os.path.samestat(os.fstat(descriptor), tmp_path.stat())
+        synced.append((is_folder, [path.name for path in tmp_path.iterdir()]))
+
+    monkeypatch.setattr(os, "fsync", sync)
+    with package.whole_file(tmp_path / "file") as unfinished:
+        unfinished.write_text("new")
+    assert synced == [(False, [unfinished.name]), (True, ["file"])]
+
+
+def test_a_folder_that_cannot_be_synced_is_no_fault(
+    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise PermissionError  # as on Windows
+
+    monkeypatch.setattr(package, "_sync", refuse)
+    with package.whole_file(tmp_path / "file") as unfinished:
+        unfinished.write_text("new")
+    assert (tmp_path / "file").read_text() == "new"
+
+
+def test_where_files_have_no_locks(package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(package, "fcntl", None)
+    with package.whole_file(tmp_path / "file") as unfinished:
+        unfinished.write_text("new")
+    with package.whole_folder(tmp_path / "folder") as unfinished:
+        (unfinished / "file").touch()
+    with package.only_one(tmp_path / "lock", ""):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_a_link_stays_a_link(package: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "there" / "file")
+    with package.whole_file(tmp_path / "link") as unfinished:
+        unfinished.write_text("new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "there" / "file").read_text() == "new"
+
+
+def test_a_pipe_gets_the_bytes_and_stays_a_pipe(package: ModuleType, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    read: list[str] = []
+    reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_text()))
+    reader.start()
+    with package.whole_file(tmp_path / "pipe") as unfinished:
+        unfinished.write_text("new")
+    reader.join()
+    assert read == ["new"]
+    assert (tmp_path / "pipe").is_fifo()
+
+
+# What killed runs leave
+
+
+def start(package: ModuleType, code: str, folder: Path) -> subprocess.Popen[str]:
+    """Run code until it has printed a line."""
+    command = [sys.executable, "-c", f"from {package.__name__} import *\n{code}\nprint(flush=True); input()"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, cwd=folder, stdin=pipe, stdout=pipe, text=True, env=environment)
+    assert process.stdout is not None
+    process.stdout.readline()
+    return process
+
+
+HALF = """
+held = whole_folder("folder"), whole_file("file")
+held[0].__enter__(), held[1].__enter__().write_text("half")
+"""
+
+
+def test_what_a_killed_run_left_is_swept_by_the_next(
+    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / ".mine.unfinished").touch()
+    with start(package, HALF, tmp_path) as process:
+        monkeypatch.setattr(package, "_swept", set())
+        with package.whole_file(tmp_path / "other") as unfinished:
+            unfinished.touch()
+        assert len(list(tmp_path.glob(".*.unfinished"))) == 3, "somebody is still writing these"
+        process.send_signal(signal.SIGKILL)
+    monkeypatch.setattr(package, "_swept", set())
+    with package.whole_file(tmp_path / "other") as unfinished:
+        unfinished.touch()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".mine.unfinished", "other"]
+
+
+def test_a_lock_dies_with_its_process(package: ModuleType, tmp_path: Path) -> None:
+    with start(package, 'held = only_one("x.lock", ""); held.__enter__()', tmp_path) as process:
+        message = rf"x\.lock: is held by another run \(process {process.pid}\); choose another name"
+        with pytest.raises(ValueError, match=message), package.only_one(tmp_path / "x.lock", "choose another name"):
+            pass
+        process.send_signal(signal.SIGKILL)
+    with package.only_one(tmp_path / "x.lock", "choose another name"):
+        assert (tmp_path / "x.lock").read_text() == f"{os.getpid()}\n"
+    assert not list(tmp_path.iterdir())

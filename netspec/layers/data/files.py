@@ -9,7 +9,7 @@ Caffe: src/caffe/layers/base_data_layer.cpp
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 
@@ -142,6 +142,15 @@ class ReadingLayer(Layer):
             self._feed.restart(iteration)
 
     @override
+    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+        return {"iteration": self.iteration}
+
+    @override
+    def resume(self, state: Mapping[str, Any]) -> None:
+        super().resume(state)
+        self.restart(_position(self, state["iteration"]))
+
+    @override
     def close(self) -> None:
         if self._feed:
             self._feed.close()
@@ -188,6 +197,12 @@ class ReadingLayer(Layer):
     def log_size(self, source: Source, site: str) -> None:
         """Log the shape of a batch."""
         log.info(site, "output data size: " + ",".join(map(str, source.shapes[0])))
+
+
+def _position(layer: Layer, value: object) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise layer.error(f"found iteration {value!r} to go on from, expected a whole number")
+    return value
 
 
 def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:
@@ -407,7 +422,7 @@ class HDF5Output(Layer):
         if reason := why_unwritable(name):
             raise self.error(f'HDF5 file "{name}" cannot be written: {reason}', *place)
         self._sink = None
-        if self.context.open_data and self.context.device.type != "meta":
+        if self.context.write_files and self.context.device.type != "meta":
             from netspec.data.hdf5 import Hdf5Sink
 
             self._sink = Hdf5Sink(name, self.context.at(*place))
@@ -428,7 +443,7 @@ class HDF5Output(Layer):
 
     @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        assert self._sink is not None, "built without opening data"
-        data, label = (bottom.detach().cpu().numpy() for bottom in bottoms)
-        self._sink.append(data, label)
+        if self._sink is not None:
+            data, label = (bottom.detach().cpu().numpy() for bottom in bottoms)
+            self._sink.append(data, label)
         return ()

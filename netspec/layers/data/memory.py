@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -195,6 +195,15 @@ class MemoryData(Layer):
     @override
     def restart(self) -> None:
         self._next = 0
+
+    @override
+    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+        return {"next": self._next}
+
+    @override
+    def resume(self, state: Mapping[str, Any]) -> None:
+        super().resume(state)
+        self._next = int(state["next"])
 
     @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:

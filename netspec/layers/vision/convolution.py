@@ -370,6 +370,16 @@ class Deconvolution(Convolution):
 
     @override
     def prepare(self, how: Preparation) -> Kernel:
+        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+        usual = self.channel_axis == 1 and self.spatial_axes == 2 and len(self.bottom_shapes) == 1
+        exact, large = self.is_exact(weight, self.small), self.multiply_adds() > SMALL_PRODUCT
+        if usual and not exact and large and how.pack and fused.suits(weight):
+            geometry = (self.stride, self.pad, self.dilation)
+            if self.group == 1:
+                return fused.deconvolution(weight, bias, *geometry, how)
+            fits = all(p < e for p, e in zip(self.pad, self.extent, strict=True))
+            if self.group == self.channels == self.num_output and fits and max(self.stride) <= 2:
+                return fused.spread_by_channel(self.bottom_shapes[0], weight, bias, *geometry, how)
         return Layer.prepare(self, how)
 
     onnx_op = "ConvTranspose"

@@ -21,6 +21,7 @@ from netspec.proto.schema import TRAIN
 MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
 CEIL, FLOOR = 0, 1  # caffe.proto: enum PoolingParameter.RoundMode
 LOWEST = torch.finfo(torch.float32).min  # what a maximum starts from: Caffe's -FLT_MAX
+HIGHEST_PYRAMID = 16  # levels: 4^16 / 3 windows
 SMALLEST = torch.finfo(torch.float32).tiny  # Caffe's FLT_MIN
 
 Pair = tuple[int, int]
@@ -357,6 +358,9 @@ class SPP(_PoolingBase):
     def setup(self) -> None:
         if self.param.spp_param.pyramid_height < 1:
             raise self.error("pyramid_height must be at least 1", "spp_param", "pyramid_height")
+        if self.param.spp_param.pyramid_height > HIGHEST_PYRAMID:
+            message = f"pyramid_height must be at most {HIGHEST_PYRAMID}: more windows than an int counts"
+            raise self.error(message, "spp_param", "pyramid_height")
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:

@@ -1,5 +1,7 @@
 """The detector over recordings: folders, sequences and videos, with any describe."""
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from loopclosure.descriptors.feature_file import Features, read_features
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import (
+    Recording,
     calibrate_on_data_set,
     from_poses,
     judged_by_poses,
@@ -98,16 +101,48 @@ def test_describe_by_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     image = np.full((4, 4, 3), 3, np.uint8)
     image[1] = 5
-    assert load_describe("my_describe:flat", {})(image).tolist() == [3.5] * 3
-    assert load_describe("my_describe:make", {"power": "2"})(image).tolist() == [12.25] * 3
-    assert load_describe("my_describe:Row", {})(image).tolist() == [3] * 3
-    assert load_describe("my_describe:Row", {"row": "1"})(image).tolist() == [5] * 3
+    assert load_describe("my_describe.py:flat", {})(image).tolist() == [3.5] * 3
+    assert load_describe(f"{tmp_path}/my_describe.py:make", {"power": "2"})(image).tolist() == [12.25] * 3
+    assert load_describe("my_describe.py:Row", {})(image).tolist() == [3] * 3
+    assert load_describe("my_describe.py:Row", {"row": "1"})(image).tolist() == [5] * 3
     for specification, options, sentence in (
-        ("my_describe", {}, "expected module:function"),
+        ("my_describe.py", {}, "expected module:function or FILE.py:function"),
+        (
+            "my_describe:flat",
+            {},
+            "lies in the working directory, not in an installed package; .* ./my_describe.py",
+        ),
+        ("gone.py:f", {}, "cannot import"),
         ("no_such_module:f", {}, "cannot import"),
-        ("my_describe:g", {}, 'has no "g"'),
-        ("my_describe:number", {}, "cannot be called"),
-        ("my_describe:make", {"power": "2", "x": "1"}, "unexpected keyword"),
+        ("my_describe.py:g", {}, 'has no "g"'),
+        ("my_describe.py:number", {}, "cannot be called"),
+        ("my_describe.py:make", {"power": "2", "x": "1"}, "unexpected keyword"),
     ):
         with pytest.raises(InputError, match=sentence):
             load_describe(specification, options)
+
+
+def test_nothing_in_the_working_directory_runs_unnamed(tmp_path, monkeypatch):
+    """Not even a module of the name of one that an installed package imports."""
+    for name in ("my_describe", "wave", "sndhdr_of_mine"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('ran')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "wave", raising=False)
+    with pytest.raises(InputError, match="name its file"):
+        load_describe("my_describe:flat", {})
+    assert callable(load_describe("wave:open", {}))
+    monkeypatch.syspath_prepend("")  # as python -c and python -m have it
+    with pytest.raises(InputError, match="name its file"):
+        load_describe("sndhdr_of_mine:flat", {})
+
+
+def test_a_video_that_is_shorter_than_it_says(tmp_path, monkeypatch):
+    image = np.zeros((8, 8, 3), np.uint8)
+    recording = Recording(tmp_path / "v.avi", ["frame"] * 3, None, np.array([0, 5, 99]))
+    monkeypatch.setattr("loopclosure.detector.run.video_frames", lambda path: ((i / 10, image) for i in range(30)))
+    frames = recording.frames()
+    assert [next(frames)[1], next(frames)[1]] == [0.0, 0.5]
+    with pytest.raises(InputError, match=r"v\.avi: ends after 30 frames, though frame 99 is wanted .* give --stop 30"):
+        next(frames)
+    with pytest.raises(InputError, match="threshold is nan"):
+        LoopDetector(threshold=float("nan"))

@@ -86,3 +86,43 @@ def test_what_signals_do_can_be_changed(endless) -> None:
     process.send_signal(signal.SIGHUP)
     assert process.wait(60) == 0
     assert len(snapshots()) == 1
+
+
+def test_sigterm_stops_a_training_as_an_interrupt_does(endless) -> None:
+    process, wait_for = endless()
+    wait_for("Iteration 10 ")
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 0
+    assert last_messages(2) == ["Optimization stopped early.", "Optimization Done."]
+    assert len(snapshots()) == 1
+
+
+ENDLESS = """
+import caffe, sys, time
+
+class Endless(caffe.Layer):
+    def setup(self, bottom, top):
+        pass
+
+    def reshape(self, bottom, top):
+        top[0].reshape(1)
+
+    def forward(self, bottom, top):
+        print("begun", file=sys.stderr, flush=True)
+        while True:
+            time.sleep(0.1)
+"""
+
+
+def test_a_second_interrupt_ends_a_training_at_once(endless) -> None:
+    """The first would wait for the end of an iteration, which takes for ever here."""
+    Path("endless.py").write_text(ENDLESS)
+    net = 'layer { name: "e" type: "Python" top: "e" python_param { module: "endless" layer: "Endless" } }'
+    Path(SOLVER).write_text(f"net_param {{ {net} }} base_lr: 1 lr_policy: 'fixed' max_iter: 1 snapshot_prefix: 'x'")
+    process, wait_for = endless("--allow-python-layers")
+    wait_for("begun")
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 130

@@ -100,4 +100,4 @@ def test_results_of_another_shape_or_place_are_refused(tmp_path: Path) -> None:
         sink.append(np.zeros((2, 4)), np.zeros(2))
     sink.close()
     with pytest.raises(SpecError, match=r"^net.prototxt:4:2: HDF5 file .* cannot be written"):
-        Hdf5Sink(str(tmp_path / "nowhere" / "out.h5"), PLACE)
+        Hdf5Sink(str(tmp_path / "nowhere" / "out.h5"), PLACE).append(np.zeros((2, 4)), np.zeros(2))

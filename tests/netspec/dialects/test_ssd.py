@@ -269,6 +269,30 @@ def test_detection_output(build: Build, kind: str, shared: bool, limits: dict[st
     np.testing.assert_allclose(top[0, 0], expected, rtol=1e-4, atol=1e-5)
 
 
+def test_refined_priors_and_those_that_show_no_object(build: Build) -> None:
+    rng = np.random.default_rng(1)
+    count, kind = 20, "CENTER_SIZE"
+    prior, variance = some_priors(count, rng), np.tile(np.array([0.1, 0.1, 0.2, 0.2], np.float32), (count, 1))
+    loc, steps = rng.normal(size=(2, 2, count, 4)).astype(np.float32)
+    scores, objects = rng.uniform(size=(2, 2, count, 2)).astype(np.float32)
+    arrays = [loc, scores, np.stack([prior.reshape(-1), variance.reshape(-1)])[None], objects, steps]
+    bottoms = [torch.from_numpy(array.reshape(len(array), -1)) for array in arrays]
+    bottoms[2] = torch.from_numpy(arrays[2])
+    settings = f"num_classes: 2 code_type: {kind} nms_param {{ nms_threshold: 0.4 }} confidence_threshold: 0.3"
+    text = f"type: 'DetectionOutput' detection_output_param {{ {settings} objectness_score: 0.4 }}"
+    expected = []
+    for i in range(2):
+        better = [decoded(steps[i, p], prior[p], variance[p], kind) for p in range(count)]
+        boxes = [decoded(loc[i, p], better[p], variance[p], kind) for p in range(count)]
+        shown = np.where(objects[i, :, 1:] >= np.float32(0.4), scores[i], 0)
+        expected += [(i, label, score, *box) for label, score, box in detections([boxes] * 2, shown, 0, 0.3, 0.4)]
+    assert len(expected) > 5
+    top = run(build("ssd", text, *(b.shape for b in bottoms)), *bottoms)
+    np.testing.assert_allclose(top[0, 0], expected, rtol=1e-4, atol=1e-5)
+    with pytest.raises(SpecError, match=r"found a bottom of shape \(2, 20\), expected \(2, 2 P\) for 20 priors"):
+        build("ssd", text, *(b.shape for b in bottoms[:3]), (2, 20), (2, 80))
+
+
 def test_detection_output_with_the_variance_in_the_target(build: Build) -> None:
     settings = (
         "num_classes: 2 variance_encoded_in_target: true confidence_threshold: 0.5 nms_param { nms_threshold: 0 }"

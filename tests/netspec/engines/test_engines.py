@@ -122,12 +122,36 @@ def test_changed_parameters_take_effect_and_are_not_kept(engine: str, files: Pat
         with torch.no_grad():
             each.params["feat"][1].fill_(3)
     torch.testing.assert_close(net(data=data)["feat"], expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
+    net.params["feat"][1].data[...] = 4
+    expected.params["feat"][1].data[...] = 4
+    torch.testing.assert_close(net(data=data)["feat"], expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
     netspec.save_weights(expected, "other.caffemodel")
     other = load(engine)
     other(data=data)
     netspec.load_weights(other, "other.caffemodel")
     torch.testing.assert_close(other(data=data)["feat"], expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
     assert len(entries(files)) == 1
+
+
+@pytest.mark.usefixtures("files")
+def test_parameters_that_may_change_unseen_are_read_at_every_pass(
+    engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    net = load(engine)
+    net(data=data)
+    held = net.params["feat"][1].data.numpy()
+    with caplog.at_level(logging.WARNING), torch.no_grad():  # an autograd graph would hold them too
+        for value in (1, 2):
+            held[:] = value
+            found = net(data=data)["feat"]
+            expected = load("torch")
+            expected.params["feat"][1].data.fill_(value)
+            torch.testing.assert_close(found, expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
+    (line,) = caplog.messages
+    assert "parameters may change unseen while their memory is held" in line
+    del held
+    torch.testing.assert_close(net(data=data)["feat"], found, rtol=1e-5, atol=1e-5)
+    assert not net(data=data)["feat"].requires_grad
 
 
 def test_random_weights_are_not_kept(engine: str, files: Path, data: np.ndarray) -> None:

@@ -7,9 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from typing_extensions import override
 
 from exported import trained
 from netspec.graph.steps import PASSES
+from netspec.layers.activation import ReLU
+from netspec.layers.base import Layer
+from netspec.layers.vision.convolution import Convolution
 from netspec.net import programs
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, write_binary
@@ -78,6 +82,16 @@ def test_what_only_hands_on_is_not_run_and_sums_are_made_in_place(net_of: Callab
     steps = last_program(net).schedule.steps
     assert [net.plan.nodes[step.node].name for step in steps] == ["conv", "left", "right", "sum"]
     assert steps[-1].reuse
+
+
+@pytest.mark.parametrize("how", ["num_output: 12", "num_output: 8 group: 8", "num_output: 8 group: 8 dilation: 2"])
+def test_deconvolutions_are_laid_out_too(how: str, net_of: Callable[..., Net]) -> None:
+    layer = f'type: "Deconvolution" convolution_param {{ kernel_size: 4 stride: 2 pad: 1 {how} {FILLERS} }}'
+    text = INPUT + f'layer {{ name: "conv" bottom: "data" top: "conv" {layer} }}' + NORM
+    net = trained(net_of(text.replace('type: "ReLU"', 'type: "ReLU" relu_param { negative_slope: 0.1 }')))
+    x = images(1, 8, 80, 80)
+    assert_same(quickly(net, data=x), slowly(net, data=x))
+    assert last_program(net).kinds == ["packed"]
 
 
 @pytest.mark.parametrize("passes", [(), *((name,) for name in PASSES), PASSES], ids="-".join)
@@ -279,3 +293,33 @@ def test_inference_mode_and_no_grad_may_take_turns(net_of: Callable[..., Net]) -
     for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
         with mode():
             assert_same(net(data=images()), expected)
+
+
+def test_layers_that_share_weights_each_lay_them_out_for_themselves(net_of: Callable[..., Net]) -> None:
+    text = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 8 dim: 300 } } }'
+    for name, bottom, transposed in (("in", "data", "false"), ("out", "in", "true"), ("again", "out", "false")):
+        text += f"""
+layer {{ name: "{name}" type: "InnerProduct" bottom: "{bottom}" top: "{name}" param {{ name: "w" }}
+  inner_product_param {{ num_output: 300 transpose: {transposed} bias_term: false
+    weight_filler {{ type: "xavier" }} }} }}
+"""
+    net, x = net_of(text, exact="none"), torch.randn(8, 300)
+    assert_same(quickly(net, data=x), slowly(net, data=x))
+    assert last_program(net).kinds == ["packed"] * 3
+
+
+def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> None:
+    class Halved(Convolution):
+        @override
+        def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return tuple(top / 2 for top in super().forward(*bottoms))
+
+    class Named(Convolution):
+        """The same forward pass."""
+
+    assert Halved.prepare is Layer.prepare
+    assert Halved.absorbs is Layer.absorbs
+    assert not Halved.fresh
+    assert Named.prepare is Convolution.prepare
+    assert Named.fresh
+    assert ReLU.fresh

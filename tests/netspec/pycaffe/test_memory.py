@@ -376,6 +376,57 @@ def test_bad_use_is_answered_and_the_net_lives(
     assert net.forward()["prob1"].sum() == pytest.approx(25, rel=1e-4)
 
 
+X = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 8 } } }\n'
+FC = 'layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_product_param { num_output: 4 } }\n'
+
+
+@pytest.mark.parametrize(
+    ("layers", "place", "check"),
+    [
+        ('layer { name: "a" type: "Foo" bottom: "x" top: "a" }', "2:19", "== 1 (0 vs. 1) Unknown layer type: Foo"),
+        ('layer { name: "a" type: "ReLU" bottom: "b" top: "a" }', "2:32", "(Unknown bottom blob 'b' (layer 'a'))"),
+        (
+            'layer { name: "c" type: "Convolution" bottom: "x" top: "c" convolution_param { num_output: 1 } }',
+            "2:60",
+            "Check failed: kernel_shape_data[i] > 0 Filter dimensions must be nonzero.",
+        ),
+        (
+            FC + 'layer { name: "c" type: "Concat" bottom: "x" bottom: "ip" top: "c" concat_param { axis: 0 } }',
+            "3:46",
+            "All inputs must have the same shape, except at concat_axis.",
+        ),
+        (
+            FC + 'layer { name: "e" type: "Eltwise" bottom: "x" bottom: "ip" top: "e" }',
+            "3:47",
+            "Check failed: bottom[0]->shape() == bottom[i]->shape()",
+        ),
+        (
+            FC + 'layer { name: "l" type: "SoftmaxWithLoss" bottom: "ip" bottom: "x" top: "l" }',
+            "3:56",
+            "(2 vs. 384) Number of labels must match number of predictions; e.g., if softmax axis == 1 and prediction",
+        ),
+    ],
+)
+def test_a_failed_check_has_caffes_words_and_the_place(
+    net_of: Callable[..., caffe.Net], layers: str, place: str, check: str
+) -> None:
+    with pytest.raises(ValueError, match=rf"net\.prototxt:{place}: ") as fault:
+        net_of(X + layers)
+    assert check in str(fault.value)
+
+
+def test_a_failed_check_of_a_pass_has_caffes_words(net_of: Callable[..., caffe.Net], tmp_path: Path) -> None:
+    net = net_of(X + FC)
+    net.blobs["x"].reshape(2, 3, 9, 9)
+    for run in (net.forward, net.reshape):
+        with pytest.raises(ValueError, match="InnerProduct") as fault:
+            run()
+        assert "(Check failed: K_ == new_K (192 vs. 243) Input size incompatible with inner" in str(fault.value)
+    (tmp_path / "bad.caffemodel").write_text("words")
+    with pytest.raises(ValueError, match=r"bad\.caffemodel: .*Failed to parse NetParameter file: .*bad\.caffemodel"):
+        net.copy_from(tmp_path / "bad.caffemodel")
+
+
 ROUNDS = """
 import netspec.pycaffe as caffe
 net = caffe.Net("net.prototxt", caffe.TRAIN)

@@ -72,18 +72,19 @@ def test_a_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monkey
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_weights_are_looked_for_as_written_then_beside_the_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_weights_are_looked_for_beside_the_state_then_as_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     Path("moved").mkdir()
     state, path = State(1, "run/x.caffemodel", 0, []), Path("moved/x.solverstate")
-    with pytest.raises(SpecError, match=r"its weights are neither at run/x\.caffemodel nor at moved/x\.caffemodel"):
+    with pytest.raises(SpecError, match=r"its weights are neither at moved/x\.caffemodel nor at run/x\.caffemodel"):
         find_learned_net(state, path)
-    Path("moved/x.caffemodel").touch()
-    assert find_learned_net(state, path) == Path("moved/x.caffemodel")
     Path("run").mkdir()
     Path("run/x.caffemodel").touch()
     assert find_learned_net(state, path) == Path("run/x.caffemodel")
-    assert find_learned_net(State(1, "", 0, []), path) is None
+    Path("moved/x.caffemodel").touch()
+    assert find_learned_net(state, path) == Path("moved/x.caffemodel")
+    with pytest.raises(SpecError, match="names no weights"):
+        find_learned_net(State(1, "", 0, []), path)
 
 
 def test_files_that_are_no_states(tmp_path: Path):

@@ -164,7 +164,11 @@ def test_the_learning_rate_is_that_of_the_iteration_to_come(make):
 
 
 def files() -> list[str]:
-    return sorted(path.name for path in Path().glob("*_iter_*"))
+    """Caffe's snapshots; beside each state lies what Caffe forgets."""
+    found = sorted(path.name for path in Path().glob("*_iter_*"))
+    caffes = [name for name in found if not name.endswith(".extra")]
+    assert [f"{name}.extra" for name in caffes if "solverstate" in name] == sorted(set(found) - set(caffes))
+    return caffes
 
 
 def test_snapshots_come_at_their_interval_and_after_training(make):

@@ -1,0 +1,120 @@
+"""Arrays of .npz and .npy files, read with care.
+
+numpy makes room for what a header announces before it reads, and a small packed file may unpack to any size: both are
+checked here against what the file holds. No Python object is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tokenize
+import zipfile
+import zlib
+from dataclasses import fields
+from pathlib import Path
+from typing import IO, Any, TypeVar, cast
+
+import numpy as np
+
+from loopclosure.errors import InputError
+
+T = TypeVar("T")
+_FAULTS = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, MemoryError, SyntaxError),
+    *(EOFError, NotImplementedError, RuntimeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
+_ALWAYS = 1 << 28  # bytes that any file may ask for
+_MOST_PACKED = 100  # times a file's size: real data is packed 2 to 20 times, a file made to fill the memory 1000 times
+
+
+def read_npz(path: str | Path, expected: str) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file, by name.
+
+    Raises InputError, which says what was expected, for any other file.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            return unpack(stream, path.stat().st_size)
+    except _FAULTS as error:
+        raise _fault(error, path, expected) from None
+
+
+def read_npy(path: str | Path, expected: str) -> np.ndarray:
+    """Return the array of an .npy file. Raises InputError, which says what was expected, for any other file."""
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            return _read(stream, os.fstat(stream.fileno()).st_size)
+    except _FAULTS as error:
+        raise _fault(error, path, expected) from None
+
+
+def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
+    """Return the arrays of an open .npz of ``stored`` bytes; raises what zipfile and numpy raise."""
+    with zipfile.ZipFile(packed) as archive:
+        entries = archive.infolist()
+        size = sum(entry.file_size for entry in entries)
+        if size > _ALWAYS and size > _MOST_PACKED * stored:
+            raise ValueError(f"its arrays would take {size / 2**20:.0f} MiB of memory, in a file of {stored} bytes")
+        arrays: dict[str, np.ndarray] = {}
+        for entry in entries:
+            with archive.open(entry) as stream:
+                arrays[entry.filename.removesuffix(".npy")] = _read(stream, entry.file_size)
+        return arrays
+
+
+def _read(stream: IO[bytes], size: int) -> np.ndarray:
+    """Return the array in the format .npy, of ``size`` bytes, that a stream holds."""
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"an array of format {version}")
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, by_columns, dtype = read_header(stream)
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or count * dtype.itemsize > size:
+        raise ValueError(f"an array of shape {shape}, {dtype}, in {size} bytes")
+    data = stream.read(count * dtype.itemsize)
+    values = np.frombuffer(data, dtype, count).copy() if dtype.itemsize else np.zeros(count, dtype)
+    return values.reshape(shape[::-1]).T if by_columns else values.reshape(shape)
+
+
+def _fault(error: BaseException, path: Path, expected: str) -> InputError:
+    if not path.exists():
+        return InputError(f"no such file; expected {expected}", path)
+    if isinstance(error, InputError):
+        return error
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return InputError(f"cannot be read ({reason}); expected {expected}", path)
+
+
+def check_array(
+    arrays: dict[str, np.ndarray], name: str, kinds: str, shape: tuple[int, ...], finite: bool = True
+) -> None:
+    """Raise ValueError for an array that is missing, of another kind or shape, or has a number that is not finite."""
+    values = arrays.get(name)
+    if values is None:
+        raise ValueError(f'has no array "{name}"')
+    if values.dtype.kind not in kinds or values.shape != shape:
+        raise ValueError(f'"{name}" has shape {values.shape}, {values.dtype}; expected {shape}')
+    if finite and not np.all(np.isfinite(values)):
+        raise ValueError(f'"{name}" has a number that is not finite')
+
+
+def from_json(made: type[T], values: Any) -> T:
+    """Return an object of a dataclass whose fields are numbers, texts, truth values, or None, from what JSON has of it.
+
+    Raises ValueError for a field that is missing or of another type, and what the class itself raises.
+    """
+    known = {field.name: str(field.type).split(" | ") for field in fields(cast(Any, made))}
+    if not isinstance(values, dict) or set(values) != set(known):
+        raise ValueError(f"found {values!r:.80}, expected the fields {', '.join(known)}")
+    for name, types in known.items():
+        value = values[name]
+        kind = "None" if value is None else type(value).__name__
+        if kind not in types and not (kind == "int" and "float" in types):
+            raise ValueError(f"{name} is {value!r:.80}, expected {' or '.join(types)}")
+    return made(**values)

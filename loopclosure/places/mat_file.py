@@ -1,0 +1,66 @@
+"""MATLAB files, read by a process of its own: a damaged file can make SciPy's reader crash.
+
+Run as a program, this file writes the matrices of a .mat file to standard output, as .npz.
+"""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+LIMIT = 1 << 30  # bytes of memory that the process may use beyond what it starts with, and
+TIMES = 100  # times the file's size
+
+
+def read_mat(path: str | Path) -> dict[str, Any]:
+    """Return the matrices (M, N) of numbers in a .mat file, by name. Raises InputError for any other file."""
+    from loopclosure.arrays import unpack
+    from loopclosure.errors import InputError
+
+    done = subprocess.run([sys.executable, __file__, str(path)], capture_output=True, check=False)
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        reason = said[-1] if said and done.returncode == 1 else "the reader crashed"
+        raise InputError(f"cannot be read as .mat ({reason})", path)
+    return unpack(io.BytesIO(done.stdout), len(done.stdout))
+
+
+def _limit_memory(path: str) -> None:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    statm = Path("/proc/self/statm")
+    used = int(statm.read_text().split()[0]) * resource.getpagesize() if statm.exists() else 0
+    most = used + LIMIT + TIMES * Path(path).stat().st_size
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
+
+
+def _main(path: str) -> None:
+    import numpy as np
+    import scipy.io
+    import scipy.sparse
+
+    _limit_memory(path)
+    matrices = {}
+    try:
+        for name, found in scipy.io.loadmat(path).items():
+            value = found.toarray() if scipy.sparse.issparse(found) else found
+            if not name.startswith("__") and isinstance(value, np.ndarray) and value.ndim == 2 and value.size > 1:
+                matrices[name] = value if value.dtype.kind in "buif" else np.array(str(value.dtype))
+        written = io.BytesIO()
+        np.savez(written, allow_pickle=False, **matrices)
+    except NotImplementedError:
+        sys.exit("it is a MATLAB 7.3 file; save it again in MATLAB with -v7")
+    except BaseException as error:  # a broken file can make loadmat raise anything
+        sys.exit(" ".join(str(error).split()) or type(error).__name__)
+    sys.stdout.buffer.write(written.getvalue())
+
+
+if __name__ == "__main__":
+    sys.path.pop(0)  # the folder of this file, which is none of modules
+    _main(sys.argv[1])

@@ -1,0 +1,168 @@
+"""HDF5 files: read with care, and written whole.
+
+The library follows links to any file of the machine, believes any size, and has many kinds of exceptions.
+
+h5py writes into a Python file here. Where HDF5's own driver meets a full disk, the library keeps what it could not
+write, tries again when the process ends, and kills it.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]
+
+from netspec.errors import SpecError, Where
+from netspec.lfs import pointer_fault_at
+from netspec.limits import bomb
+from netspec.whole_file import whole_file
+
+_MOST_LINKS = 16  # from link to link
+LIBRARY_FAULTS = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError)
+
+
+@contextmanager
+def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Group]:
+    """Yield what is in an HDF5 file. Raises SpecError, at ``where``, for all that cannot be read within the block.
+
+    Nothing outside of the file is read: links to other files, and datasets stored in them, are refused.
+    """
+    place = where or Where(str(path))
+    named = f'HDF5 file "{path}" ' if where else ""
+    try:
+        with h5py.File(path, "r") as file:
+            yield Hdf5Group(file, os.path.getsize(path))
+    except SpecError as fault:
+        raise fault if fault.where else SpecError(named + fault.message, place) from None
+    except LIBRARY_FAULTS as fault:
+        reason = pointer_fault_at(path) or f"cannot be read: {_one_line(fault)}"
+        raise SpecError(named + reason, place) from None
+
+
+class Hdf5Group:
+    """A group of an HDF5 file. Its methods raise SpecError, without a place."""
+
+    def __init__(self, group: Any, file_size: int, path: str = "", above: frozenset[Any] = frozenset()) -> None:
+        self._group, self._file_size, self._path = group, file_size, path
+        self._seen = above | {h5o.get_info(group.id).addr}
+
+    def names(self) -> list[str]:
+        """Return the names of the members, in the library's (alphabetical) order."""
+        return list(self._group)
+
+    def group(self, name: str) -> Hdf5Group | None:
+        """Return a member, or a member of a member (``a/b``), that is a group; None if there is none."""
+        found = self._member(name)
+        if not isinstance(found, h5py.Group):
+            return None
+        if h5o.get_info(found.id).addr in self._seen:
+            raise SpecError(f"group {self._path}/{name} contains itself")
+        return Hdf5Group(found, self._file_size, f"{self._path}/{name}", self._seen)
+
+    def dataset(self, name: str) -> h5py.Dataset | None:
+        """Return a member that is a dataset, stored in this file and not larger than it can be; None if there is none.
+
+        What is read of it in slices is checked as if it were read at once.
+        """
+        found = self._member(name)
+        if not isinstance(found, h5py.Dataset):
+            return None
+        if found.external or found.is_virtual:
+            raise SpecError(f"dataset {self._path}/{name} is stored in another file, which is not read")
+        if too_large := bomb(found.nbytes, self._file_size):
+            raise SpecError(f"dataset {self._path}/{name} {too_large}")
+        return found
+
+    def values(self, name: str) -> np.ndarray:
+        """Return the numbers of a dataset, or its text as an array of bytes."""
+        found = self.dataset(name)
+        if found is None:
+            raise SpecError(f"has no dataset {self._path}/{name}")
+        values = np.asarray(found[()])
+        if values.dtype.kind not in "fiubSO":
+            raise SpecError(f"dataset {self._path}/{name} holds {values.dtype}, expected numbers")
+        return values
+
+    def _member(self, name: str) -> Any:
+        found: Any = self._group
+        parts, links = _parts(name), 0
+        while parts:
+            part = parts.pop(0)
+            link = found.get(part, getlink=True) if isinstance(found, h5py.Group) else None
+            if isinstance(link, h5py.ExternalLink):
+                raise SpecError(f'{self._path}/{name} is a link to "{link.filename}", which is not read')
+            if isinstance(link, h5py.SoftLink) and links < _MOST_LINKS:
+                found = self._group.file if link.path.startswith("/") else found
+                parts, links = _parts(link.path) + parts, links + 1
+            elif isinstance(link, h5py.HardLink):
+                found = found[part]
+            else:
+                return None
+        return found
+
+
+def _parts(path: str) -> list[str]:
+    return [part for part in path.split("/") if part]
+
+
+def _one_line(fault: BaseException) -> str:
+    return " ".join(str(fault).split()) or type(fault).__name__
+
+
+@contextmanager
+def new_hdf5(path: str | Path) -> Iterator[h5py.File]:
+    """Yield a new HDF5 file, which appears at ``path`` at the end of the block; see :func:`whole_file`."""
+    with whole_file(path) as unfinished, hdf5_in(unfinished) as file:
+        yield file
+
+
+@contextmanager
+def hdf5_in(unfinished: Path) -> Iterator[h5py.File]:
+    """Yield an HDF5 file to fill, in a file that is there for it. Raises OSError if it cannot be written."""
+    with _Patient(unfinished) as stream:
+        with h5py.File(stream, "w") as file:
+            yield file
+        stream.check()
+
+
+class _Patient(io.FileIO):
+    """A file to read and write whose first error is kept: the library is told that all went well."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+b")
+        self._fault: OSError | None = None
+
+    def check(self) -> None:
+        """Raise the first error that came."""
+        if self._fault is not None:
+            raise self._fault
+
+    def write(self, data: memoryview) -> int:  # type: ignore[override]
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while len(rest) and self._fault is None:  # a write to a file may be cut short
+                rest = rest[super().write(rest) :]
+        except OSError as fault:
+            self._fault = fault
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as fault:
+            self._fault = self._fault or fault
+            return size or 0
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except OSError as fault:
+            self._fault = self._fault or fault

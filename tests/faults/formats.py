@@ -1,0 +1,208 @@
+"""Every format that is read, with a small good file of it and the function that reads it to the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import h5py
+import lmdb
+import numpy as np
+import scipy.io
+
+from lmdb_build.pairs.list_file import read_pair_list
+from loopclosure.descriptors.feature_file import read_features
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.places.frames import read_bgr
+from loopclosure.places.image_list import list_images
+from loopclosure.places.masks import read_coordinates, read_truth_matrix
+from loopclosure.places.trajectory import read_groundtruth, read_rgb_list
+from loopclosure.words.chow_liu import learn_tree
+from loopclosure.words.vocabulary import Extractor, Vocabulary
+from loopclosure.words.word_model import WordModel
+from netspec.data.database import open_reader
+from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
+from netspec.data.hdf5 import Hdf5Source
+from netspec.data.images import read_image, read_image_list
+from netspec.data.mean import read_mean, read_mean_option, write_mean
+from netspec.data.windows import read_window_file
+from netspec.errors import SpecError
+from netspec.graph.filter import with_state
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.net.weights import load_weights, save_weights
+from netspec.proto.schema import TEST
+from netspec.proto.text import parse_net_text
+from netspec.scores import Score, Scores, Snapshot, read_scores
+from netspec.solver.extra import Extra, Stamp, read_extra, write_extra
+from netspec.solver.snapshot import State, read_state, write_state
+
+NET = """
+name: "small"
+input: "data" input_dim: 1 input_dim: 2 input_dim: 5 input_dim: 5
+layer { name: "conv" type: "Convolution" bottom: "data" top: "conv"
+  convolution_param { num_output: 3 kernel_size: 3 weight_filler { type: "xavier" } } }
+layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip"
+  inner_product_param { num_output: 4 weight_filler { type: "xavier" } } }
+"""
+
+
+@dataclass(frozen=True)
+class Format:
+    """``write(path)`` writes a good file, ``read(path)`` reads it; ``path`` ends in ``suffix``.
+
+    Of a format whose file lies in a folder of its own, ``inside`` is its name there.
+    """
+
+    suffix: str
+    write: Callable[[Path], object]
+    read: Callable[[Path], object]
+    inside: str = ""
+
+
+@cache
+def net() -> Net:
+    message, source = parse_net_text(NET, "net.prototxt")
+    return build_net(with_state(message, TEST), source, BuildOptions(seed=0))
+
+
+def numbers(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).random(shape).astype(np.float32)
+
+
+def state(path: Path) -> None:
+    write_state(path, State(7, "x.caffemodel", 1, [numbers(3, 2), numbers(3)]))
+
+
+def extra(path: Path) -> None:
+    carried = {"0": {"iteration": 7}, "3": {"state": [{"shape": [1, 2], "float32": "AACAPwAAAEA="}]}}
+    write_extra(path, Extra(1, [0.5, 0.25], [carried, {}], Stamp(3, "ab"), Stamp(4, "cd")))
+
+
+def database(path: Path) -> None:
+    with lmdb.open(str(path), map_size=1 << 22, lock=False) as env, env.begin(write=True) as transaction:
+        for i in range(60):
+            picture = (255 * numbers(1, 8, 8)).astype(np.uint8) if i % 10 else np.zeros((3, 48, 48), np.uint8)
+            transaction.put(b"%08d" % i, array_to_datum(picture, i).SerializeToString())
+
+
+def all_records(path: Path) -> None:
+    reader = open_reader(str(path))
+    for i in range(len(reader)):
+        try:
+            datum_to_array(parse_datum(reader.record(i)))
+        except ValueError as fault:  # in the layer, with the name of the record
+            raise SpecError(str(fault)) from None
+
+
+def detector(path: Path, check: GeometricCheck | None = None) -> None:
+    made = LoopDetector(lambda image: image.ravel()[:8], check=check, threshold=0.0, exclude_recent=2)
+    for i in range(12):
+        picture = cv2.GaussianBlur((255 * np.random.default_rng(i % 5).random((40, 40, 3))).astype(np.uint8), (5, 5), 2)
+        made.add(picture, float(i), [i, 0, 0, 0, 0, 0, 1])
+    made.save(path)
+
+
+def go_on(path: Path) -> None:
+    made = LoopDetector.load(path, lambda image: image.ravel()[: made._frames.rows[0].size if len(made) else 8])
+    made.add(np.zeros((40, 40, 3), np.uint8), 1e9, [0, 0, 0, 0, 0, 0, 1])
+    made.save(path)
+
+
+def word_model(path: Path) -> None:
+    words = np.random.default_rng(0).integers(0, 3, (12, 6)).astype(np.int32)
+    vocabulary = Vocabulary(numbers(6, 128), Extractor(), "by hand")
+    WordModel(vocabulary, words, [Path(f"{i}.png") for i in range(12)], learn_tree(words)).save(path)
+
+
+def features(path: Path) -> None:
+    np.savez_compressed(
+        path, features=numbers(6, 5), names=np.array([f"{i}.png" for i in range(6)]), stamps=np.arange(6.0)
+    )
+
+
+def truth(path: Path) -> None:
+    scipy.io.savemat(path, {"truth": np.eye(6), "note": "synthetic", "more": np.arange(5.0)}, do_compression=True)
+
+
+def rows(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["data"], file["label"] = numbers(5, 2, 3), np.arange(5.0)
+        file.create_dataset("packed", data=numbers(40, 4), chunks=(8, 4), compression="gzip")
+
+
+def all_rows(path: Path) -> None:
+    listed = path.with_suffix(".txt")
+    listed.write_text(f"{path}\n")
+    for tops in (["data", "label"], ["packed"]):
+        source = Hdf5Source(str(listed), tops, 4, False, 0, "h5")
+        for i in range(3):
+            source.batch(i)
+
+
+def text(words: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(words)
+
+
+def picture(path: Path) -> None:
+    cv2.imwrite(str(path), (255 * numbers(24, 32, 3)).astype(np.uint8))
+
+
+def either_picture(path: Path) -> None:
+    for read in (lambda path: read_image(str(path)), read_bgr):
+        try:
+            read(path)
+        except ValueError:
+            continue
+
+
+POSES = "".join(f"{i}.5 {i} 0 1 0 0 0 1\n" for i in range(6))
+WINDOWS = "# 0\na.png\n3\n48\n64\n2\n4 0.9 0 0 20 20\n0 0.1 10 10 40 40\n# 1\nb.png\n3\n48\n64\n0\n"
+PARAM = SimpleNamespace(fg_threshold=0.5, bg_threshold=0.5, root_folder="")
+
+FORMATS = {
+    "caffemodel": Format(".caffemodel", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)),
+    "caffemodel.h5": Format(
+        ".caffemodel.h5", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)
+    ),
+    "solverstate": Format(".solverstate", state, read_state),
+    "solverstate.h5": Format(".solverstate.h5", state, read_state),
+    "solverstate.extra": Format(".extra", extra, lambda path: read_extra(path.with_suffix(""))),
+    "hdf5 data": Format(".h5", rows, all_rows),
+    "lmdb": Format("", database, all_records, inside="data.mdb"),
+    "mean": Format(
+        ".binaryproto", lambda path: write_mean(str(path), numbers(3, 4, 4)), lambda path: read_mean(str(path))
+    ),
+    "mean.npy": Format(".npy", lambda path: np.save(path, numbers(3, 4, 4)), lambda path: read_mean_option(str(path))),
+    "detector": Format(".npz", detector, go_on),
+    "detector with points": Format(".npz", lambda path: detector(path, GeometricCheck(min_inliers=8)), go_on),
+    "word model": Format(".npz", word_model, WordModel.load),
+    "features": Format(".npz", features, read_features),
+    "truth.mat": Format(".mat", truth, read_truth_matrix),
+    "truth.npy": Format(".npy", lambda path: np.save(path, np.eye(6)), read_truth_matrix),
+    "truth.txt": Format(".txt", lambda path: np.savetxt(path, np.eye(6), "%d"), read_truth_matrix),
+    "coordinates": Format(".txt", text("a.png 1 2\nb.png 3 4\n"), read_coordinates),
+    "groundtruth": Format(".txt", text("# stamp tx ty tz qx qy qz qw\n" + POSES), read_groundtruth),
+    "rgb.txt": Format(".txt", text("# stamps\n1.5 rgb/1.png\n2.5 rgb/2.png\n"), read_rgb_list),
+    "image list": Format(
+        ".txt", text("a.png 0\nb c.png 1\n# note\nd.png 2\n"), lambda path: read_image_list(str(path))
+    ),
+    "pair list": Format(".txt", text('# seed: 1\na.png b.png 1\n"c d.png" e.png 0\n'), read_pair_list),
+    "frame list": Format(".txt", text("a.png 1.5\nb.png 2.5\n"), list_images),
+    "window file": Format(
+        ".txt", text(WINDOWS), lambda path: read_window_file(SimpleNamespace(source=str(path), **vars(PARAM)), None)
+    ),
+    "scores": Format(
+        ".json",
+        lambda path: Scores([Score(1, 0, {"loss": [0.5]})], [Snapshot(1, "x.caffemodel")]).write(path),
+        read_scores,
+    ),
+    "png": Format(".png", picture, either_picture),
+    "jpeg": Format(".jpg", picture, either_picture),
+}

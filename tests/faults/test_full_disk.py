@@ -1,0 +1,141 @@
+"""No room, or no leave, to write: one line, and the old file is whole."""
+
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from faults.commands import CASES, Case, check_npz
+from netspec import whole_file
+from netspec.cli import main
+from netspec.proto.schema import NetParameter
+
+resource = pytest.importorskip("resource", reason="limits the size of files")
+pytestmark = pytest.mark.slow
+
+MOST = 1500  # bytes of a file; all that the commands write is larger
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """No file may become larger than a few bytes; the error is another one, its way is the same."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (MOST, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    return tmp_path
+
+
+def contents() -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_full_disk(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case = CASES[name]
+    case.prepare()
+    assert case.main(case.words) == 0
+    if name == "convert":
+        shutil.rmtree("out/db")
+    before = contents()
+    capsys.readouterr()
+    with full_disk():
+        assert case.main(case.words) == 1
+    *_, line = capsys.readouterr().err.strip().splitlines()
+    assert "File too large" in line or "No space left on device" in line  # LMDB has words of its own
+    assert contents() == before
+
+
+@pytest.mark.parametrize("name", ["extract", "similarity", "detect"])
+def test_a_folder_that_vanished(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case = CASES[name]
+    case.prepare()
+    Path("out").rmdir()
+    words = [word for word in case.words if name != "detect" or word not in ("--out", "out")]
+    words += ["--out", "loops"] if name == "detect" else []
+    assert case.main(words) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
+    assert "No such file or directory" in line
+
+
+def test_a_detector_resumed_and_saved_under_one_name(here: Path) -> None:
+    case: Case = CASES["detect"]
+    case.prepare()
+    assert case.main(case.words) == 0
+    before = check_npz("out/d.npz")
+    with full_disk():
+        assert case.main(["detect", "images", "--resume", "out/d.npz", "--save", "out/d.npz", "--out", "out"]) == 1
+    assert check_npz("out/d.npz") == before
+
+
+NET = """
+layer { name: "x" type: "DummyData" top: "x" top: "y" dummy_data_param { shape { dim: 8 dim: 90 } shape { dim: 8 } } }
+layer { name: "o" type: "HDF5Output" bottom: "x" bottom: "y" hdf5_output_param { file_name: "out/o.h5" } }
+"""
+
+
+@pytest.fixture
+def output_net(here: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """``output_net(command)``: run it on a net with HDF5Output, where there is an older file."""
+    Path("net.prototxt").write_text(NET)
+    Path("w.caffemodel").write_bytes(NetParameter(name="of no layer").SerializeToString())
+    with h5py.File("out/o.h5", "w") as file:
+        file["data"] = np.ones(3)
+    return lambda command: main(f"{command} --model net.prototxt --iterations 3".split())
+
+
+def test_results_in_hdf5_on_a_full_disk(output_net: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents()
+    with full_disk():
+        assert output_net("test --weights w.caffemodel") == 1
+    assert 'HDF5 file "out/o.h5" cannot be written: File too large' in capsys.readouterr().err.splitlines()[-1]
+    assert contents() == before
+    assert output_net("test --weights w.caffemodel") == 0
+    with h5py.File("out/o.h5") as file:
+        assert {name: np.asarray(file[name]).shape for name in file} == {"data": (24, 90, 1, 1), "label": (24, 1, 1, 1)}
+
+
+def test_nothing_is_written_by_a_net_that_is_only_timed_or_checked(output_net: Callable[..., int]) -> None:
+    before = contents()
+    assert output_net("time") == 0
+    assert main(["check", "net.prototxt", "--data"]) == 0
+    assert contents() == before
+
+
+def test_two_trainings_on_one_prefix(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case = CASES["train"]
+    case.prepare()
+    with whole_file.only_one("out/x.lock", ""):
+        assert case.main(case.words) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("out/x.lock: is held by another run")
+    assert line.endswith('give each training a snapshot_prefix of its own, not "out/x" to both')
+    assert not contents()
+    assert case.main(case.words) == 0
+    assert not Path("out/x.lock").exists()
+
+
+def test_snapshots_over_2_gib_are_refused_at_the_start(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case = CASES["train"]
+    case.prepare()
+    monkeypatch.setattr(sys.modules["netspec.solver.solver"], "MOST_BYTES", 1000)
+    assert case.main(case.words) == 1
+    assert "a binary file; set snapshot_format: HDF5" in capsys.readouterr().err.splitlines()[-1]
+    with Path("solver.prototxt").open("a") as file:
+        file.write("snapshot_format: HDF5\n")
+    assert case.main(case.words) == 0

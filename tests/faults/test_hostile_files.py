@@ -1,0 +1,239 @@
+"""Files that lie: about their size, about where their contents are, about what they are."""
+
+import io
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+import zlib
+from pathlib import Path
+
+import cv2
+import h5py
+import lmdb
+import numpy as np
+import pytest
+
+from faults.formats import all_records, all_rows, net
+from loopclosure.descriptors.feature_file import read_features
+from loopclosure.errors import InputError
+from loopclosure.places.frames import read_bgr
+from loopclosure.places.masks import read_truth_matrix
+from netspec.data.database import Writer, open_reader
+from netspec.data.images import read_image
+from netspec.data.mean import read_mean_option
+from netspec.errors import SpecError
+from netspec.features.images import _read as read_for_features
+from netspec.net.weights import load_weights
+from netspec.solver.snapshot import read_state
+from paths import ROOT
+
+HUGE = (1 << 20, 1 << 20)
+
+
+def lying_header() -> bytes:
+    """An .npy file that announces terabytes."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": HUGE})
+    return stream.getvalue() + bytes(100)
+
+
+def test_an_npy_that_announces_too_much(tmp_path: Path) -> None:
+    (tmp_path / "x.npy").write_bytes(lying_header())
+    with pytest.raises(InputError, match=r"shape \(1048576, 1048576\), float32, in"):
+        read_truth_matrix(tmp_path / "x.npy")
+    with pytest.raises(SpecError, match="cannot be read as an array"):
+        read_mean_option(str(tmp_path / "x.npy"))
+
+
+def test_an_npz_that_announces_too_much(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("features.npy", lying_header())
+    with pytest.raises(InputError, match=r"shape \(1048576, 1048576\), float32, in"):
+        read_features(tmp_path / "x.npz")
+
+
+def test_an_npz_that_unpacks_to_too_much(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "x.npz", features=np.zeros((70, 1 << 20), np.float32))
+    with pytest.raises(InputError, match=r"would take 280 MiB of memory, in a file of \d+ bytes"):
+        read_features(tmp_path / "x.npz")
+
+
+def test_an_npz_with_python_objects(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", features=np.array([{"a": 1}], object))
+    with pytest.raises(InputError, match="Python objects"):
+        read_features(tmp_path / "x.npz")
+
+
+def test_an_hdf5_file_that_announces_too_much(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file.create_dataset("data", HUGE, np.float32, chunks=(1024, 1024), compression="gzip")
+        file["label"] = np.zeros(3)
+    with pytest.raises(
+        SpecError, match=r"dataset /data would take 4 TiB of memory, in a file of .* KiB; it is not read"
+    ):
+        all_rows(tmp_path / "x.h5")
+
+
+@pytest.mark.parametrize("kind", ["link", "soft link", "stored", "virtual"])
+def test_an_hdf5_file_that_shows_what_lies_in_another(kind: str, tmp_path: Path) -> None:
+    """The other file is not read: its contents would come out of ``extract``, or of a snapshot."""
+    secret = tmp_path / "secret"
+    with h5py.File(secret, "w") as file:
+        file["data"] = np.arange(24.0).reshape(4, 6)
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["label"] = np.zeros(4)
+        if kind == "link":
+            file["data"] = h5py.ExternalLink(str(secret), "data")
+        elif kind == "soft link":
+            file["other"] = h5py.ExternalLink(str(secret), "/")
+            file["data"] = h5py.SoftLink("/other/data")
+        elif kind == "stored":
+            file.create_dataset("data", (4, 6), np.float32, external=[(str(secret), 0, 96)])
+        else:
+            layout = h5py.VirtualLayout((4, 6), np.float64)
+            layout[:] = h5py.VirtualSource(str(secret), "data", (4, 6))
+            file.create_virtual_dataset("data", layout)
+    with pytest.raises(SpecError, match="which is not read"):
+        all_rows(tmp_path / "x.h5")
+
+
+def test_weights_and_states_that_link_elsewhere(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "secret", "w") as file:
+        file["0"] = np.zeros((3, 2, 3, 3), np.float32)
+    with h5py.File(tmp_path / "w.caffemodel.h5", "w") as file:
+        file.create_group("data")["conv"] = h5py.ExternalLink("secret", "/")
+    with pytest.raises(SpecError, match=r'/data/conv is a link to "secret", which is not read'):
+        load_weights(net(), tmp_path / "w.caffemodel.h5")
+    with h5py.File(tmp_path / "x.solverstate.h5", "w") as file:
+        file["iter"], file["current_step"] = [1], [0]
+        file["history"] = h5py.ExternalLink("secret", "/")
+    with pytest.raises(SpecError, match=r'/history is a link to "secret", which is not read'):
+        read_state(tmp_path / "x.solverstate.h5")
+
+
+def test_a_group_that_contains_itself(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "w.caffemodel.h5", "w") as file:
+        file.create_group("data/a")
+        file["data/a/b"] = file["data"]
+    with pytest.raises(SpecError, match="contains itself"):
+        load_weights(net(), tmp_path / "w.caffemodel.h5")
+
+
+def test_links_within_a_file_are_followed(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["rows/data"], file["label"], file["packed"] = np.ones((5, 2, 3)), np.zeros(5), np.zeros((5, 4))
+        file["data"] = h5py.SoftLink("/rows/data")
+    all_rows(tmp_path / "x.h5")
+
+
+def bomb(side: int) -> bytes:
+    """A black PNG of 1 bit per pixel, packed a thousand times; in color it has 24 times as many bytes."""
+    header = b"IHDR" + side.to_bytes(4, "big") * 2 + b"\x01\x00\x00\x00\x00"
+    body = b"IDAT" + zlib.compress(bytes(side * (side // 8 + 1)))
+    parts = (header, body, b"IEND")
+    chunks = (len(part[4:]).to_bytes(4, "big") + part + zlib.crc32(part).to_bytes(4, "big") for part in parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+READ = """
+import resource, sys
+from {module} import {function} as read
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    read("x.png")
+except ValueError as fault:
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024, fault)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="measures memory in Linux's unit")
+@pytest.mark.parametrize(
+    ("module", "function"), [("netspec.data.images", "read_image"), ("loopclosure.places.frames", "read_bgr")]
+)
+def test_an_image_that_unpacks_to_too_much(module: str, function: str, tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_bytes(bomb(20_000))
+    code = READ.format(module=module, function=function)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment.pop("OPENCV_IO_MAX_IMAGE_PIXELS", None)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    mebibytes, _, said = done.stdout.partition(" ")
+    assert int(mebibytes) < 100
+    assert "image" in said
+
+
+def test_a_cut_jpeg_is_accepted_by_nobody(tmp_path: Path) -> None:
+    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (60, 80, 3)).astype(np.uint8), (5, 5), 2)
+    data = cv2.imencode(".jpg", picture)[1].tobytes()
+    path = tmp_path / "x.jpg"
+    for size in range(0, len(data) - 2, 97):
+        path.write_bytes(data[:size])
+        with pytest.raises(ValueError, match="image"):
+            read_image(str(path))
+        with pytest.raises(SpecError, match="image"):
+            read_for_features(path, 3)
+        with pytest.raises(InputError, match="image"):
+            read_bgr(path)
+
+
+# LMDB
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_any_lmdb_is_read_as_the_library_reads_it(seed: int, tmp_path: Path) -> None:
+    """Records of all sizes, written over, deleted, in several transactions."""
+    draw = np.random.default_rng(seed)
+    with lmdb.open(str(tmp_path / "db"), map_size=1 << 26, lock=False) as env:
+        for _ in range(6):
+            with env.begin(write=True) as transaction:
+                for _ in range(150):
+                    key = b"%d" % draw.integers(0, 400) * int(draw.integers(1, 40))
+                    if draw.random() < 0.2:
+                        transaction.delete(key)
+                    else:
+                        transaction.put(key, draw.bytes(int(draw.choice([0, 1, 30, 900, 3000, 9000, 70_000]))))
+        with env.begin() as transaction:
+            expected = list(transaction.cursor())
+    reader = open_reader(str(tmp_path / "db"))
+    assert [(reader.key(i), reader.record(i)) for i in range(len(reader))] == expected
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Path:
+    with Writer(str(tmp_path / "db")) as writer:
+        for i in range(300):
+            writer.put(b"%08d" % i, bytes([i % 256]) * (20 + 50 * (i % 90)))
+    return tmp_path / "db"
+
+
+def test_a_database_that_was_cut(database: Path, tmp_path: Path) -> None:
+    data = (database / "data.mdb").read_bytes()
+    (tmp_path / "cut").mkdir()
+    for size in range(len(data) - 1, 0, -4099):
+        (tmp_path / "cut" / "data.mdb").write_bytes(data[:size])
+        with pytest.raises(SpecError, match=r"truncated|damaged|not an LMDB"):
+            all_records(tmp_path / "cut")
+
+
+@pytest.mark.parametrize("change", ["cut", "emptied", "rewritten"])
+def test_a_database_that_is_changed_while_it_is_read(change: str, database: Path) -> None:
+    reader = open_reader(str(database))
+    reader.record(0)
+    data = database / "data.mdb"
+    if change == "rewritten":
+        with lmdb.open(str(database), lock=False, map_size=1 << 24) as env, env.begin(write=True) as transaction:
+            transaction.put(b"%08d" % 7, b"new")
+        os.utime(data, (1, 1))  # clocks of file systems are coarse
+    else:
+        os.truncate(data, data.stat().st_size // 2 if change == "cut" else 0)
+    with pytest.raises(SpecError, match="by another program while it was read"):
+        reader.record(299)
+
+
+def test_a_database_that_is_replaced_is_still_read(database: Path) -> None:
+    reader = open_reader(str(database))
+    shutil.rmtree(database)
+    assert reader.record(299)[:1] == bytes([299 % 256])

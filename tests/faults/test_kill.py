@@ -1,0 +1,17 @@
+"""The script that kills commands, in small."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
+def test_nothing_is_lost_by_killing(tmp_path: Path) -> None:
+    command = [sys.executable, Path(__file__).with_name("kill.py"), "--kills", "4"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("0 broken or lost, 0 orphans, 0 leftovers") == 6

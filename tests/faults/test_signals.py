@@ -1,0 +1,94 @@
+"""What SIGTERM and a second signal do to any command, of netspec and of loopclosure."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+
+pytestmark = pytest.mark.slow
+
+CODE = """
+import argparse, sys, time
+from {module} import Commands, run
+
+def endless(arguments):
+    try:
+        print("begun", flush=True)
+        while True:
+            time.sleep(0.01)
+    finally:
+        print("ending", flush=True)
+        time.sleep({cleaning})
+
+parser = argparse.ArgumentParser()
+Commands(parser).add("endless", endless, "")
+sys.exit(run(parser, ["endless"]))
+"""
+MODULES = ("netspec.command_line", "loopclosure.cli.run")
+
+
+def start(module: str, cleaning: int) -> subprocess.Popen[str]:
+    code = CODE.format(module=module, cleaning=cleaning)
+    environment, pipe = {**os.environ, "PYTHONPATH": str(ROOT)}, subprocess.PIPE
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=pipe, stderr=pipe, text=True, env=environment)
+    assert line_of(process) == "begun"
+    return process
+
+
+def line_of(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_line_and_status_130(module: str, number: int) -> None:
+    process = start(module, cleaning=0)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=30)
+    assert (process.returncode, said) == (130, "interrupted\n")
+
+
+@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_one_ends_at_once(module: str, number: int) -> None:
+    process = start(module, cleaning=60)
+    process.send_signal(signal.SIGINT)
+    assert line_of(process) == "ending"
+    process.send_signal(number)
+    assert process.wait(10) == 130
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks for processes in /proc")
+def test_the_processes_that_read_images_end_with_a_killed_writer(tmp_path: Path) -> None:
+    code = (
+        "import os, sys, time\n"
+        "from lmdb_build.databases import _Workers\n"
+        "with _Workers(3) as workers:\n"
+        "    print(*[worker.pid for worker in workers._pool._processes.values()], flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
+    workers = line_of(process).split()
+    assert len(workers) == 3
+    process.kill()
+    process.wait()
+    for _ in range(500):
+        alive = [number for number in workers if _is_alive(number)]
+        if not alive:
+            return
+        signal.sigtimedwait([], 0.02)
+    pytest.fail(f"{alive} are still alive")
+
+
+def _is_alive(number: str) -> bool:
+    try:
+        return Path("/proc", number, "stat").read_text().split()[2] not in "ZX"
+    except OSError:
+        return False

@@ -1,0 +1,278 @@
+"""A training that is resumed goes on as if it had never stopped: same weights, same log, to the last bit."""
+
+import json
+import logging
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from netspec.cli import main
+from netspec.data.database import Writer
+from netspec.data.datum import array_to_datum
+from netspec.errors import SpecError
+from netspec.solver.extra import newest_pair, path_beside, read_extra
+from netspec.solver.snapshot import State, read_state, write_state
+from netspec.solver.solver import Solver, load_solver
+from netspec.solver.update import RULES
+
+pytestmark = pytest.mark.slow
+
+SIDE = 10
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """37 images, as a database and as files in a list: no batch size divides their number."""
+    monkeypatch.chdir(tmp_path)
+    draw = np.random.default_rng(0)
+    Path("images").mkdir()
+    lines = []
+    with Writer("db") as writer:
+        for i in range(37):
+            picture = draw.integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)
+            cv2.imwrite(f"images/{i}.png", picture)
+            lines.append(f"images/{i}.png {i % 4}")
+            writer.put(b"%08d" % i, array_to_datum(picture.transpose(2, 0, 1), i % 4).SerializeToString())
+    Path("list.txt").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+DATA = (
+    'layer { name: "data" type: "Data" top: "data" top: "label" data_param { source: "db" batch_size: 8 backend: LMDB }'
+)
+CROP = DATA + "transform_param { crop_size: 7 mirror: true scale: 0.01 } }"
+LIST = """layer { name: "data" type: "ImageData" top: "data" top: "label" transform_param { scale: 0.01 }
+  image_data_param { source: "list.txt" batch_size: 8 shuffle: true } }"""
+DUMMY = """layer { name: "data" type: "DummyData" top: "data" top: "label" dummy_data_param {
+  shape { dim: 8 dim: 12 } shape { dim: 8 } data_filler { type: "gaussian" } data_filler { type: "constant" } } }"""
+CLASSIFY = """layer { name: "ip" type: "InnerProduct" bottom: "{bottom}" top: "ip"
+  inner_product_param { num_output: 4 weight_filler { type: "xavier" } } }
+layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" }"""
+DROPOUT = 'layer { name: "drop" type: "Dropout" bottom: "data" top: "drop" }'
+LSTM = """layer { name: "x" type: "DummyData" top: "x" top: "cont" top: "label" dummy_data_param {
+  shape { dim: 3 dim: 2 dim: 5 } shape { dim: 3 dim: 2 } shape { dim: 3 dim: 2 }
+  data_filler { type: "gaussian" } data_filler { type: "constant" value: 1 } data_filler { type: "constant" } } }
+layer { name: "data" type: "LSTM" bottom: "x" bottom: "cont" top: "data"
+  recurrent_param { num_output: 6 weight_filler { type: "gaussian" std: 0.3 } } }
+layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip"
+  inner_product_param { num_output: 4 axis: 2 weight_filler { type: "xavier" } } }
+layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" softmax_param { axis: 2 } }"""
+POOL = """layer { name: "pool" type: "Pooling" bottom: "data" top: "pool"
+  pooling_param { pool: STOCHASTIC kernel_size: 2 stride: 2 } }"""
+
+
+def classify(bottom: str = "data") -> str:
+    return CLASSIFY.replace("{bottom}", bottom)
+
+
+NETS = {
+    "batches of 8 of 37": DATA + "transform_param { scale: 0.01 } }" + classify(),
+    "crop and mirror": CROP + classify(),
+    "shuffled ImageData": LIST + classify(),
+    "Dropout": CROP + DROPOUT + classify("drop"),
+    "filler at run time": DUMMY + classify(),
+    "LSTM": LSTM,
+    "stochastic pooling": CROP + POOL + classify("pool"),
+}
+SOLVER = """net: "net.prototxt" base_lr: 0.05 lr_policy: "step" gamma: 0.5 stepsize: 4 max_iter: 13 display: 1
+average_loss: 4 test_iter: 2 test_interval: 4 snapshot_prefix: "x" solver_mode: CPU weight_decay: 0.001
+snapshot_after_train: false
+"""
+
+
+def write(net: str, more: str = "momentum: 0.9", solver: str = SOLVER) -> None:
+    Path("net.prototxt").write_text(net)
+    Path("solver.prototxt").write_text(solver + more)
+
+
+def said(caplog: pytest.LogCaptureFixture, after: int) -> list[str]:
+    """The losses, rates and scores from an iteration on, without times."""
+    lines = [record.getMessage() for record in caplog.records]
+    (start,) = [i for i, line in enumerate(lines) if line.startswith(f"Iteration {after} (") or line == "resumed"][-1:]
+    return [
+        line.partition(" (")[0] + line.partition("),")[2] for line in lines[start:] if "loss" in line or "lr" in line
+    ]
+
+
+def straight_and_resumed(caplog: pytest.LogCaptureFixture, at: int = 6) -> tuple[Solver, Solver, list[str], list[str]]:
+    caplog.set_level(logging.INFO, "netspec")
+    straight = load_solver("solver.prototxt")
+    straight.param.snapshot = at
+    straight.solve()
+    log = said(caplog, at)
+    caplog.clear()
+    resumed = load_solver("solver.prototxt", snapshot=f"x_iter_{at}.solverstate")
+    assert resumed.iteration == at
+    resumed.solve()
+    return straight, resumed, log, said(caplog, at)
+
+
+def assert_same(straight: Solver, resumed: Solver) -> None:
+    for mine, theirs in zip(straight.net.learnable, resumed.net.learnable, strict=True):
+        assert mine.parameter.equal(theirs.parameter)
+    for mine, theirs in zip(straight.history, resumed.history, strict=True):
+        assert mine.equal(theirs)
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_to_the_bit(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    write(NETS[name])
+    straight, resumed, log, log_after = straight_and_resumed(caplog)
+    assert_same(straight, resumed)
+    assert log_after == log
+    assert len(log) > 20
+    assert straight.scores == resumed.scores
+
+
+@pytest.mark.parametrize("kind", RULES)
+@pytest.mark.parametrize("form", ["BINARYPROTO", "HDF5"])
+def test_every_solver_and_form(kind: str, form: str) -> None:
+    momentum = "momentum: 0.9" if RULES[kind].momentum else ""
+    write(NETS["Dropout"], f'type: "{kind}" {momentum} iter_size: 2 snapshot_format: {form}')
+    straight = load_solver("solver.prototxt")
+    straight.step(5)
+    _, state = straight.snapshot()
+    straight.step(5)
+    resumed = load_solver("solver.prototxt", snapshot=state)
+    resumed.step(5)
+    assert_same(straight, resumed)
+
+
+def test_a_snapshot_during_a_test_resumes_before_that_test() -> None:
+    write(NETS["batches of 8 of 37"])
+    asked: list[str | None] = []
+
+    def action() -> str | None:
+        asked.append("snapshot" if training.iteration == 4 and len(asked) == 6 else None)
+        return asked[-1]
+
+    training = load_solver("solver.prototxt", action=action)
+    training.step(7)
+    assert "snapshot" in asked
+    resumed = load_solver("solver.prototxt", snapshot="x_iter_4.solverstate")
+    resumed.step(3)
+    assert resumed.scores == training.scores
+    assert_same(training, resumed)
+
+
+def test_the_state_is_caffes_byte_for_byte_and_the_rest_is_beside_it() -> None:
+    write(NETS["crop and mirror"])
+    solver = load_solver("solver.prototxt")
+    solver.step(2)
+    model, state = solver.snapshot()
+    write_state("again", State(2, model, 0, [values.numpy() for values in solver.history]))
+    assert Path("again").read_bytes() == Path(state).read_bytes()
+    found = json.loads(Path("x_iter_2.solverstate.extra").read_text())
+    assert found["nets"][0] == {"0": {"iteration": 2}}
+
+
+def test_without_the_file_a_state_resumes_as_caffe_does(caplog: pytest.LogCaptureFixture) -> None:
+    write(NETS["batches of 8 of 37"])
+    solver = load_solver("solver.prototxt")
+    solver.step(2)
+    _, state = solver.snapshot()
+    path_beside(state).unlink()
+    caplog.set_level(logging.INFO, "netspec")
+    resumed = load_solver("solver.prototxt", snapshot=state)
+    assert "is Caffe's: the data starts again at its first record" in caplog.text
+    assert [layer.iteration for layer in resumed.net.layers if hasattr(layer, "iteration")] == [0]
+
+
+def test_another_random_seed_is_said(warnings: Callable[[], list[str]]) -> None:
+    write(NETS["crop and mirror"], "random_seed: 3")
+    solver = load_solver("solver.prototxt")
+    _, state = solver.snapshot()
+    write(NETS["crop and mirror"], "random_seed: 4")
+    load_solver("solver.prototxt", snapshot=state)
+    assert warnings() == [f"{state}.extra: random_seed was 3: the random numbers are others from here on"]
+
+
+# What is refused
+
+
+@pytest.fixture
+def state() -> Path:
+    write(NETS["batches of 8 of 37"])
+    solver = load_solver("solver.prototxt")
+    solver.step(1)
+    return Path(solver.snapshot()[1])
+
+
+def refused(state: Path, message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        load_solver("solver.prototxt", snapshot=state)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"iteration": -1}, "found iter -1, expected at least 0"),
+        ({"current_step": -1}, "found current_step -1, expected at least 0"),
+        ({"learned_net": ""}, "names no weights to resume with"),
+        ({"learned_net": "gone.caffemodel"}, "its weights are neither at gone.caffemodel nor at"),
+        ({"history": [np.full((4, 300), np.nan, np.float32), np.zeros(4, np.float32)]}, "history blob 0 has a NaN"),
+    ],
+)
+def test_a_state_that_no_training_was_in(state: Path, change: dict, message: str) -> None:
+    whole = read_state(state)
+    path_beside(state).unlink()
+    write_state(state, State(**{**vars(whole), **change}))
+    refused(state, message)
+
+
+def test_weights_that_are_cut_at_the_border_of_a_layer(state: Path) -> None:
+    """Protobuf reads them without a word; the file beside the state knows what was written."""
+    weights = state.with_suffix(".caffemodel")
+    data = weights.read_bytes()
+    weights.write_bytes(data[: data.rindex(b"loss") - 4])
+    refused(state, r"x_iter_1.caffemodel: is not the file that was written with x_iter_1.solverstate.extra")
+
+
+def test_the_weights_of_another_net(state: Path) -> None:
+    path_beside(state).unlink()
+    write(NETS["batches of 8 of 37"].replace('"ip"', '"other"'))
+    refused(state, r"x_iter_1.caffemodel: holds weights for none of the net's 1 layers")
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": 2}', '{"format": 1, "seed": "x"}'])
+def test_a_damaged_file_beside_a_state(state: Path, text: str) -> None:
+    path_beside(state).write_text(text)
+    refused(state, r"x_iter_1.solverstate.extra: is damaged .*; without it the training resumes as Caffe's")
+
+
+def test_the_weights_beside_a_state_go_before_those_of_the_same_name_elsewhere(state: Path) -> None:
+    Path("backup").mkdir()
+    for path in Path().glob("x_iter_1*"):
+        shutil.copy(path, "backup")
+    expected = load_solver("solver.prototxt", snapshot=state).net.learnable[0].parameter.clone()
+    other = load_solver("solver.prototxt")
+    other.step(1)
+    other.snapshot()
+    resumed = load_solver("solver.prototxt", snapshot="backup/x_iter_1.solverstate")
+    assert resumed.net.learnable[0].parameter.equal(expected)
+
+
+# --resume
+
+
+def test_resume_finds_the_newest_whole_pair(
+    warnings: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
+) -> None:
+    write(NETS["crop and mirror"], "snapshot: 5")
+    assert main(["train", "solver.prototxt"]) == 0
+    expected = Path("x_iter_10.caffemodel").read_bytes()
+    Path("x_iter_11.solverstate").write_bytes(b"half a st")
+    Path("x_iter_10.caffemodel").write_bytes(expected[:-9])
+    assert newest_pair("x") == Path("x_iter_5.solverstate")
+    assert [line.partition(": x")[0] for line in warnings()] == ["passed over"] * 2
+    assert main(["train", "solver.prototxt", "--resume"]) == 0
+    assert Path("x_iter_10.caffemodel").read_bytes() == expected
+    for path in Path().glob("x_iter*"):
+        path.unlink()
+    assert main(["train", "solver.prototxt", "--resume"]) == 0
+    assert read_extra("x_iter_10.solverstate") is not None
+    assert main(["train", "solver.prototxt", "--resume", "--snapshot", "x_iter_5.solverstate"]) == 2
