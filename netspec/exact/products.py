@@ -356,7 +356,9 @@ class SummedProducts(ParameterSums):
         vectors = vectors.to(weight.dtype) if few else vectors
         ParameterSums.keep(ctx, vectors, (weight, bias), in_place)
         ctx.transposed = transposed
-        with torch.autocast(weight.device.type, enabled=False) if few else nullcontext():
+        kind = weight.device.type
+        autocast = few and kind in ("cpu", "cuda") and torch.is_autocast_enabled(kind)
+        with torch.autocast(kind, enabled=False) if autocast else nullcontext():
             return F.linear(vectors, weight.t() if transposed else weight, bias)
 
     @staticmethod

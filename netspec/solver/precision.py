@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -30,7 +30,7 @@ def computing(precision: str, device: torch.device) -> Iterator[None]:
     try:
         for library in cuda:
             library.allow_tf32 = precision == TF32
-        with torch.autocast(device.type, torch.bfloat16, enabled=precision == BF16):
+        with torch.autocast(device.type, torch.bfloat16) if precision == BF16 else nullcontext():
             yield
     finally:
         for library, allowed in zip(cuda, before, strict=True):
