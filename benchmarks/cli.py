@@ -45,6 +45,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--batch", type=int, default=32, help="items of a batch (default: 32)")
     p.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
     p.add_argument("--rounds", type=int, default=7, help="default: 7")
+    p = commands.add("growth", _growth, "time building and running nets of more and more layers")
+    p.add_argument("--layers", type=int, nargs="+", default=[125, 250, 500, 1000, 2000], metavar="N")
     commands.add("list", _list, "list the nets of the catalogue")
     return made
 
@@ -101,6 +103,12 @@ def _waiting(arguments: argparse.Namespace) -> None:
 
     for name in arguments.nets:
         compare(name, arguments.waits, arguments.batch, arguments.threads, arguments.rounds)
+
+
+def _growth(arguments: argparse.Namespace) -> None:
+    from benchmarks.growth import table
+
+    print(table(arguments.layers))
 
 
 def _start(arguments: argparse.Namespace) -> None:

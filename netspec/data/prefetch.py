@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,9 +25,17 @@ class Feed(Generic[T]):
         self._pool: ThreadPoolExecutor | None = None
         self._pending: deque[Future[T]] = deque()
         self.position = 0  #: the iteration whose batch comes next
+        self.waited = 0.0  #: how many seconds calls of ``next`` have taken
 
     def next(self) -> T:
         """Return the batch at ``position``, and go to the next."""
+        start = time.perf_counter()
+        try:
+            return self._next()
+        finally:
+            self.waited += time.perf_counter() - start
+
+    def _next(self) -> T:
         position = self.position
         self.position += 1
         if not self._ahead:

@@ -44,6 +44,7 @@ class DetectionEvaluate(Layer):
     counted_axis = 2
     not_exported = "it compares with true boxes"
     gathers = True
+    remembers = True  # which image comes next
     solver_reads = frozenset({"eval_type", "ap_version", "show_per_class_result"})
 
     @override

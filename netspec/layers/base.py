@@ -240,6 +240,11 @@ class Layer(torch.nn.Module):
         """Return, by top, what is written when the layer is made and never again; empty where there is no such top."""
         return ()
 
+    @property
+    def waited(self) -> float:
+        """How many seconds forward passes have waited for records."""
+        return 0.0
+
     def restart(self) -> None:
         """Return to the first record, where the layer reads any."""
 

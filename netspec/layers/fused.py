@@ -7,6 +7,7 @@ functions do the same.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -46,8 +47,8 @@ def convolution(
     """Return a convolution by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
     geometry = [list(pad), list(stride), list(dilation), group]
     side_by_side = torch.channels_last
-    weight = how.memo(f"weight {geometry}", lambda: _laid_out(values_of(weight), geometry))
-    bias = None if bias is None else how.memo("bias", lambda: values_of(bias).clone())
+    weight = how.memo(f"filters {tuple(weight.shape)} {geometry}", lambda: _laid_out(values_of(weight), geometry))
+    bias = _kept(bias, how)
     call, relu = _ops()._convolution_pointwise.default, how.finish is F.relu_
     arguments = (*geometry, "relu" if relu else "none", [], "")
 
@@ -71,8 +72,10 @@ def deconvolution(
     """
     geometry = [list(pad), [0, 0], list(stride), list(dilation), 1]
     lay_out, call = _ops()._reorder_convolution_transpose_weight, _ops()._convolution_transpose_pointwise.default
-    weight = how.memo(f"transposed {geometry}", lambda: lay_out(values_of(weight).contiguous(), *geometry, []))
-    bias = None if bias is None else how.memo("bias", lambda: values_of(bias).clone())
+    weight = how.memo(
+        f"spread {tuple(weight.shape)} {geometry}", lambda: lay_out(values_of(weight).contiguous(), *geometry, [])
+    )
+    bias = _kept(bias, how)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *geometry, "none", [], "")
@@ -99,7 +102,8 @@ def spread_by_channel(
     frame = frame.detach().contiguous(memory_format=torch.channels_last)
     pixels = frame[:, :, ::down, ::across]
     frames = [d * (k - 1) - p for k, d, p in zip(weight.shape[2:], dilation, pad, strict=True)]
-    convolve = convolution(values_of(weight).flip(2, 3), bias, (1, 1), frames, dilation, channels, how)
+    turned = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
+    convolve = convolution(values_of(weight).flip(2, 3), bias, (1, 1), frames, dilation, channels, turned)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         pixels.copy_(maps)
@@ -108,14 +112,19 @@ def spread_by_channel(
     return kernel
 
 
+def _kept(bias: torch.Tensor | None, how: Preparation) -> torch.Tensor | None:
+    return None if bias is None else how.memo("bias", values_of(bias).clone)
+
+
 def _laid_out(weight: torch.Tensor, geometry: Sequence[Any]) -> torch.Tensor:
     return _ops()._reorder_convolution_weight(weight.contiguous(), *geometry, [])
 
 
 def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernel:
     """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
-    weight = how.memo("weight", lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
-    bias = None if bias is None else how.memo("bias", lambda: values_of(bias).clone())
+    name = f"rows {tuple(weight.shape)} {weight.stride()}"  # of a shared matrix one layer may take the transpose
+    weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
+    bias = _kept(bias, how)
     call, relu = _ops()._linear_pointwise.default, how.finish is F.relu_
     arguments = ("relu" if relu else "none", [], "")
     return finished(lambda vectors: call(vectors, weight, bias, *arguments), None if relu else how.finish)

@@ -172,7 +172,7 @@ class Programs:
         def memo(name: str, make: Callable[[], Any]) -> Any:
             uses.append(name)
             stamps = tuple(stamp(blob) for blob in blobs)
-            key = (name, *map(id, blobs))
+            key = (name, step.node if step.chain else -1, *map(id, blobs))  # layers that share blobs share this too
             if self._memos.get(key, (None,))[0] != stamps:
                 self._memos[key] = stamps, make()
             return self._memos[key][1]

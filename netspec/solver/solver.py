@@ -190,6 +190,7 @@ class Solver:
         self._last_snapshot = ""
         self._states_before_test: list[dict[str, Any]] = []
         self._displayed = (clock(), 0)
+        self._waited = 0.0
         rule = update.find_rule(param.type)
         assert rule is not None, "check_settings refuses unknown types"
         self._rule = rule
@@ -303,6 +304,7 @@ class Solver:
         self._losses.extend(self._losses_before)
         self._losses_before = []
         self._displayed = (self.clock(), self.iteration)
+        self._waited = self._seconds_waited()
         for _ in range(iterations):
             if self._is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
                 self.test_all()
@@ -421,8 +423,16 @@ class Solver:
         speed = (self.iteration - iteration) / (now - then or 1)
         pace = f"{log.number(speed)} iter/s, {log.number(now - then)}s/{self.param.display} iters"
         log.info("solver.cpp:239", f"Iteration {self.iteration} ({pace}), loss = {log.number(self.loss)}")
-        self._displayed = (now, self.iteration)
         _log_scores("solver.cpp:258", "Train", as_scores(outputs), self.net.output_loss_weights)
+        if any(layer.reads_data for layer in self.net.layers):
+            waited = self._seconds_waited()
+            share = 100 * (waited - self._waited) / (now - then or 1)
+            log.info("blocking_queue.cpp:49", f"Waiting for data: {share:.1f} % of the time")
+            self._waited = waited
+        self._displayed = (now, self.iteration)
+
+    def _seconds_waited(self) -> float:
+        return sum(layer.waited for layer in self.net.layers)
 
     # Testing
 

@@ -124,6 +124,13 @@ def test_an_environment_that_cannot_be_installed_is_a_fault(
 
 
 @pytest.mark.slow
+def test_growth_builds_and_runs_nets_of_a_thousand_layers(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["growth", "--layers", "17", "1002"]) == 0
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["| 17", "| 1002"]
+
+
+@pytest.mark.slow
 def test_starts_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("onnxruntime")
     out = tmp_path / "start.json"

@@ -127,6 +127,11 @@ class ReadingLayer(Layer):
         """The iteration whose batch the next forward pass returns."""
         return self._feed.position if self._feed else 0
 
+    @property
+    @override
+    def waited(self) -> float:
+        return self._feed.waited if self._feed else 0.0
+
     def keys(self, iteration: int) -> list[str]:
         """Return the keys (or file names) of the records of an iteration, one per row of the tops."""
         return self.source.keys(iteration)

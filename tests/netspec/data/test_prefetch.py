@@ -24,6 +24,14 @@ def test_batches_come_in_order_however_many_threads_make_them(ahead: int, worker
     feed.close()
 
 
+@pytest.mark.parametrize("ahead", [0, 2])
+def test_a_feed_counts_the_time_for_which_it_was_waited_for(ahead: int) -> None:
+    feed = Feed(lambda i: time.sleep(0.05), ahead, workers=1)
+    feed.next()
+    assert feed.waited >= 0.05
+    feed.close()
+
+
 def test_batches_are_made_ahead_but_not_far() -> None:
     made: list[int] = []
     feed = Feed(made.append, ahead=3, workers=1)

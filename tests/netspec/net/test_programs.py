@@ -295,6 +295,19 @@ def test_inference_mode_and_no_grad_may_take_turns(net_of: Callable[..., Net]) -
             assert_same(net(data=images()), expected)
 
 
+def test_layers_that_share_weights_each_lay_them_out_for_themselves(net_of: Callable[..., Net]) -> None:
+    text = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 8 dim: 300 } } }'
+    for name, bottom, transposed in (("in", "data", "false"), ("out", "in", "true"), ("again", "out", "false")):
+        text += f"""
+layer {{ name: "{name}" type: "InnerProduct" bottom: "{bottom}" top: "{name}" param {{ name: "w" }}
+  inner_product_param {{ num_output: 300 transpose: {transposed} bias_term: false
+    weight_filler {{ type: "xavier" }} }} }}
+"""
+    net, x = net_of(text, exact="none"), torch.randn(8, 300)
+    assert_same(quickly(net, data=x), slowly(net, data=x))
+    assert last_program(net).kinds == ["packed"] * 3
+
+
 def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> None:
     class Halved(Convolution):
         @override

@@ -36,6 +36,19 @@ def test_the_speed_comes_from_the_clock_and_is_0_at_first(work_in: Callable[...,
     assert paces == ["0 iter/s, 0.5s/10 iters", "5 iter/s, 2s/10 iters"]
 
 
+def test_the_share_of_the_time_spent_waiting_for_data_is_there(
+    work_in: Callable[..., Path], lines: Callable[[], list[str]], monkeypatch: pytest.MonkeyPatch
+):
+    work_in("train/sgd_step")
+    solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel")
+    times, waited = iter([100.0, 100.5, 102.5]), iter([1.0, 1.25, 1.3])
+    solver.clock = lambda: next(times)
+    monkeypatch.setattr(solver, "_seconds_waited", lambda: next(waited))
+    solver.step(11)
+    solver.close()
+    assert re.findall(r"Waiting for data: (\S+) % of the time", "\n".join(lines())) == ["50.0", "2.5"]
+
+
 def test_clipping_and_multistep_say_so(work_in: Callable[..., Path], lines: Callable[[], list[str]]):
     work_in("train/sgd_step")
     Path("solver.prototxt").write_text(
