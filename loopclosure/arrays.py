@@ -6,6 +6,7 @@ checked here against what the file holds. No Python object is ever unpickled.
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import tokenize
@@ -36,7 +37,10 @@ def read_npz(path: str | Path, expected: str) -> dict[str, np.ndarray]:
     path = Path(path)
     try:
         with path.open("rb") as stream:
-            return unpack(stream, path.stat().st_size)
+            if stream.seekable():
+                return unpack(stream, path.stat().st_size)
+            data = stream.read()  # a pipe
+            return unpack(io.BytesIO(data), len(data))
     except _FAULTS as error:
         raise _fault(error, path, expected) from None
 
