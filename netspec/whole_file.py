@@ -108,6 +108,11 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
         os.close(held)
 
 
+def has_locks() -> bool:
+    """Return whether the system can lock files, so that :func:`only_one` can refuse a second process."""
+    return fcntl is not None
+
+
 def sync_folder(folder: Path) -> None:
     """Bring the names in a folder to disk, where the system can: a rename is otherwise lost with the power."""
     with suppress(OSError):  # Windows opens no folders, and some file systems do not sync them
@@ -134,7 +139,9 @@ def why_unwritable(path: str | Path) -> str:
     renamed_over = not path.exists() or path.is_file()  # a pipe or a device is not
     if (not path.exists() or os.access(path, os.W_OK)) and (not renamed_over or os.access(folder, os.W_OK | os.X_OK)):
         return ""
-    return os.strerror(errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES)
+    if hasattr(os, "statvfs") and os.statvfs(folder).f_flag & os.ST_RDONLY:  # Windows has none
+        return os.strerror(errno.EROFS)
+    return os.strerror(errno.EACCES)
 
 
 @contextmanager

@@ -99,6 +99,14 @@ def read_features(path: str | Path) -> Features:
             f'"{chosen}" has shape {features.shape}, {features.dtype}; expected (images, dimensions)', path
         )
     features = features.reshape(len(features), -1).astype(np.float32)
+    finite = np.all(np.isfinite(features), axis=1)
+    if not np.all(finite):
+        count, first = np.count_nonzero(~finite), np.argmin(finite)
+        raise InputError(
+            f"{count} of {len(features)} descriptors have a NaN or an infinity, the first in row {first} (from 0); "
+            "did the net diverge?",
+            path,
+        )
     names = [str(name) for name in arrays.get("names", np.zeros(0, str)).reshape(-1)]
     stamps = arrays.get("stamps")
     if stamps is not None and (stamps.ndim != 1 or stamps.dtype.kind not in "fiu"):

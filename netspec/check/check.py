@@ -7,7 +7,9 @@ faults of its text the first is reported, of one layer's own settings too.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import gc
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -55,6 +57,19 @@ class _Manner:
     passes: Collection[str] | None
 
 
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Collect no garbage within the block: a net makes many objects and drops few, and each would be visited often."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+@_no_collection()
 def check_file(
     path: str | Path,
     phase: PhaseValue = TEST,
@@ -134,6 +149,8 @@ def _check_net(
         passes=manner.passes or (),
     )
     built = build_net(net, source, options)
+    if fault := built.need.fault():
+        faults.append(fault)
     if files := [path.strip() for paths in weights for path in paths.split(",")]:
         load_weights(built, files, manner.strict, report=faults.append)
     advice = [*missing_data(net, built.param, source), *(() if faults else net_advice(built))]

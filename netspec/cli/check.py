@@ -58,7 +58,8 @@ def _check(arguments: argparse.Namespace) -> int:
         print(json.dumps(next(iter(found.values())) if len(found) == 1 else found))
         return 0
     for label, net in nets:
-        print(f"{label}: {printable(net.name) or 'a net without a name'}\n{table(net)}\n")
+        print(f"{label}: {printable(net.name) or 'a net without a name'}\n{table(net)}")
+        print(f"memory: at least {net.need}\n")
         if arguments.plan:
             print(plan_text(net) + "\n")
     return 0

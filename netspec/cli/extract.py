@@ -83,12 +83,18 @@ def add_to(commands: Commands) -> None:
 def _extract(arguments: argparse.Namespace) -> None:
     import numpy as np
 
+    from netspec.features.finite import rows_not_finite
+
     out = Path(arguments.out)
     if reason := why_unwritable(out):
         raise SpecError(f"--out {out}: cannot be written: {reason}")
     if not arguments.weights:
         log.logger.warning("no --weights given: the weights are random")
     arrays = _over_images(arguments) if arguments.images else _over_records(arguments)
+    for line in rows_not_finite(
+        {name: arrays[name] for name in (("features",) if arguments.images else arguments.blob)}
+    ):
+        log.logger.warning(f"{line} (from 0); did the net diverge?")
     with whole_file(out) as unfinished, unfinished.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
     _tell(out, arrays)

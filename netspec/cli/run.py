@@ -12,6 +12,7 @@ from typing import Any
 
 from netspec import command_line, log
 from netspec.dialects import use_dialect
+from netspec.limits import limited, read_amount
 
 
 class Commands(command_line.Commands):
@@ -28,7 +29,8 @@ class Commands(command_line.Commands):
         def with_dialects(arguments: argparse.Namespace) -> int | None:
             for plugin in arguments.plugin:
                 use_dialect(plugin)
-            return function(arguments)
+            with limited(arguments.limit):
+                return function(arguments)
 
         added = super().add(name, with_dialects, summary)
         if quiet:
@@ -36,7 +38,20 @@ class Commands(command_line.Commands):
             added.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
         plugin = "a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated"
         added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=plugin)
+        added.add_argument(
+            "--limit",
+            type=_amount,
+            metavar="SIZE",
+            help="memory that a net may need, e.g. 64GiB; more is refused (default: this machine's)",
+        )
         return added
+
+
+def _amount(text: str) -> int:
+    try:
+        return read_amount(text)
+    except ValueError as fault:
+        raise argparse.ArgumentTypeError(str(fault)) from None
 
 
 class _Verbose(argparse.Action):

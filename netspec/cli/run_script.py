@@ -11,7 +11,7 @@ from netspec.cli.run import Commands
 from netspec.command_line import VARIABLE, WrongUsage
 
 NAME = "run"
-_WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel")
+_WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel", "--limit")
 
 
 def add_to(commands: Commands) -> None:

@@ -111,12 +111,14 @@ def _newest(solver: str) -> Path | None:
 def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
     """Refuse a second training that would write snapshots of the same names."""
     from netspec.solver.checks import check_prefix
-    from netspec.whole_file import only_one
+    from netspec.whole_file import has_locks, only_one
 
     if not (solver.param.snapshot or solver.param.snapshot_after_train):
         return nullcontext()
     check_prefix(solver.param, solver.node)
     prefix = solver.param.snapshot_prefix
+    if not has_locks():
+        log.logger.warning(f'no file locks here: nothing stops another training from writing over "{prefix}"')
     return only_one(f"{prefix}.lock", f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from threadpoolctl import ThreadpoolController
 
+CAFFES = "SkylakeX"  # OpenBLAS' name of its kernels for AVX-512, with which the golden files were computed
 CORE_TYPE = "OPENBLAS_CORETYPE"  # the environment variable by which OpenBLAS chooses its kernels, when it is loaded
 
 
@@ -28,7 +29,7 @@ def _load() -> tuple[Any, Any]:
     """
     chosen = CORE_TYPE not in os.environ and torch.backends.cpu.get_cpu_capability() == "AVX512"
     if chosen:
-        os.environ[CORE_TYPE] = "SkylakeX"
+        os.environ[CORE_TYPE] = CAFFES
     try:
         return import_module("scipy.linalg.blas"), import_module("scipy.linalg.cython_blas")
     finally:
@@ -182,6 +183,17 @@ def one_thread() -> Iterator[None]:
     finally:
         for pool, count in before:
             pool.set_num_threads(count)
+
+
+def other_kernels() -> str:
+    """Return what to say where BLAS does not have the kernels for AVX-512; "" where it does."""
+    found = {pool.info().get("architecture", "unknown") for pool in _pools()} or {"another BLAS"}
+    if CAFFES in found:
+        return ""
+    return (
+        f"Caffe's sums are computed by the kernels for {', '.join(sorted(found))}, not {CAFFES} (AVX-512): "
+        "they have the bits of a Caffe on such a CPU"
+    )
 
 
 @cache

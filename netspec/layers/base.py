@@ -147,6 +147,7 @@ class Context:
     exact: str = SMALL
     accumulate_in_place: bool = False
     created: Callable[[], None] = lambda: None  # called when ``construct`` has run: Caffe's log goes by it
+    take: Callable[[int], None] = lambda size: None  # called before memory is taken, in bytes: it may refuse
 
 
 class Layer(torch.nn.Module):
@@ -371,6 +372,7 @@ class Layer(torch.nn.Module):
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
         """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""
         axes, device = self.possible(shape), self.context.device
+        self.context.take(4 * math.prod(axes))
         data: torch.Tensor | None = None
         if filler is not None:
             try:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,23 +18,27 @@ from typing_extensions import override
 
 from netspec import log
 from netspec.errors import SpecError, Where
+from netspec.exact import ALL
+from netspec.exact.blas import other_kernels
 from netspec.exact.sums import RowSums
 from netspec.exact.switch import applies, is_recorded
 from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
-from netspec.limits import amount, is_out_of_memory
+from netspec.limits import amount, is_out_of_memory, most
 from netspec.limits import memory as memory_of_machine
 from netspec.net.chains import chains
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
+from netspec.net.need import BYTES, Need, limit_text
 from netspec.net.options import BuildOptions
 from netspec.net.programs import Programs
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST, NetParameter
 
 Array = np.ndarray | torch.Tensor
+MUCH = 8  # a net that takes more than this part of the limit is first looked at as a whole
 
 
 @dataclass(frozen=True)
@@ -75,8 +79,12 @@ class Net(torch.nn.Module):
         self.loss_weights: list[list[float]] = []
         self.learnable: list[Learnable] = []
         self._last_use = _last_uses(plan)
+        self.need = Need(plan, self._last_use)
+        self._surveyed, self._too_much = False, None  # whether the whole net was looked at, and what was found
         seed = int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed
         self.random = Random(seed)
+        if self.exact == ALL and self.device.type == "cpu" and (said := other_kernels()):
+            log.warning("net.cpp:53", said)
         self.layers = self._build_layers(options)
         self._overwritten = [
             is_overwritten(layer, node, plan) for layer, node in zip(self.layers, plan.nodes, strict=False)
@@ -127,6 +135,7 @@ class Net(torch.nn.Module):
                 exact=options.exact,
                 accumulate_in_place=options.accumulate_in_place,
                 created=partial(self._log_wiring, node),
+                take=partial(self._take, options, at),
             )
             try:
                 layer = cls(param, [shapes[v] for v in node.bottoms], context)
@@ -152,10 +161,43 @@ class Net(torch.nn.Module):
                 if weight:
                     log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
             log.info("net.cpp:139", f"Memory required for data: {memory}")
+            owned = len(self.learnable)
             self._adopt_params(layers, i, layer, options.report)
+            self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
+        if self.device.type == "cpu" and (fault := self.need.fault()):
+            options.report(fault)
         if len(layers) == len(self.plan.nodes):
             self._finish(list(layers.values()))
         return torch.nn.ModuleList(layers.values())
+
+    def _take(self, options: BuildOptions, at: Callable[[], Where], size: int) -> None:
+        """Let a layer take memory, in bytes. Raises SpecError where that, or what the whole net needs, is too much.
+
+        Only a net that takes much is looked at as a whole.
+        """
+        if self.device.type != "cpu" or self.need.total + size <= most() // MUCH:
+            return
+        if not self._surveyed:
+            self._surveyed, self._too_much = True, self._survey(options).fault()
+        if self._too_much:
+            raise self._too_much
+        if self.need.parameters + size > most():
+            raise SpecError(f"needs {amount(size)} of memory beside {self.need}; {limit_text()}", at())
+
+    def _survey(self, options: BuildOptions) -> Need:
+        """Return what the net needs, from the shapes that are known so far, without memory, data or Python layers."""
+        seen = replace(
+            options,
+            device=torch.device("meta"),
+            open_data=False,
+            write_files=False,
+            given_shapes={**(options.given_shapes or {}), **self.shapes},
+            report=lambda fault: None,
+            allow_python=False,
+            passes=(),
+        )
+        with log.silent():
+            return Net(self.plan, seen).need
 
     def _find_chains(self) -> list[list[int]]:
         if len(self.layers) < len(self.plan.nodes):

@@ -50,6 +50,7 @@ from netspec.solver.precision import FP32, check_precision, computing
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.tally import Outputs, Tally, as_scores, score_lines, scorers
+from netspec.solver.threads import dependence
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
@@ -219,6 +220,8 @@ class Solver:
         read = frozenset[str]().union(*(layer.solver_reads for net in self.test_nets for layer in net.layers))
         for line in fields_without_effect(param, node, read):
             log.warning("solver.cpp:45", line)
+        if said := dependence(self.net, torch.get_num_threads()):
+            log.info("solver.cpp:57", said)
         log.info("solver.cpp:57", "Solver scaffolding done.")
         self.history = [
             torch.zeros_like(learnable.parameter.detach())

@@ -45,7 +45,7 @@ def little_memory() -> Iterator[None]:
 def test_too_little_memory(text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "net.prototxt").write_text(text)
     with little_memory():
-        status = main(["time", "--model", str(tmp_path / "net.prototxt"), "--iterations", "1"])
+        status = main(["time", "--model", str(tmp_path / "net.prototxt"), "--iterations", "1", "--limit", "1TiB"])
     assert status == 1
     assert said in capsys.readouterr().err.splitlines()[-1]
 
@@ -53,5 +53,5 @@ def test_too_little_memory(text: str, said: str, tmp_path: Path, capsys: pytest.
 def test_check_needs_no_memory_for_what_it_describes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "net.prototxt").write_text(NET + WIDE)
     with little_memory():
-        assert main(["check", str(tmp_path / "net.prototxt")]) == 0
+        assert main(["check", str(tmp_path / "net.prototxt"), "--limit", "1TiB"]) == 0
     assert "6103.86" in capsys.readouterr().out  # MiB: 40,000 x 40,000 floats, and 60,000

@@ -19,3 +19,11 @@ def test_a_damaged_file_is_refused_in_one_line(tries: str, formats: list[str], t
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count(f": 0 of {tries}\n") == len(formats)
+
+
+def test_a_text_of_odd_pieces_is_refused_in_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("hypothesis")
+    command = [sys.executable, Path(__file__).with_name("texts.py"), "--tries", "50"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count(": 50 texts, no fault\n") > 8

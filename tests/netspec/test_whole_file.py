@@ -1,5 +1,6 @@
 """Files that appear whole, locks, and whether a file could be written: in netspec and, the same, in loopclosure."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -101,6 +102,14 @@ def test_where_files_have_no_locks(package: ModuleType, tmp_path: Path, monkeypa
     with package.only_one(tmp_path / "lock", ""):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_why_unwritable_where_file_systems_tell_nothing(
+    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "statvfs")  # as on Windows
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert package.why_unwritable(tmp_path / "file") == os.strerror(errno.EACCES)
 
 
 def test_a_link_stays_a_link(package: ModuleType, tmp_path: Path) -> None:

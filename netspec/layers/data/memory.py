@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -86,10 +87,9 @@ class DummyData(Layer):
         self._fillers = self._one_a_top(given or [FillerParameter()], "data_filler")
         self.refuse(self._wrong_fillers())
         on_meta = self.context.device.type == "meta"
-        self._constants = [
-            self._fill(i, torch.Generator()) if filler.type == "constant" and not on_meta else None
-            for i, filler in enumerate(self._fillers)
-        ]
+        constant = [filler.type == "constant" and not on_meta for filler in self._fillers]
+        self.context.take(4 * sum(math.prod(shape) for shape, kept in zip(self.shapes, constant, strict=True) if kept))
+        self._constants = [self._fill(i, torch.Generator()) if kept else None for i, kept in enumerate(constant)]
 
     def _wrong_fillers(self) -> Iterator[SpecError]:
         for i, (filler, shape) in enumerate(zip(self._fillers, self.shapes, strict=True)):

@@ -115,3 +115,11 @@ def test_queries_and_references_of_two_files(tmp_path):
     method = make_method(f"features:{tmp_path}/q.npz,{tmp_path}/r.npz")
     scores = method.score(Images([Path("1.png")], [Path("1.png"), Path("2.png")]), silent).scores
     np.testing.assert_allclose(scores, [[-np.sqrt(2), -np.sqrt(18)]], rtol=1e-5)
+
+
+def test_descriptors_that_are_not_finite_are_refused(tmp_path):
+    rows = ROWS.astype(np.float32).copy()
+    rows[1:3, 0] = np.nan, np.inf
+    np.savez(tmp_path / "f.npz", features=rows)
+    with pytest.raises(InputError, match=r"f.npz: 2 of 4 descriptors have a NaN or an infinity, the first in row 1"):
+        read_features(tmp_path / "f.npz")

@@ -332,3 +332,16 @@ def test_extract_features_says_in_one_line_what_is_wrong(run: Run) -> None:
     assert "found 2 blob names and 1 databases, expected one database per blob" in fault("feat,sim", "db", "1", "lmdb")
     Path("db").mkdir()
     assert fault("feat", "db", "1", "lmdb").startswith("db: already exists; ")
+
+
+def test_extract_warns_of_descriptors_that_are_not_finite(run: Run) -> None:
+    Path("dark").mkdir()
+    for name, value in (("a.png", 9), ("b.png", 0)):
+        cv2.imwrite(f"dark/{name}", np.full((8, 8, 3), value, np.uint8))
+    Path("log.prototxt").write_text(
+        'input: "data" input_dim: 1 input_dim: 3 input_dim: 8 input_dim: 8\n'
+        'layer { name: "log" type: "Log" bottom: "data" top: "log" }\n'
+    )
+    result = run("extract", "--model", "log.prototxt", "--blob", "log", "--images", "dark", "--out", "f.npz")
+    assert result.status == 0
+    assert "features: 1 of 2 rows have a NaN or an infinity, the first is row 1 (from 0)" in result.err

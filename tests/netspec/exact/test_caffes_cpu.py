@@ -3,11 +3,15 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from netspec.exact import blas
 from netspec.exact.blas import CORE_TYPE
+from netspec.net.net import Net
 from paths import ROOT
 
 KERNELS = f"""
@@ -30,3 +34,24 @@ def test_the_kernels_are_caffes_unless_the_user_chose_others(wanted: str | None,
         [sys.executable, "-c", KERNELS], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.split() == expected
+
+
+@pytest.mark.parametrize(
+    ("kernels", "exact", "said"),
+    [
+        ("Haswell", "all", ["Caffe's sums are computed by the kernels for Haswell, not SkylakeX (AVX-512)"]),
+        ("SkylakeX", "all", []),
+        ("Haswell", "small", []),
+    ],
+)
+def test_other_kernels_are_told(
+    kernels: str,
+    exact: str,
+    said: list[str],
+    net_of: Callable[..., Net],
+    warnings: Callable[[], list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(blas, "_pools", lambda: [SimpleNamespace(info=lambda: {"architecture": kernels})])
+    net_of('layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 } } }', exact=exact)
+    assert [line.partition(":")[0] for line in warnings()] == said

@@ -1,0 +1,80 @@
+"""How much memory a net needs at least, and whether that is too much."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from netspec.errors import SpecError
+from netspec.graph.plan import Plan
+from netspec.layers.base import Layer
+from netspec.limits import amount, most
+from netspec.proto.schema import TEST
+
+BYTES = 4  # of a number: float32
+
+
+class Need:
+    """The memory that a net needs at least, in bytes, as far as the shapes of its layers are known.
+
+    ``parameters`` counts shared ones once. ``tops`` is what tops need at one time: in phase TEST each is given up after
+    its last use, in phase TRAIN the backward pass needs them all. Tops that are in place, or that lie in their bottom's
+    memory, need nothing. Gradients, the solver's history and what kernels need for their work come on top.
+    """
+
+    def __init__(self, plan: Plan, last_uses: Sequence[Sequence[int]]) -> None:
+        self.parameters = self.tops = 0
+        self._plan = plan
+        self._ends = last_uses if plan.net.state.phase == TEST else [()] * len(plan.nodes)
+        self._home: dict[int, int] = {}  # the value whose memory a value lies in
+        self._sizes: dict[int, int] = {}
+        self._users: dict[int, int] = {}
+        self._alive = 0
+        self._largest = (0, 0)  # bytes of the layer that needs most, and its index, negative: the first of equals
+
+    @property
+    def total(self) -> int:
+        """Bytes of parameters and tops together."""
+        return self.parameters + self.tops
+
+    def add(self, i: int, layer: Layer, parameters: int) -> None:
+        """Count layer ``i``, which comes after all that were counted, with its bytes of parameters."""
+        node, made = self._plan.nodes[i], 0
+        for j, (v, shape) in enumerate(zip(node.tops, layer.top_shapes, strict=False)):
+            bottom = node.bottoms[j if node.in_place[j] else 0] if node.bottoms else -1
+            shared = node.in_place[j] or "data" in layer.shares
+            home = self._home.get(bottom, v) if shared else v
+            if home == v:
+                self._sizes[v] = BYTES * math.prod(shape)
+                made += self._sizes[v]
+            self._home[v] = home
+            self._users[home] = self._users.get(home, 0) + 1
+        self._alive += made
+        self.tops = max(self.tops, self._alive)
+        self.parameters += parameters
+        self._largest = max(self._largest, (made + parameters, -i))
+        for v in self._ends[i]:
+            home = self._home.pop(v, None)
+            if home is not None:
+                self._users[home] -= 1
+                self._alive -= 0 if self._users[home] else self._sizes.pop(home)
+
+    def fault(self) -> SpecError | None:
+        """Return an error that names the layer that needs most, if the net needs more than :func:`limits.most`."""
+        if self.total <= most():
+            return None
+        size, i = self._largest[0], -self._largest[1]
+        node = self._plan.nodes[i]
+        return SpecError(
+            f"needs {amount(size)} of memory, the most of all layers; the net needs at least {self}; {limit_text()}",
+            self._plan.source.at(i, layer=node.name, type=node.type),
+        )
+
+    def __str__(self) -> str:
+        """Return the sums for people."""
+        return f"{amount(self.total)}: parameters {amount(self.parameters)}, tops {amount(self.tops)}"
+
+
+def limit_text() -> str:
+    """Return what the limit is, and how to set another."""
+    return f"the limit is {amount(most())}, --limit SIZE sets another"
