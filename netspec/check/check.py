@@ -7,9 +7,7 @@ faults of its text the first is reported, of one layer's own settings too.
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -57,19 +55,6 @@ class _Manner:
     passes: Collection[str] | None
 
 
-@contextmanager
-def _no_collection() -> Iterator[None]:
-    """Collect no garbage within the block: a net makes many objects and drops few, and each would be visited often."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
-@_no_collection()
 def check_file(
     path: str | Path,
     phase: PhaseValue = TEST,

@@ -83,7 +83,11 @@ def try_format(form: Format, tries: int, folder: Path) -> str:
     form.write(good)
 
     @settings(
-        max_examples=tries, deadline=10_000, database=None, derandomize=True, suppress_health_check=list(HealthCheck)
+        max_examples=tries,
+        deadline=10_000,
+        database=None,
+        derandomize=True,
+        suppress_health_check=[HealthCheck.too_slow],
     )
     @given(texts(good.read_text()))
     def ends_well(words: str) -> None:

@@ -38,8 +38,9 @@ def requirements(name: str) -> dict[str, Distribution]:
 def license_of(package: Distribution) -> str:
     """Return what a package says of its license: its expression, else its classifiers, else the first line of text."""
     meta = package.metadata
-    classified = [line.rpartition(" :: ")[2] for line in meta.get_all("Classifier", []) if line.startswith("License")]
-    said = meta.get("License-Expression") or "; ".join(classified) or meta.get("License", "").strip()
+    lines = {name: meta.get_all(name, []) for name in ("License-Expression", "Classifier", "License")}
+    classified = [line.rpartition(" :: ")[2] for line in lines["Classifier"] if line.startswith("License")]
+    said = "; ".join(lines["License-Expression"] or classified or lines["License"]).strip()
     return said.splitlines()[0] if said else ""
 
 
