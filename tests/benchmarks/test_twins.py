@@ -70,7 +70,7 @@ def test_a_twin_learns_the_same(name: str) -> None:
         groups = twins.parameter_groups(twin, RATE, DECAY)
         optimizer = torch.optim.SGD(groups, lr=RATE, momentum=MOMENTUM)
         with np.load(case.inputs) as arrays:
-            data, labels = torch.from_numpy(arrays["data"]).double(), torch.from_numpy(arrays["label"]).double()
+            data, labels = torch.from_numpy(arrays["data"]).double(), torch.from_numpy(arrays["label"])
         losses: list[list[float]] = []
         for _ in range(3):
             solver.step(1)
