@@ -41,7 +41,9 @@ def parser() -> argparse.ArgumentParser:
         "waiting", _waiting, "time two trainings side by side, as their OpenMP threads wait in several ways"
     )
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
-    p.add_argument("--waits", nargs="+", default=["", "OMP_WAIT_POLICY=PASSIVE"], metavar="VARIABLE=VALUE")
+    p.add_argument(
+        "--waits", nargs="+", default=["", "OMP_WAIT_POLICY=PASSIVE", "GOMP_SPINCOUNT=2000"], metavar="VARIABLE=VALUE"
+    )
     p.add_argument("--batch", type=int, default=32, help="items of a batch (default: 32)")
     p.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
     p.add_argument("--rounds", type=int, default=7, help="default: 7")

@@ -31,8 +31,8 @@ def spins(**variables: str) -> set[str]:
     return found
 
 
-def test_threads_that_wait_sleep_in_a_command() -> None:
-    assert spins() == {"0"}
+def test_threads_that_wait_soon_sleep_in_a_command() -> None:
+    assert spins() <= {"2000", "0"}  # GNU's runtime counts turns, LLVM's milliseconds
     assert spins(GOMP_SPINCOUNT="5", KMP_BLOCKTIME="5") == {"5"}
 
 
@@ -43,5 +43,8 @@ def test_the_users_own_choice_is_left(choice: str) -> None:
 
 
 def test_where_torch_is_there_already_it_is_too_late() -> None:
-    assert python("-c", f"import netspec, torch; {SHOW}").stdout.strip() == "OMP_WAIT_POLICY=PASSIVE"
+    assert python("-c", f"import netspec, torch; {SHOW}").stdout.split() == [
+        "OMP_WAIT_POLICY=PASSIVE",
+        "GOMP_SPINCOUNT=2000",
+    ]
     assert python("-c", f"import torch, netspec; {SHOW}").stdout.strip() == ""
