@@ -17,7 +17,7 @@ from fake_gpu import NAME, POSSIBLE, fake_gpu
 from paths import ROOT
 
 SCRIPT = ROOT / "benchmarks" / "gpu_steps"
-SMALL = {"GPU": "", "BATCH": "2", "ITERATIONS": "2", "TRAIN": "40", "VALIDATION": "8", "FRAMES": "20"}
+SMALL = {"GPU": "", "BATCH": "2", "ITERATIONS": "2", "TRAIN": "40", "VALIDATION": "8", "FRAMES": "250"}
 
 
 @pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
