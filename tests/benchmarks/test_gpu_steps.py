@@ -44,6 +44,14 @@ def test_a_step_that_there_is_not_is_wrong_usage(tmp_path: Path) -> None:
     assert finished.stderr.startswith("usage: benchmarks/gpu_steps STEP FOLDER")
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_no_step_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SMALL, "GPU", "0")
+    finished = step("layers", tmp_path)
+    assert finished.returncode == 1
+    assert "torch finds no GPU" in finished.stderr
+
+
 def test_the_page_names_every_step() -> None:
     (steps,) = re.findall(r'^STEPS="(.*)"$', SCRIPT.read_text(), re.MULTILINE)
     page = (ROOT / "benchmarks" / "README.md").read_text()
