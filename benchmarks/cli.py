@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from benchmarks.report import Row
-from netspec.command_line import Commands, run
+from netspec.command_line import Commands, WrongUsage, run
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
@@ -33,6 +33,7 @@ def parser() -> argparse.ArgumentParser:
     p = commands.add("train", _train, "time training iterations: forward, backward, update")
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
     _add_common(p, TRAINING, TRAINING[:2])
+    p.add_argument("--device", default="cpu", help="torch's name of it, for netspec and pytorch (default: cpu)")
     p = commands.add("start", _start, "time processes that load a net and describe one image")
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list), or a prototxt")
     p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
@@ -97,7 +98,9 @@ def _forward(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     from benchmarks.case import training_case
 
-    _compare(arguments, training_case, "_training")
+    if arguments.device != "cpu" and ("pycaffe" in arguments.ways or arguments.caffe):
+        raise WrongUsage("only netspec and pytorch are timed on other devices than the CPU")
+    _compare(arguments, training_case, "_training", arguments.device)
 
 
 def _waiting(arguments: argparse.Namespace) -> None:
@@ -125,7 +128,9 @@ def _start(arguments: argparse.Namespace) -> None:
     _report(arguments, rows)
 
 
-def _compare(arguments: argparse.Namespace, case_of: Callable[[str, int], Any], suffix: str) -> None:
+def _compare(
+    arguments: argparse.Namespace, case_of: Callable[[str, int], Any], suffix: str, device: str = "cpu"
+) -> None:
     from benchmarks.compare import rows_of
 
     def rows(yardsticks: str | None) -> Iterator[list[Row]]:
@@ -134,7 +139,7 @@ def _compare(arguments: argparse.Namespace, case_of: Callable[[str, int], Any], 
                 with case_of(name, batch) as case:
                     for threads in arguments.threads:
                         ways, caffe = arguments.ways, arguments.caffe
-                        yield rows_of(case, threads, ways, suffix, yardsticks, caffe, arguments.rounds)
+                        yield rows_of(case, threads, ways, suffix, yardsticks, caffe, arguments.rounds, device)
 
     _report(arguments, rows)
 

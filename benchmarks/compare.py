@@ -16,10 +16,20 @@ YARDSTICKS = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these ru
 
 
 def rows_of(
-    case: Case, threads: int, ways: Sequence[str], suffix: str, yardsticks: str | None, caffe: str | None, rounds: int
+    case: Case,
+    threads: int,
+    ways: Sequence[str],
+    suffix: str,
+    yardsticks: str | None,
+    caffe: str | None,
+    rounds: int,
+    device: str = "cpu",
 ) -> list[Row]:
-    """Return a row for each way; ``suffix`` is that of the worker's functions, ``yardsticks`` the Python of some."""
-    task = task_of(case, threads)
+    """Return a row for each way; ``suffix`` is that of the worker's functions, ``yardsticks`` the Python of some.
+
+    Trainings of netspec and of the twin run on ``device``, a name of torch's.
+    """
+    task = {**task_of(case, threads), "device": device}
     contestants = [_worker(case, way, task, suffix, yardsticks) for way in ways]
     if caffe:
         contestants.append(CaffeProgram(caffe, task, training=bool(suffix)))
@@ -58,7 +68,7 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
     return {
         **{name: str(getattr(case, name)) for name in ("prototxt", "caffemodel", "onnx", "inputs", "solver", "folder")},
         "cache": str(case.folder / "cache"),
-        **{"twin": case.twin, "outputs": outputs, "threads": threads},
+        **{"twin": case.twin, "outputs": outputs, "threads": threads, "device": "cpu"},
         **{"rate": RATE, "momentum": MOMENTUM, "decay": DECAY},
     }
 

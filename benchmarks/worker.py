@@ -140,10 +140,11 @@ def netspec_training(task: Task) -> Run:
     import netspec
 
     torch.set_num_threads(task["threads"])
-    solver = netspec.load_solver(task["solver"], task["caffemodel"], device="cpu")
+    solver = netspec.load_solver(task["solver"], task["caffemodel"], device=task["device"])
 
     def run() -> dict[str, Any]:
         solver.step(1)
+        _finish(task)
         return {"loss": solver.loss}
 
     return run
@@ -173,19 +174,22 @@ def pytorch_training(task: Task) -> Run:
     from benchmarks import twins
 
     torch.set_num_threads(task["threads"])
+    torch.backends.cudnn.allow_tf32 = False  # as netspec computes
     twin = twins.net(task["twin"]).train()
     twins.load(twin, task["caffemodel"])
+    twin.to(task["device"])
     loss_of = twins.Classified(twin) if task["twin"] in twins.CLASSIFIERS else twins.Pairs(twin)
     groups = twins.parameter_groups(twin, task["rate"], task["decay"])
     optimizer = torch.optim.SGD(groups, lr=task["rate"], momentum=task["momentum"])
-    data, labels = (torch.from_numpy(value) for value in _inputs(task).values())
+    data, labels = (torch.from_numpy(value).to(task["device"]) for value in _inputs(task).values())
 
     def run() -> dict[str, Any]:
         optimizer.zero_grad()
         loss = loss_of(data, labels)
         loss.backward()
         optimizer.step()
-        return {"loss": loss.detach()}
+        _finish(task)
+        return {"loss": loss.detach().cpu()}
 
     return run
 
@@ -197,6 +201,14 @@ WAYS: dict[str, Callable[[Task], Run]] = {
         *(netspec_training, pycaffe_training, pytorch_training),
     )
 }
+
+
+def _finish(task: Task) -> None:
+    """Wait for what a GPU still computes."""
+    import torch
+
+    if torch.device(task["device"]).type == "cuda":
+        torch.cuda.synchronize(task["device"])
 
 
 def _inputs(task: Task) -> dict[str, np.ndarray]:

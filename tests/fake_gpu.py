@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
 import torch
 import torch.utils.backend_registration as registration
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -83,6 +84,20 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if len(returns) == 1 and returns[0].alias_info is not None and returns[0].alias_info.is_write:
         return kwargs["out"] if "out" in kwargs else args[0]
     return tree_map(lambda r: FakeTensor(r) if fake and isinstance(r, torch.Tensor) else r, result)
+
+
+@contextmanager
+def gpu(kind: str) -> Iterator[str]:
+    """Yield the device of a kind: ``fake``, or ``cuda``, a real one; skip the test where there is none."""
+    if kind == "cuda":
+        if not torch.cuda.is_available():
+            pytest.skip("no GPU here")
+        yield "cuda:0"
+    elif not POSSIBLE:
+        pytest.skip("this torch cannot make a fake device")
+    else:
+        with fake_gpu():
+            yield NAME
 
 
 @contextmanager

@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec import log
 from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, devices
 from netspec.cli.run import Commands, signals
-from netspec.command_line import WrongUsage
+from netspec.command_line import DONE, FAULT, WrongUsage
 from netspec.scores import Score, Scores, Snapshot, read_scores
 
 if TYPE_CHECKING:
+    from netspec.solver.processes import Processes
     from netspec.solver.solver import Solver
 
 NAN = ("stop", "warn")
@@ -52,11 +54,7 @@ def add_to(commands: Commands) -> None:
     add_strict(p)
 
 
-def _train(arguments: argparse.Namespace) -> None:
-    from tqdm import tqdm
-
-    from netspec.solver.solver import load_solver
-
+def _train(arguments: argparse.Namespace) -> int:
     path = arguments.solver or arguments.path
     if not path or (arguments.solver and arguments.path):
         raise WrongUsage("need one solver definition: netspec train solver.prototxt")
@@ -64,36 +62,79 @@ def _train(arguments: argparse.Namespace) -> None:
         raise WrongUsage("give a snapshot to resume training or weights to fine-tune, not both")
     if arguments.resume and arguments.snapshot:
         raise WrongUsage("--resume looks for the snapshot; leave out --snapshot")
-    if arguments.resume and (found := _newest(path)):
-        arguments.snapshot, arguments.weights = str(found), None
+    from netspec.solver.processes import FaultOfAll, Lost, Processes, join, started_by_torchrun
+
+    if arguments.gpu and started_by_torchrun():
+        raise WrongUsage("under torchrun each process takes the GPU of its number; leave out --gpu")
+    processes = join() if started_by_torchrun() else Processes()
+    status = DONE
+    with nullcontext() if processes.is_root else log.silent():
+        try:
+            status = _solve(arguments, path, processes)
+        except FaultOfAll:
+            if processes.is_root:
+                raise
+            with suppress(Lost):  # the root tells it; torchrun ends all processes as soon as one has ended
+                processes.gather(None)
+            return FAULT
+    processes.leave()
+    return status
+
+
+def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> int:
+    """Train, and return the exit status."""
+    from tqdm import tqdm
+
+    from netspec.solver.processes import Lost
+
     effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: arguments.sigint_effect}
     if hasattr(signal, "SIGHUP"):  # Windows has none
         effects[signal.SIGHUP] = arguments.sighup_effect
     with signals(effects) as action:
-        solver = load_solver(
-            path,
-            weights=arguments.weights,
-            snapshot=arguments.snapshot,
-            device=devices(arguments.gpu) if arguments.gpu else None,
-            level=arguments.level,
-            stages=tuple(arguments.stage.split(",")),
-            allow_python=arguments.allow_python_layers,
-            action=action,
-            exact=arguments.exact,
-            strict=arguments.strict,
-            precision=arguments.precision,
-            nan=arguments.nan,
-        )
-        if arguments.scores:
-            _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
+        solver = processes.together(lambda: _load(arguments, path, action, processes))
         log.info("caffe.cpp:239", "Starting Optimization")
-        total, first, hidden = solver.param.max_iter, solver.iteration, not sys.stderr.isatty()
+        total, first = solver.param.max_iter, solver.iteration
+        hidden = not sys.stderr.isatty() or not processes.is_root
         bar = tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False)
-        with _sole_writer(solver), bar:
+        with _sole_writer(solver) if processes.is_root else nullcontext(), bar:
             solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
-            solver.solve()
+            try:
+                solver.solve()
+            except Lost as fault:  # told here: torchrun ends this process as soon as signals work again
+                kept = (
+                    f"the last snapshot is {solver.last_snapshot}" if solver.last_snapshot else "no snapshot was taken"
+                )
+                print(f"{fault}; {kept}; start all processes again with --resume", file=sys.stderr)
+                return FAULT
         solver.close()
     log.info("caffe.cpp:250", "Optimization Done.")
+    return DONE
+
+
+def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | None], processes: Processes) -> Solver:
+    """Return the solver, resumed where that is asked for."""
+    from netspec.solver.solver import load_solver
+
+    if arguments.resume and (found := _newest(path)):
+        arguments.snapshot, arguments.weights = str(found), None
+    solver = load_solver(
+        path,
+        weights=arguments.weights,
+        snapshot=arguments.snapshot,
+        device=devices(arguments.gpu) if arguments.gpu else None,
+        level=arguments.level,
+        stages=tuple(arguments.stage.split(",")),
+        allow_python=arguments.allow_python_layers,
+        action=action,
+        exact=arguments.exact,
+        strict=arguments.strict,
+        precision=arguments.precision,
+        nan=arguments.nan,
+        processes=processes,
+    )
+    if arguments.scores and processes.is_root:
+        _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
+    return solver
 
 
 def _newest(solver: str) -> Path | None:

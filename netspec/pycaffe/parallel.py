@@ -12,11 +12,12 @@ import time
 import uuid
 from pathlib import Path
 
-import torch
 from torch import distributed
 
 from netspec.pycaffe import mode
 from netspec.pycaffe.solver import Solver
+from netspec.solver.processes import Processes, join
+from netspec.solver.replicas import Replicas
 
 
 def has_nccl() -> bool:
@@ -31,35 +32,30 @@ class NCCL:
     """
 
     def __init__(self, solver: Solver, uid: str) -> None:
-        self._learnable = solver._training.net.learnable
-        self._count = mode.solver_count()
-        if self._count > 1 and not distributed.is_initialized():
-            backend = "nccl" if mode.device().type == "cuda" else "gloo"
-            place = f"file://{Path(tempfile.gettempdir(), uid)}"
-            distributed.init_process_group(backend, place, world_size=self._count, rank=mode.solver_rank())
+        count = mode.solver_count()
+        if count == 1:
+            processes = Processes()
+        elif distributed.is_initialized():
+            processes = Processes(mode.solver_rank(), count)
+        else:
+            processes = join(count, mode.solver_rank(), f"file://{Path(tempfile.gettempdir(), uid)}")
+        self._replicas = Replicas(solver._training.net, (), processes)
 
     @staticmethod
     def new_uid() -> str:
         """Return a name for a group of processes."""
         return f"netspec-{uuid.uuid4().hex}"
 
-    @torch.no_grad()
     def bcast(self) -> None:
         """Give every process the root's weights."""
-        for item in self._learnable:
-            if self._count > 1:
-                distributed.broadcast(item.parameter.detach(), 0)
+        self._replicas.begin()
 
     def on_start(self) -> None:
         """Do nothing: the weights are alike."""
 
-    @torch.no_grad()
     def on_gradients_ready(self) -> None:
         """Replace each gradient by the mean of all processes' gradients."""
-        for item in self._learnable:
-            if self._count > 1 and item.parameter.grad is not None:
-                distributed.all_reduce(item.parameter.grad)
-                item.parameter.grad /= self._count
+        self._replicas.reduce()
 
     def __call__(self, layer: int) -> None:
         """Do nothing after a layer's backward: all gradients are averaged at once (layer_wise_reduce only hurries)."""

@@ -42,8 +42,8 @@ class Stamp:
 class Extra:
     """What the file has.
 
-    ``seed`` is the solver's; ``losses`` are the last ``average_loss`` ones; ``nets`` has, for the training net, its
-    replicas and the test nets, in this order, what each of their layers remembers (``Layer.running_state``), by the
+    ``seed`` is the solver's; ``losses`` are the last ``average_loss`` ones; ``nets`` has, for the training nets of all
+    ranks and the test nets, in this order, what each of their layers remembers (``Layer.running_state``), by the
     layer's number.
     """
 

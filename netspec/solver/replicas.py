@@ -1,6 +1,7 @@
-"""Copies of the training net on further devices: each runs its share of the records, the root updates.
+"""Copies of the training net on further devices: each runs its share of the records.
 
-So an iteration uses batch_size records per device, and the gradient is the mean over the devices.
+So an iteration uses batch_size records per device, and the gradient is the mean over the devices, here and in other
+processes. Each process updates its own weights, all alike; its root's are copied to its replicas.
 Each device has its own BatchNorm statistics during a run; those of the root are tested and saved.
 
 Caffe: src/caffe/parallel.cpp (NCCL: all-reduce of the gradients, scaled by 1 / solver_count)
@@ -15,17 +16,19 @@ import torch
 from netspec.net.net import Net
 from netspec.solver import update
 from netspec.solver.precision import FP32, computing
+from netspec.solver.processes import Processes
 
 
 class Replicas:
-    """The training nets besides the root, which has rank 0."""
+    """The training nets besides the root: those of this process, and the nets of the other ``processes``."""
 
-    def __init__(self, root: Net, nets: Sequence[Net]) -> None:
-        self._root, self.nets = root, nets
+    def __init__(self, root: Net, nets: Sequence[Net], processes: Processes) -> None:
+        self._root, self.nets, self._processes = root, nets, processes
 
     @torch.no_grad()
     def begin(self) -> None:
-        """Copy the root's parameters, including BatchNorm's statistics, to every replica."""
+        """Copy the root's parameters, including BatchNorm's statistics, to every replica, here and elsewhere."""
+        self._processes.copy_root(item.parameter.detach() for item in self._root.learnable)
         self._copy(everything=True)
 
     def backward(self, precision: str = FP32) -> None:
@@ -40,15 +43,20 @@ class Replicas:
 
     @torch.no_grad()
     def reduce(self) -> None:
-        """Make the root's gradients the mean over all devices."""
-        if not self.nets:
+        """Make the root's gradients the mean over all devices of all processes."""
+        count = self._processes.count * (1 + len(self.nets))
+        if count == 1:
             return
+        sums = []
         for own, *theirs in zip(*(net.learnable for net in (self._root, *self.nets)), strict=True):
             if own.parameter.grad is None:
                 continue
             for learnable in theirs:
                 own.parameter.grad += learnable.parameter.grad.to(own.parameter.device, non_blocking=True)
-            own.parameter.grad /= 1 + len(theirs)
+            sums.append(own.parameter.grad)
+        self._processes.sum(sums)
+        for gradient in sums:
+            gradient /= count
 
     def clear(self) -> None:
         """Clear the gradients of the last iteration."""

@@ -34,7 +34,6 @@ from netspec.solver.checks import check_prefix, check_settings, fields_without_e
 from netspec.solver.debug import debug_info
 from netspec.solver.extra import (
     Extra,
-    Stamp,
     check_pair,
     path_beside,
     read_extra,
@@ -47,6 +46,7 @@ from netspec.solver.heap import keep_freed_memory
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.precision import FP32, check_precision, computing
+from netspec.solver.processes import Processes, own_device
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.tally import Outputs, Tally, as_scores, score_lines, scorers
@@ -73,13 +73,15 @@ def load_solver(
     strict: bool = False,
     precision: str = FP32,
     nan: str = "stop",
+    processes: Processes | None = None,
 ) -> Solver:
     """Build the solver of a prototxt and its nets, ready to run.
 
     ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
     ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
     ``stages`` go to the training net. Several devices train side by side, the first being the root. For ``device``,
-    ``action``, ``precision`` and ``nan`` see :class:`Solver`. Raises SpecError for every fault of the files.
+    ``action``, ``precision``, ``nan`` and ``processes`` see :class:`Solver`; each of several processes has the GPU of
+    its number on its machine if ``device`` is None. Raises SpecError for every fault of the files.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
@@ -91,6 +93,8 @@ def load_solver(
         param.weights.extend([str(weights)] if isinstance(weights, (str, Path)) else map(str, weights))
     if device is None:
         chosen = [choose_device(param, node)]
+        if processes is not None and processes.count > 1 and chosen[0].type == "cuda":
+            chosen = [own_device()]
     else:
         chosen = [torch.device(d) for d in ([device] if isinstance(device, (str, torch.device)) else device)]
     if chosen[0].type == "cpu":
@@ -110,6 +114,7 @@ def load_solver(
         action=action,
         precision=precision,
         nan=nan,
+        processes=processes,
     )
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
@@ -140,7 +145,7 @@ class Solver:
     for each test net, the mean of each output element in its last test. ``on_start()`` is called before the passes of
     each iteration, ``on_gradients()`` between them and the update, ``on_iteration()`` after it; ``on_test(i)`` after
     test net i was run, ``on_snapshot(model)`` after weights and state were written, with the path
-    of the weights.
+    of the weights. ``last_snapshot`` is the path of the last state of this run, or "".
     """
 
     def __init__(
@@ -158,6 +163,7 @@ class Solver:
         nan: str = "stop",
         clock: Callable[[], float] = time.perf_counter,
         precision: str = FP32,
+        processes: Processes | None = None,
     ) -> None:
         """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError.
 
@@ -165,12 +171,14 @@ class Solver:
         if there is no random_seed; without it one is drawn. ``action`` is called between iterations, also those of a
         test: "stop" ends the training, "snapshot" takes one. ``nan`` says what a loss of NaN or infinity does: "stop"
         raises SpecError, "warn" warns once. ``clock`` gives the seconds for "iter/s". In another ``precision`` than
-        "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order.
+        "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order. Of several
+        ``processes`` each has one training net and calls the same methods; the root tests and writes the snapshots.
         """
         node = node or Place(Where("<solver>"))
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         check_settings(param, node)
-        if param.snapshot:
+        self._processes = processes or Processes()
+        if param.snapshot and self._processes.is_root:
             check_prefix(param, node)
         self.param = param
         self.node = node
@@ -188,7 +196,7 @@ class Solver:
         self._losses: deque[float] = deque(maxlen=param.average_loss)
         self._losses_before: list[float] = []  # of a training that is resumed
         self._nan, self._told_nan = nan, False
-        self._last_snapshot = ""
+        self.last_snapshot = ""
         self._states_before_test: list[dict[str, Any]] = []
         self._displayed = (clock(), 0)
         self._waited = 0.0
@@ -201,19 +209,23 @@ class Solver:
         self._precision = precision
         self._exact = exact if precision == FP32 else NONE
         self._strict = strict
+        if seed is None:
+            seed = self._processes.seed
         drawn = int.from_bytes(os.urandom(4), "little") if seed is None else seed
         self._seed = param.random_seed if param.random_seed >= 0 else drawn
 
         train, *tests = nets.solver_nets(param, node)
         site, sentence = _CREATING[train.origin.split()[0]]
         log.info(site, sentence.format(train.origin))
-        ranks = 1 + len(others)
-        self.net = self._build(train, train.label, self._device, 0, ranks)
+        assert not (others and self._processes.count > 1), "each of several processes has one device"
+        rank, ranks = self._processes.rank, self._processes.count * (1 + len(others))
+        self.net = self._build(train, f"rank {rank}" if rank else train.label, self._device, rank, ranks)
         with log.silent():  # Caffe logs only the root
             replicas = [self._build(train, f"rank {k}", other, k, ranks) for k, other in enumerate(others, 1)]
-        self.replicas = Replicas(self.net, replicas)
+        self.replicas = Replicas(self.net, replicas, self._processes)
         self.test_nets: list[Net] = []
-        for i, test in enumerate(tests):
+        self._tests = len(tests)
+        for i, test in enumerate(tests if self._processes.is_root else ()):
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
             self.test_nets.append(self._build(test, test.label, self._device))
         self._check_size()
@@ -278,7 +290,7 @@ class Solver:
         """Train up to max_iter, then show the loss and test once more if the settings require it."""
         log.info("solver.cpp:289", f"Solving {self.net.name}")
         log.info("solver.cpp:290", f"Learning Rate Policy: {self.param.lr_policy}")
-        if self.param.snapshot_after_train:
+        if self.param.snapshot_after_train and self._processes.is_root:
             check_prefix(self.param, self.node)
         self.step(self.param.max_iter - self.iteration)
         if self.param.snapshot_after_train and not self._is_due(self.param.snapshot):
@@ -325,7 +337,7 @@ class Solver:
             self.on_gradients()
             self.apply_update()
             self.on_iteration()
-            request = self.action()
+            request = self._processes.agree(self.action())
             if self._is_due(self.param.snapshot) or request == "snapshot":
                 self.snapshot()
             if request == "stop":
@@ -340,7 +352,7 @@ class Solver:
         first = f"; the first NaN or infinity is in {found}" if found else ""
         message = f"Iteration {self.iteration}: {what}{first}"
         if self._nan == "stop":
-            kept = f"; the last good snapshot is {self._last_snapshot}" if self._last_snapshot else ""
+            kept = f"; the last good snapshot is {self.last_snapshot}" if self.last_snapshot else ""
             raise SpecError(f"{message}{kept}; lower base_lr, or go on with --nan warn", self.node.where)
         if not self._told_nan:
             log.logger.warning(f"{message}; the training goes on")
@@ -456,7 +468,7 @@ class Solver:
         net.random.begin(f"test at iteration {self.iteration}")
         tally = Tally(scorers(net, self.param))
         for _ in range(batches):
-            while request := self.action():
+            while self._processes.count == 1 and (request := self.action()):  # several agree after an iteration
                 if request == "snapshot":
                     self.snapshot()
                 self.stopped |= request == "stop"
@@ -476,7 +488,8 @@ class Solver:
     def snapshot(self) -> tuple[str, str]:
         """Write the weights and the state; return their paths, ``PREFIX_iter_N.caffemodel`` and ``.solverstate``.
 
-        With ``snapshot_format: HDF5`` both end in ``.h5``. Raises SpecError if they cannot be written.
+        With ``snapshot_format: HDF5`` both end in ``.h5``. Of several processes the root writes them.
+        Raises SpecError if they cannot be written.
         """
         if self._nan == "stop" and bad_parameter(self.net):
             self._tell_nan("the weights cannot be saved")
@@ -484,6 +497,10 @@ class Solver:
         form, ending = ("HDF5", ".h5") if hdf5 else ("binary proto", "")
         stem = f"{self.param.snapshot_prefix}_iter_{self.iteration}"
         model, state = f"{stem}.caffemodel{ending}", f"{stem}.solverstate{ending}"
+        states = self._running_states()
+        if not self._processes.is_root:
+            self.last_snapshot = state
+            return model, state
         log.info("solver.cpp:474" if hdf5 else "solver.cpp:464", f"Snapshotting to {form} file {model}")
         save_weights(self.net, model, self.param.snapshot_diff)
         site = "sgd_solver.cpp:296" if hdf5 else "sgd_solver.cpp:284"
@@ -493,17 +510,19 @@ class Solver:
         write_state(
             state,
             State(self.iteration, model, self.current_step, history),
-            before=lambda unfinished: write_extra(path_beside(state), self._extra(weights, stamp_of(unfinished))),
+            before=lambda unfinished: write_extra(
+                path_beside(state), Extra(self._seed, list(self._losses), states, weights, stamp_of(unfinished))
+            ),
         )
-        self._last_snapshot = state
+        self.last_snapshot = state
         self.on_snapshot(model)
         return model, state
 
-    def _extra(self, weights: Stamp, state: Stamp) -> Extra:
-        """Return what Caffe's state lacks. During a test, it is as before: the test is run again after a resume."""
+    def _running_states(self) -> list[dict[str, dict[str, Any]]]:
+        """Return what each net remembers. During a test, test nets' are as before: it is run again after a resume."""
         training = [running_state(net) for net in (self.net, *self.replicas.nets)]
         testing = self._states_before_test or [running_state(net) for net in self.test_nets]
-        return Extra(self._seed, list(self._losses), training + testing, weights, state)
+        return [state for states in self._processes.gather(training) for state in states] + testing
 
     def restore(self, path: str | Path) -> None:
         """Resume from a .solverstate or .solverstate.h5, of Caffe or of netspec, and from its weights.
@@ -543,12 +562,16 @@ class Solver:
 
     def _go_on(self, extra: Extra, where: Where) -> None:
         """Go on in the data where a training stopped, with the losses of its average."""
-        nets = (self.net, *self.replicas.nets, *self.test_nets)
-        if len(extra.nets) != len(nets):
-            log.logger.warning(f"{where}: is of {len(extra.nets)} nets, not {len(nets)}: the data starts again")
+        training, rank = (self.net, *self.replicas.nets), self._processes.rank
+        ranks = len(training) * self._processes.count
+        if len(extra.nets) != ranks + self._tests:
+            expected = f"{ranks} of training and {self._tests} of testing"
+            log.logger.warning(f"{where}: is of {len(extra.nets)} nets, not {expected}: the data starts again")
             return
+        nets = (*training, *self.test_nets)
+        remembered = extra.nets[rank : rank + len(training)] + extra.nets[ranks:][: len(self.test_nets)]
         try:
-            for net, states in zip(nets, extra.nets, strict=True):
+            for net, states in zip(nets, remembered, strict=True):
                 resume(net, states)
         except SpecError as fault:
             raise SpecError(fault.message, where) from None

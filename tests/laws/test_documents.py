@@ -23,7 +23,7 @@ PARSERS = {
     "loopclosure": loopclosure.cli.parser,
     "benchmarks": benchmarks.cli.parser,
 }
-OTHERS = {"source", "cd", "pip"}  # programs that are not ours
+OTHERS = {"source", "cd", "pip", "benchmarks/gpu_steps"}  # programs that are not ours
 BLOCKS = {
     (f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, found.start()) + 2}", found[1]): found[2]
     for path in DOCUMENTS
@@ -53,6 +53,8 @@ def commands(text: str) -> Iterator[list[str]]:
 def parse(words: list[str]) -> argparse.Namespace | None:
     """Parse a command with the parser of its program. Raises SystemExit for wrong usage."""
     program, *arguments = words
+    if program == "torchrun":
+        program, *arguments = arguments[arguments.index("-m") + 1 :]
     if program in OTHERS:
         return None
     if program.startswith("tools/"):

@@ -1,4 +1,4 @@
-"""Nets and solvers on a GPU: on a fake GPU, which shows what is on the wrong device."""
+"""Nets and solvers on a GPU: on a fake GPU, which shows what is on the wrong device; trainings on a real one too."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -7,19 +7,33 @@ import numpy as np
 import pytest
 import torch
 
-from fake_gpu import NAME, POSSIBLE, FakeTensor, fake_gpu
+from fake_gpu import NAME, POSSIBLE, FakeTensor, fake_gpu, gpu
 from netspec.features.describer import Describer
 from netspec.solver.solver import load_solver
+from paths import GOLDEN
 
-pytestmark = pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
+needs_fake = pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
+QUICK = ("adadelta", "adam", "nesterov", "residual_bn_shared", "sgd_clip", "sgd_iter_size")
+TRAININGS = [
+    pytest.param(folder.name, marks=() if folder.name in QUICK else pytest.mark.slow)
+    for folder in sorted((GOLDEN / "train").iterdir())
+]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def _gpu() -> Iterator[None]:
     with fake_gpu():
         yield
 
 
+@pytest.fixture(params=["fake", "cuda"])
+def device(request: pytest.FixtureRequest) -> Iterator[str]:
+    with gpu(request.param) as found:
+        yield found
+
+
+@needs_fake
+@pytest.mark.usefixtures("_gpu")
 def test_a_fake_gpu_refuses_what_a_gpu_refuses() -> None:
     x = torch.ones(2, 3, device=NAME)
     assert x.device == torch.device(NAME, 0)
@@ -34,16 +48,19 @@ def test_a_fake_gpu_refuses_what_a_gpu_refuses() -> None:
     assert (x + torch.tensor(2.0)).cpu().numpy().sum() == 18
 
 
-@pytest.mark.parametrize("case", ["adadelta", "adam", "nesterov", "residual_bn_shared", "sgd_clip", "sgd_iter_size"])
-def test_training_testing_snapshots_and_resuming(case: str, work_in: Callable[..., Path]) -> None:
+@pytest.mark.parametrize("case", TRAININGS)
+def test_training_testing_snapshots_and_resuming(
+    case: str, device: str, work_in: Callable[..., Path], record_property: Callable[[str, object], None]
+) -> None:
     work_in(f"train/{case}")
-    solver = load_solver(f"{case}/solver.prototxt", weights=f"{case}/init.caffemodel", device=NAME)
+    solver = load_solver(f"{case}/solver.prototxt", weights=f"{case}/init.caffemodel", device=device)
     golden = np.load(f"{case}/trajectory.npz")["loss"]
     found = []
     solver.on_iteration = lambda: found.append(solver.loss)
     solver.step(8)
+    record_property("losses off by", float(np.abs(found / golden[:8] - 1).max()))
     np.testing.assert_allclose(found, golden[:8], rtol=1e-3)
-    assert {item.parameter.device.type for item in solver.net.learnable} == {NAME}
+    assert {item.parameter.device.type for item in solver.net.learnable} == {torch.device(device).type}
     solver.test_all()
     _, state = solver.snapshot()
     weights = [item.parameter.detach().cpu() for item in solver.net.learnable]
@@ -56,6 +73,8 @@ def test_training_testing_snapshots_and_resuming(case: str, work_in: Callable[..
     solver.close()
 
 
+@needs_fake
+@pytest.mark.usefixtures("_gpu")
 def test_two_devices_learn_what_one_does_from_batches_of_twice_the_size(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     weights = []
@@ -72,6 +91,8 @@ def test_two_devices_learn_what_one_does_from_batches_of_twice_the_size(work_in:
         torch.testing.assert_close(two, one, rtol=1e-4, atol=1e-6)
 
 
+@needs_fake
+@pytest.mark.usefixtures("_gpu")
 def test_describer(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)

@@ -1,0 +1,190 @@
+"""Training in several processes that torchrun starts: on the CPU, by gloo."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.solver.extra import newest_pair, read_extra
+from netspec.solver.solver import Solver, load_solver
+from paths import GOLDEN
+
+pytestmark = pytest.mark.slow
+CPU = torch.device("cpu")
+LIMIT = 120  # seconds
+TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+SOLVER = """net: "net.prototxt" base_lr: 0.01 lr_policy: "step" gamma: 0.5 stepsize: 20 momentum: 0.9
+max_iter: {iterations} snapshot_prefix: "{prefix}" snapshot: {snapshot} random_seed: 7 average_loss: 3
+test_iter: 1 test_interval: 20
+snapshot_after_train: {after} solver_mode: CPU"""
+NET = """layer {{ name: "pairs" type: "Data" top: "pairs" top: "sim"
+  transform_param {{ scale: 0.00390625 mirror: true }}
+  data_param {{ source: "pairs/train_lmdb" batch_size: {batch} backend: LMDB rand_skip: 17 }} }}
+layer {{ name: "conv" type: "Convolution" bottom: "pairs" top: "conv"
+  convolution_param {{ num_output: 4 kernel_size: 5 stride: 2 weight_filler {{ type: "xavier" }} }} }}
+{middle}
+layer {{ name: "relu" type: "ReLU" bottom: "conv" top: "conv" }}
+layer {{ name: "ip" type: "InnerProduct" bottom: "conv" top: "ip"
+  inner_product_param {{ num_output: 2 weight_filler {{ type: "xavier" }} }} }}
+layer {{ name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "sim" top: "loss" }}"""
+OWN = """layer { name: "bn" type: "BatchNorm" bottom: "conv" top: "conv" }
+layer { name: "drop" type: "Dropout" bottom: "conv" top: "conv" }"""
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "pairs").symlink_to(GOLDEN / "pairs")
+    monkeypatch.chdir(tmp_path)
+
+
+def write(
+    batch: int, iterations: int, prefix: str = "x", middle: str = "", snapshot: int = 0, after: str = "true"
+) -> None:
+    Path("net.prototxt").write_text(NET.format(batch=batch, middle=middle))
+    text = SOLVER.format(iterations=iterations, prefix=prefix, snapshot=snapshot, after=after)
+    Path("solver.prototxt").write_text(text)
+
+
+def start(*options: str) -> "subprocess.Popen[str]":
+    command = [*TORCHRUN, "-m", "netspec", "train", "--solver", "solver.prototxt", *options]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True)
+
+
+def train(*options: str) -> str:
+    """Train in two processes and return what they wrote to stderr."""
+    started = start(*options)
+    _, told = started.communicate(timeout=LIMIT)
+    assert started.returncode == 0, told
+    return told
+
+
+def weights(solver: Solver, snapshot: str = "") -> list[np.ndarray]:
+    if snapshot:
+        solver.restore(snapshot)
+    return [blob.detach().numpy().copy() for blobs in solver.net.params.values() for blob in blobs]
+
+
+def process_of_rank(rank: int, parent: int) -> int:
+    """Return the process id of a rank, by the environment that torchrun gives it."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            of = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            if of == parent and f"RANK={rank}".encode() in (folder / "environ").read_bytes().split(b"\0"):
+                return int(folder.name)
+        except OSError:
+            continue
+    raise AssertionError(f"no process of rank {rank}")
+
+
+def wait_for_training(started: "subprocess.Popen[str]") -> None:
+    """Wait for the log of the first iterations."""
+    assert started.stderr is not None
+    for line in started.stderr:
+        if "Starting Optimization" in line:
+            return
+    raise AssertionError("the training did not start")
+
+
+def test_two_processes_follow_one_with_twice_the_batch() -> None:
+    write(batch=8, iterations=50)
+    told = train()
+    assert told.count("Iteration 20, Testing net (#0)") == 1, "one log"
+    assert sorted(p.name for p in Path().glob("x_*")) == [
+        "x_iter_50.caffemodel",
+        "x_iter_50.solverstate",
+        "x_iter_50.solverstate.extra",
+    ]
+    write(batch=16, iterations=50)
+    alone = load_solver("solver.prototxt")
+    begun = weights(alone)
+    alone.step(50)
+    expected = weights(alone)
+    found = weights(alone, "x_iter_50.solverstate")
+    for mine, theirs, before in zip(found, expected, begun, strict=True):
+        assert abs(mine - before).max() > 1e-3, "it learned"
+        assert np.allclose(mine, theirs, rtol=0, atol=1e-5 * abs(theirs).max() + 1e-6)
+    alone.close()
+
+
+def test_each_process_has_its_own_statistics_and_draws() -> None:
+    """As the replicas of one process, to the bit: also where batches of half the size are not one of the whole."""
+    write(batch=8, iterations=10, middle=OWN)
+    train()
+    together = load_solver("solver.prototxt", device=[CPU, CPU])
+    together.step(10)
+    expected = weights(together)
+    first, second = (net.params["bn"][0].detach() for net in (together.net, *together.replicas.nets))
+    assert not torch.equal(first, second)
+    found = weights(together, "x_iter_10.solverstate")
+    for mine, theirs in zip(found, expected, strict=True):
+        assert np.array_equal(mine, theirs)
+    together.close()
+
+
+def test_a_training_goes_on_to_the_bit() -> None:
+    write(batch=8, iterations=20, prefix="whole", middle=OWN)
+    train()
+    write(batch=8, iterations=10, prefix="parts", middle=OWN)
+    train()
+    write(batch=8, iterations=20, prefix="parts", middle=OWN)
+    assert "as if it had never stopped" in train("--resume")
+    model = "{}_iter_20.caffemodel"
+    assert Path(model.format("whole")).read_bytes() == Path(model.format("parts")).read_bytes()
+    extras = [read_extra(f"{prefix}_iter_20.solverstate") for prefix in ("whole", "parts")]
+    assert extras[0] is not None
+    assert extras[1] is not None
+    assert len(extras[0].nets) == 3, "two of training and one of testing"
+    assert (extras[0].nets, extras[0].losses) == (extras[1].nets, extras[1].losses)
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
+def test_a_killed_process_ends_the_training_and_the_last_snapshot_is_whole() -> None:
+    write(batch=2, iterations=10**7, after="false")
+    settings = Path("solver.prototxt")
+    settings.write_text(settings.read_text().replace("test_interval: 20", "test_interval: 10000000"))
+    started = start()
+    try:
+        wait_for_training(started)
+        other = process_of_rank(1, started.pid)
+        os.kill(other, signal.SIGHUP)  # any process may ask for a snapshot
+        end = time.monotonic() + LIMIT
+        while not list(Path().glob("x_iter_*.solverstate")):
+            assert time.monotonic() < end, "no snapshot was taken"
+            time.sleep(0.05)
+        os.kill(other, signal.SIGKILL)
+        _, told = started.communicate(timeout=LIMIT)
+    finally:
+        if started.poll() is None:
+            os.killpg(started.pid, signal.SIGKILL)
+    assert started.returncode != 0
+    lines = [line for line in told.splitlines() if "rank 0 of 2" in line]
+    (state,) = Path().glob("x_iter_*.solverstate")
+    assert len(lines) == 1, told
+    assert re.fullmatch(r"rank 0 of 2: another process ended.*; the last snapshot is (.*); start .*--resume", lines[0])
+    assert str(state) in lines[0]
+    assert newest_pair("x") == state
+
+
+def test_a_fault_of_the_files_is_told_once() -> None:
+    write(batch=8, iterations=10)
+    Path("net.prototxt").write_text(Path("net.prototxt").read_text().replace("Convolution", "Convolutoin", 1))
+    started = start()
+    _, told = started.communicate(timeout=LIMIT)
+    assert started.returncode != 0
+    assert len([line for line in told.splitlines() if line.startswith("net.prototxt:")]) == 1, told
+
+
+def test_a_gpu_is_not_chosen_where_torchrun_chooses() -> None:
+    write(batch=8, iterations=10)
+    started = start("--gpu", "0,1")
+    _, told = started.communicate(timeout=LIMIT)
+    assert started.returncode != 0
+    assert "leave out --gpu" in told
