@@ -36,6 +36,7 @@ def has_bfloat16() -> bool | None:
 
 
 def convolution(
+    shape: Shape,
     weight: torch.Tensor,
     bias: torch.Tensor | None,
     stride: Sequence[int],
@@ -44,21 +45,21 @@ def convolution(
     group: int,
     how: Preparation,
 ) -> Kernel:
-    """Return a convolution by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
+    """Return a convolution of maps (N, C, H, W) by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
     geometry = [list(pad), list(stride), list(dilation), group]
-    side_by_side = torch.channels_last
-    weight = how.memo(f"filters {tuple(weight.shape)} {geometry}", lambda: _laid_out(values_of(weight), geometry))
+    weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
     bias = _kept(bias, how)
     call, relu = _ops()._convolution_pointwise.default, how.finish is F.relu_
     arguments = (*geometry, "relu" if relu else "none", [], "")
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
-        return call(maps.contiguous(memory_format=side_by_side), weight, bias, *arguments)
+        return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *arguments)
 
     return finished(kernel, None if relu else how.finish)
 
 
 def deconvolution(
+    shape: Shape,
     weight: torch.Tensor,
     bias: torch.Tensor | None,
     stride: Sequence[int],
@@ -66,15 +67,13 @@ def deconvolution(
     dilation: Sequence[int],
     how: Preparation,
 ) -> Kernel:
-    """Return a transposed convolution by fixed weights (C, num_output, kernel_h, kernel_w).
+    """Return a transposed convolution of maps (N, C, H, W) by fixed weights (C, num_output, kernel_h, kernel_w).
 
     An activation is another pass here: in the same one oneDNN falls back to a slow kernel.
     """
     geometry = [list(pad), [0, 0], list(stride), list(dilation), 1]
-    lay_out, call = _ops()._reorder_convolution_transpose_weight, _ops()._convolution_transpose_pointwise.default
-    weight = how.memo(
-        f"spread {tuple(weight.shape)} {geometry}", lambda: lay_out(values_of(weight).contiguous(), *geometry, [])
-    )
+    call = _ops()._convolution_transpose_pointwise.default
+    weight = _laid_out(_ops()._reorder_convolution_transpose_weight, weight, geometry, shape, how)
     bias = _kept(bias, how)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
@@ -103,7 +102,8 @@ def spread_by_channel(
     pixels = frame[:, :, ::down, ::across]
     frames = [d * (k - 1) - p for k, d, p in zip(weight.shape[2:], dilation, pad, strict=True)]
     turned = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
-    convolve = convolution(values_of(weight).flip(2, 3), bias, (1, 1), frames, dilation, channels, turned)
+    framed = (count, channels, *frame.shape[2:])
+    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, (1, 1), frames, dilation, channels, turned)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         pixels.copy_(maps)
@@ -116,8 +116,20 @@ def _kept(bias: torch.Tensor | None, how: Preparation) -> torch.Tensor | None:
     return None if bias is None else how.memo("bias", values_of(bias).clone)
 
 
-def _laid_out(weight: torch.Tensor, geometry: Sequence[Any]) -> torch.Tensor:
-    return _ops()._reorder_convolution_weight(weight.contiguous(), *geometry, [])
+def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape: Shape, how: Preparation) -> Any:
+    """Return filters as oneDNN wants them for maps of this shape; in another layout it may be ten times as slow.
+
+    Shapes that want the same layout share it.
+    """
+    name = f"{reorder} {tuple(weight.shape)} {geometry}"
+
+    def make() -> torch.Tensor:
+        filters = values_of(weight).contiguous(memory_format=torch.channels_last)
+        laid_out = reorder(filters, *geometry, list(shape))
+        layout = getattr(_ops(), "_get_mkldnn_serialized_md", None)
+        return how.memo(f"{name} {layout(laid_out).tolist()}", lambda: laid_out) if layout else laid_out
+
+    return how.memo(f"{name} {shape}", make)
 
 
 def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernel:

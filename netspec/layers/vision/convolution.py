@@ -250,7 +250,7 @@ class Convolution(_SlidingFilter):
             return finished(prepared_columns(self.bottom_shapes[0], weight, bias, sliding), how.finish)
         geometry = (self.stride, self.pad, self.dilation, self.group)
         if self.bottom_shapes[0][0] * self._work > SMALL_PRODUCT and how.pack and fused.suits(weight):
-            return fused.convolution(weight, bias, *geometry, how)
+            return fused.convolution(self.bottom_shapes[0], weight, bias, *geometry, how)
         return finished(lambda maps: torch.conv2d(maps, weight, bias, *geometry), how.finish)
 
     @override
@@ -376,7 +376,7 @@ class Deconvolution(Convolution):
         if usual and not exact and large and how.pack and fused.suits(weight):
             geometry = (self.stride, self.pad, self.dilation)
             if self.group == 1:
-                return fused.deconvolution(weight, bias, *geometry, how)
+                return fused.deconvolution(self.bottom_shapes[0], weight, bias, *geometry, how)
             fits = all(p < e for p, e in zip(self.pad, self.extent, strict=True))
             if self.group == self.channels == self.num_output and fits and max(self.stride) <= 2:
                 return fused.spread_by_channel(self.bottom_shapes[0], weight, bias, *geometry, how)
