@@ -21,23 +21,23 @@ CAFFES = "SkylakeX"  # OpenBLAS' name of its kernels for AVX-512, with which the
 CORE_TYPE = "OPENBLAS_CORETYPE"  # the environment variable by which OpenBLAS chooses its kernels, when it is loaded
 
 
-def _load() -> tuple[Any, Any]:
-    """Return SciPy's BLAS, for arrays and for addresses, with the kernels for AVX-512 that Caffe's had, if possible.
+@cache
+def _library(name: str) -> Any:
+    """Return SciPy's BLAS, ``blas`` for arrays or ``cython_blas`` for addresses, with Caffe's kernels, for AVX-512.
 
     OpenBLAS chooses others on some newer CPUs. What the environment says stays; if SciPy's BLAS was loaded before, so
-    do its kernels.
+    do its kernels. Loading takes half a second, for which nets without exact sums need not wait.
     """
     chosen = CORE_TYPE not in os.environ and torch.backends.cpu.get_cpu_capability() == "AVX512"
     if chosen:
         os.environ[CORE_TYPE] = CAFFES
     try:
-        return import_module("scipy.linalg.blas"), import_module("scipy.linalg.cython_blas")
+        return import_module(f"scipy.linalg.{name}")
     finally:
         if chosen:
             del os.environ[CORE_TYPE]
 
 
-blas, cython_blas = _load()
 _IN_DOUBLE = 32  # OpenBLAS' dot sums up fewer products than this in double, one by one
 
 
@@ -52,9 +52,7 @@ def array(values: torch.Tensor) -> np.ndarray:
 
 
 def _routine(name: str, values: np.ndarray) -> Callable[..., Any]:
-    from scipy.linalg import blas  # half a second, for which nets without exact sums need not wait
-
-    return getattr(blas, values.dtype.char.replace("f", "s") + name)
+    return getattr(_library("blas"), values.dtype.char.replace("f", "s") + name)
 
 
 def gemm_routine(values: np.ndarray) -> Callable[..., Any]:
@@ -112,7 +110,7 @@ _ARGUMENTS = {"gemm": 13, "gemv": 11}
 @cache
 def _function(name: str, dtype: torch.dtype) -> Callable[..., None]:
     """Return a Fortran routine of SciPy's BLAS, whose arguments are addresses."""
-    capsule = cython_blas.__pyx_capi__[("s" if dtype == torch.float32 else "d") + name]
+    capsule = _library("cython_blas").__pyx_capi__[("s" if dtype == torch.float32 else "d") + name]
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
@@ -185,9 +183,14 @@ def one_thread() -> Iterator[None]:
             pool.set_num_threads(count)
 
 
+def kernels() -> set[str]:
+    """Return OpenBLAS' names of the kernels that BLAS has."""
+    return {pool.info().get("architecture", "unknown") for pool in _pools()}
+
+
 def other_kernels() -> str:
     """Return what to say where BLAS does not have the kernels for AVX-512; "" where it does."""
-    found = {pool.info().get("architecture", "unknown") for pool in _pools()} or {"another BLAS"}
+    found = kernels() or {"another BLAS"}
     if CAFFES in found:
         return ""
     return (
@@ -199,7 +202,6 @@ def other_kernels() -> str:
 @cache
 def _pools() -> list[Any]:
     """Return the OpenBLAS that SciPy brings, or every one there is where SciPy's has no place of its own."""
-    import scipy.linalg  # noqa: F401  so that its OpenBLAS is there
-
+    _library("blas")  # so that its OpenBLAS is there
     pools = ThreadpoolController().select(internal_api="openblas").lib_controllers
     return [pool for pool in pools if "scipy.libs" in pool.filepath] or pools

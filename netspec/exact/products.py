@@ -142,15 +142,16 @@ class ColumnProducts(ParameterSums):
 
 
 def prepared_columns(
-    shape: Axes, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter
+    shape: Axes, sliding: Filter, weight: torch.Tensor, bias: torch.Tensor | None = None
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return what :class:`ColumnProducts` computes for maps (N, C, H, W) of one shape, without gradients.
 
-    It works in memory of its own, on copies of the weights, and expects that BLAS uses one thread.
+    It works in memory of its own, on copies of the weights, which ask for no gradient, and expects that BLAS uses one
+    thread.
     """
     count, fits, outputs = shape[0], sliding.fits(shape[2:]), len(weight)
-    filters = weight.detach().flatten(1).clone().numpy().T
-    bias = None if bias is None else bias.detach().clone().view(-1, 1)
+    filters = weight.flatten(1).clone().numpy().T
+    bias = None if bias is None else bias.clone().view(-1, 1)
     lay_out = _columns_of_shape(shape, weight.dtype, sliding, fits)
     top_shape, rows = (count, outputs, *fits), (count, outputs, fits[0] * fits[1])
     multiply, dtype = gemm_routine(filters), weight.dtype
@@ -385,14 +386,14 @@ class SummedProducts(ParameterSums):
 
 
 def prepared_vectors(
-    rows: int, weight: torch.Tensor, bias: torch.Tensor | None, transposed: bool
+    rows: int, transposed: bool, weight: torch.Tensor, bias: torch.Tensor | None = None
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return what :class:`VectorProducts` computes for vectors (rows, K), without gradients.
 
-    It works on copies of the weights, and expects that BLAS uses one thread.
+    It works on copies of the weights, which ask for no gradient, and expects that BLAS uses one thread.
     """
-    matrix = weight.detach().clone(memory_format=torch.contiguous_format).numpy().T
-    bias = None if bias is None else bias.detach().clone()
+    matrix = weight.clone(memory_format=torch.contiguous_format).numpy().T
+    bias = None if bias is None else bias.clone()
     outputs = weight.shape[1 if transposed else 0]
     multiply, trans = gemm_routine(matrix), int(not transposed)
 

@@ -390,6 +390,10 @@ class Layer(torch.nn.Module):
         tensor = self.blobs[index]
         return tensor if tensor.shape == self.blob_shapes[index] else tensor.view(self.blob_shapes[index])
 
+    def values(self) -> list[torch.Tensor]:
+        """Return the values of all learnable blobs, in this layer's shapes, without gradients, for reading."""
+        return [values_of(self.blob(j)) for j in range(len(self.blobs))]
+
     def possible(self, shape: Sequence[int]) -> Shape:
         """Return a shape as a tuple; refuse one with a negative size, or of more numbers than Caffe can count."""
         if min(shape, default=0) < 0:

@@ -79,7 +79,7 @@ class InnerProduct(Layer):
         rows = math.prod(top_shape[:-1])
         one_by_one = (rows, self.inputs)
         if self.is_exact(weight, self.small):
-            multiply = finished(prepared_vectors(rows, weight, bias, transposed), how.finish)
+            multiply = finished(prepared_vectors(rows, transposed, *self.values()), how.finish)
         else:
             weight = weight.t() if transposed else weight
             # A single vector is multiplied as fast as memory gives the weights, whatever their layout.

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
+from netspec.exact.products import Filter
 from netspec.layers.base import Kernel, Preparation, Shape, finished
 from netspec.layers.learned import values_of
 
@@ -39,14 +40,12 @@ def convolution(
     shape: Shape,
     weight: torch.Tensor,
     bias: torch.Tensor | None,
-    stride: Sequence[int],
-    pad: Sequence[int],
-    dilation: Sequence[int],
+    sliding: Filter,
     group: int,
     how: Preparation,
 ) -> Kernel:
     """Return a convolution of maps (N, C, H, W) by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
-    geometry = [list(pad), list(stride), list(dilation), group]
+    geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]
     weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
     bias = _kept(bias, how)
     call, relu = _ops()._convolution_pointwise.default, how.finish is F.relu_
@@ -59,19 +58,13 @@ def convolution(
 
 
 def deconvolution(
-    shape: Shape,
-    weight: torch.Tensor,
-    bias: torch.Tensor | None,
-    stride: Sequence[int],
-    pad: Sequence[int],
-    dilation: Sequence[int],
-    how: Preparation,
+    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Preparation
 ) -> Kernel:
     """Return a transposed convolution of maps (N, C, H, W) by fixed weights (C, num_output, kernel_h, kernel_w).
 
     An activation is another pass here: in the same one oneDNN falls back to a slow kernel.
     """
-    geometry = [list(pad), [0, 0], list(stride), list(dilation), 1]
+    geometry = [list(sliding.pad), [0, 0], list(sliding.stride), list(sliding.dilation), 1]
     call = _ops()._convolution_transpose_pointwise.default
     weight = _laid_out(_ops()._reorder_convolution_transpose_weight, weight, geometry, shape, how)
     bias = _kept(bias, how)
@@ -83,27 +76,21 @@ def deconvolution(
 
 
 def spread_by_channel(
-    shape: Shape,
-    weight: torch.Tensor,
-    bias: torch.Tensor | None,
-    stride: Sequence[int],
-    pad: Sequence[int],
-    dilation: Sequence[int],
-    how: Preparation,
+    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Preparation
 ) -> Kernel:
     """Return a transposed convolution by weights (C, 1, kernel_h, kernel_w), each channel of (N, C, H, W) by itself.
 
     oneDNN's own is slow. A convolution does the same on maps with ``stride`` - 1 zeros between the pixels, with the
     filters turned around.
     """
-    (count, channels, *size), (down, across) = shape, stride
-    frame = weight.new_zeros(count, channels, *((n - 1) * s + 1 for n, s in zip(size, stride, strict=True)))
-    frame = frame.detach().contiguous(memory_format=torch.channels_last)
+    (count, channels, *size), (down, across) = shape, sliding.stride
+    framed = (count, channels, (size[0] - 1) * down + 1, (size[1] - 1) * across + 1)
+    frame = values_of(weight).new_zeros(framed).contiguous(memory_format=torch.channels_last)
     pixels = frame[:, :, ::down, ::across]
-    frames = [d * (k - 1) - p for k, d, p in zip(weight.shape[2:], dilation, pad, strict=True)]
-    turned = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
-    framed = (count, channels, *frame.shape[2:])
-    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, (1, 1), frames, dilation, channels, turned)
+    axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
+    turned = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
+    apart = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
+    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, apart)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         pixels.copy_(maps)

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import threadpoolctl
 
 from fresh_dialects import fresh_dialects
 from netspec.cli import main
+from netspec.exact.blas import CAFFES, kernels
 from netspec.graph.filter import with_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
@@ -30,10 +30,7 @@ def leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def same_blas() -> bool:
     """Whether SciPy's BLAS has the kernels that Caffe's had when it computed the golden files, those for AVX-512."""
-    return any(
-        "scipy.libs" in library["filepath"] and library.get("architecture") == "SkylakeX"
-        for library in threadpoolctl.threadpool_info()
-    )
+    return CAFFES in kernels()
 
 
 @pytest.fixture(scope="session")

@@ -245,12 +245,12 @@ class Convolution(_SlidingFilter):
         exact = self.is_exact(weight, self.small)
         if not usual or len(self.bottom_shapes) > 1 or (exact and self.group > 1):
             return super().prepare(how)
+        shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
         if exact:
-            sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
-            return finished(prepared_columns(self.bottom_shapes[0], weight, bias, sliding), how.finish)
+            return finished(prepared_columns(shape, sliding, *self.values()), how.finish)
+        if shape[0] * self._work > SMALL_PRODUCT and how.pack and fused.suits(weight):
+            return fused.convolution(shape, weight, bias, sliding, self.group, how)
         geometry = (self.stride, self.pad, self.dilation, self.group)
-        if self.bottom_shapes[0][0] * self._work > SMALL_PRODUCT and how.pack and fused.suits(weight):
-            return fused.convolution(self.bottom_shapes[0], weight, bias, *geometry, how)
         return finished(lambda maps: torch.conv2d(maps, weight, bias, *geometry), how.finish)
 
     @override
@@ -374,12 +374,12 @@ class Deconvolution(Convolution):
         usual = self.channel_axis == 1 and self.spatial_axes == 2 and len(self.bottom_shapes) == 1
         exact, large = self.is_exact(weight, self.small), self.multiply_adds() > SMALL_PRODUCT
         if usual and not exact and large and how.pack and fused.suits(weight):
-            geometry = (self.stride, self.pad, self.dilation)
+            shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
             if self.group == 1:
-                return fused.deconvolution(self.bottom_shapes[0], weight, bias, *geometry, how)
+                return fused.deconvolution(shape, weight, bias, sliding, how)
             fits = all(p < e for p, e in zip(self.pad, self.extent, strict=True))
             if self.group == self.channels == self.num_output and fits and max(self.stride) <= 2:
-                return fused.spread_by_channel(self.bottom_shapes[0], weight, bias, *geometry, how)
+                return fused.spread_by_channel(shape, weight, bias, sliding, how)
         return Layer.prepare(self, how)
 
     onnx_op = "ConvTranspose"

@@ -16,7 +16,8 @@ from paths import ROOT
 
 KERNELS = f"""
 import os, threadpoolctl
-import netspec.exact.blas
+from netspec.exact.blas import kernels
+kernels()
 found = [library for library in threadpoolctl.threadpool_info() if "scipy.libs" in library["filepath"]]
 print(found[0]["architecture"])
 print(os.environ.get("{CORE_TYPE}"))

@@ -212,6 +212,20 @@ def test_shapes_may_change_from_run_to_run(net_of: Callable[..., Net]) -> None:
     assert len(net.programs.made) == 3
 
 
+@pytest.mark.parametrize("exact", ["none", "small"])
+def test_what_was_prepared_for_a_shape_is_there_when_it_comes_again(exact: str, net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK + SHARED, exact=exact))
+    sizes = (5, 40, 7)
+    for size in sizes:
+        quickly(net, data=images(1, 8, size, size))
+    assert net.programs is not None
+    prepared = list(net.programs.made.values())
+    for size in sizes:
+        quickly(net, data=images(1, 8, size, size))
+    assert all(a is b for a, b in zip(net.programs.made.values(), prepared, strict=True))
+    assert "as is" not in {kind for program in prepared for kind in program.kinds}
+
+
 def test_programs_of_a_net_are_bounded(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(programs, "PROGRAMS", 2)
     net = trained(net_of(BLOCK))
