@@ -10,7 +10,7 @@ They know no layer type: :class:`Roles` says of each layer what it can do.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from netspec.graph.fold import Chain, Roles, find_chains, origins
 from netspec.graph.plan import Plan
@@ -60,7 +60,7 @@ def schedule(
     """
     passes_on = roles.passes_on if SKIP in passes else [False] * len(plan.nodes)
     kept = {*kept, *plan.outputs.values()}
-    chains = find_chains(plan, _with(roles, passes_on), kept) if FOLD in passes else []
+    chains = find_chains(plan, replace(roles, passes_on=passes_on), kept) if FOLD in passes else []
     by_keeper = {chain.keeper: chain for chain in chains}
     gone = {i for chain in chains for i in chain.folded}
     origin = origins(plan, passes_on)
@@ -83,10 +83,6 @@ def schedule(
     return Schedule(tuple(_with_ends(steps, fresh, lasting, FUSE in passes)), origin)
 
 
-def _with(roles: Roles, passes_on: Sequence[bool]) -> Roles:
-    return Roles(roles.absorbs, roles.affine, roles.absorbs_before, passes_on)
-
-
 def _readers(plan: Plan, origin: Sequence[int], passes_on: Sequence[bool]) -> dict[int, list[int]]:
     """Return the layers that read each value, in running order."""
     readers: dict[int, list[int]] = {}
@@ -105,7 +101,7 @@ def _with_ends(steps: Sequence[Step], fresh: Sequence[bool], lasting: Collection
         ends = tuple(dict.fromkeys(v for v in (*step.bottoms, *step.tops) if last[v] == s and v not in lasting))
         first = step.bottoms[0] if step.bottoms else -1
         reuse = reusing and first in ends and first in owned and step.bottoms.count(first) == 1
-        made.append(Step(step.node, step.bottoms, step.tops, step.chain, step.finish, reuse, ends))
+        made.append(replace(step, reuse=reuse, ends=ends))
         if fresh[step.node]:
             owned.update(step.tops)
         else:

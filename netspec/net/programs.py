@@ -12,14 +12,13 @@ import copy
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from netspec.exact import ALL
 from netspec.exact.blas import one_thread
-from netspec.graph.fold import Roles
 from netspec.graph.steps import PACK, Schedule, Step, schedule
 from netspec.layers.base import Kernel, Layer, Preparation, Shape
 from netspec.layers.learned import Stamp, is_lent, stamp
@@ -128,11 +127,11 @@ class Programs:
         foldable = [not (e or a) for e, a in zip(exact, as_is, strict=True)]
         order = schedule(
             plan,
-            Roles(
+            replace(
+                roles,
                 absorbs=_both(roles.absorbs, foldable),
                 affine=_both(roles.affine, foldable),
                 absorbs_before=_both(roles.absorbs_before, foldable),
-                passes_on=roles.passes_on,
             ),
             finishes=[found is not None and found.finishing() is not None for found in fitted],
             fresh=[found is not None and found.fresh for found in fitted],
