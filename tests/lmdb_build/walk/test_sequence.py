@@ -13,7 +13,8 @@ from lmdb_build.walk.render import Camera, Light, Renderer
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import same_place_matrix
-from loopclosure.places.trajectory import PosedSequence, read_groundtruth, read_tum_sequence, rotation_matrices
+from loopclosure.places.sequences import read_posed
+from loopclosure.places.trajectory import PosedSequence, read_groundtruth, rotation_matrices
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sequence(folder: Path) -> PosedSequence:
-    return read_tum_sequence(folder)
+    return read_posed(folder, "tum")
 
 
 def plain_light(rooms: int = 1) -> Light:
