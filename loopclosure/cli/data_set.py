@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from loopclosure.cli.run import WrongUsage, show_progress
+from loopclosure.cli.run import WrongUsage, show_progress, warn
 from loopclosure.places import datasets
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
@@ -106,7 +105,7 @@ def sequence(a: argparse.Namespace, source: str, layout: str) -> ImageSequence:
         layout = "images"
     read = read_sequence(path, layout, poses=poses)
     for doubt in read.doubts:
-        print(f"warning: {doubt}", file=sys.stderr)
+        warn(doubt)
     return read
 
 

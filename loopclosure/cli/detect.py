@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from loopclosure.cli.data_set import add_selection, add_topics, selection
-from loopclosure.cli.run import Commands, WrongUsage, show_progress
+from loopclosure.cli.run import Commands, WrongUsage, show_progress, warn
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -98,7 +97,7 @@ def _detect(a: argparse.Namespace) -> None:
         raise WrongUsage("--topic and --pose-topic belong to bags")
     recording = run.open_recording(source, selection(a))
     for doubt in recording.doubts:
-        print(f"warning: {doubt}", file=sys.stderr)
+        warn(doubt)
     features = read_features(a.features) if a.features else None
     validation = read_features(a.calibrate_features) if a.calibrate_features else None
     describe = run.load_describe(a.describe, options) if features is None else None

@@ -157,18 +157,23 @@ def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
     return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), quaternions)
 
 
-def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame]) -> None:
-    """Write ``rgb.txt`` with TUM's three comment lines; stamps with microseconds."""
-    lines = ["# color images", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
+def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame], what: str = "color images") -> None:
+    """Write ``rgb.txt`` or ``depth.txt`` with TUM's three comment lines; stamps with microseconds."""
+    lines = [f"# {what}", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
     lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
     with whole_file(Path(path)) as unfinished:
         unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write ``groundtruth.txt`` with TUM's three comment lines; meters and quaternions with six decimals."""
+    """Write ``groundtruth.txt`` as :func:`write_trajectory` does."""
+    write_trajectory(path, trajectory, "ground truth")
+
+
+def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what: str) -> None:
+    """Write poses in TUM's form with its three comment lines; meters and quaternions with six decimals."""
     lines = [
-        "# ground truth trajectory",
+        f"# {what} trajectory",
         f"# file: '{Path(path).parent.name}'",
         "# timestamp tx ty tz qx qy qz qw",
     ]
