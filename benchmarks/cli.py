@@ -55,6 +55,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--without-others", action="store_true", help="leave out FAISS, which would be installed")
     p.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
     p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
+    p = commands.add("feeding", _feeding, "how long trainings wait for data from databases and image files")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
+    p.add_argument("--batch", type=int, default=4, help="items of a batch (default: 4)")
+    p.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
     commands.add("list", _list, "list the nets of the catalogue")
     return made
 
@@ -113,6 +117,12 @@ def _waiting(arguments: argparse.Namespace) -> None:
 
     for name in arguments.nets:
         compare(name, arguments.waits, arguments.batch, arguments.threads, arguments.rounds)
+
+
+def _feeding(arguments: argparse.Namespace) -> None:
+    from benchmarks.feeding import measure
+
+    measure(arguments.nets, arguments.batch, arguments.threads, print)
 
 
 def _growth(arguments: argparse.Namespace) -> None:
