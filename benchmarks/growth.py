@@ -212,7 +212,7 @@ def workers(size: int) -> Found:
         names = []
         for number, image in enumerate(write_walk(folder / "walk", Walk(frames=20, width=640, height=480))):
             names.append(f"{number}.png")
-            cv2.imwrite(str(folder / names[-1]), cv2.imread(str(image)))
+            cv2.imwrite(str(folder / names[-1]), np.array(cv2.imread(str(image))))
         lines = [f"{names[k % len(names)]} {names[(k + 1) % len(names)]} 1" for k in range(PAIRS)]
         (folder / "pairs.txt").write_text("\n".join(lines) + "\n")
         entries = read_pairs(str(folder / "pairs.txt"))
