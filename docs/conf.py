@@ -15,6 +15,7 @@ project = "netspec"
 author = "the netspec authors"
 extensions = ["myst_parser", "reference"]
 exclude_patterns = ["_build"]
+highlight_language = "text"
 html_theme = "furo"
 html_title = "netspec: the living Caffe"
 html_copy_source = False
@@ -32,7 +33,7 @@ LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]*)(#[^)]*)?\)")
 
 
 def rewrite(text: str, folder: Path) -> str:
-    """Return the text of a file of ``folder``, its links as the site has them: those to files without a page as text."""
+    """Return the text of a file of ``folder``, its links as the site has them; those without a page are text."""
 
     def replaced(found: re.Match[str]) -> str:
         label, target, anchor = found[1], found[2], found[3] or ""

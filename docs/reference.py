@@ -34,7 +34,7 @@ class FromCode(SphinxDirective):
 
 
 class CommandReference(FromCode):
-    """All commands of a program, with their options as ``--help`` shows them."""
+    """All commands of a program, with what ``--help`` says of their arguments."""
 
     def markdown(self, name: str) -> str:
         """Return a section for each command."""
@@ -43,8 +43,8 @@ class CommandReference(FromCode):
         parser = import_module(f"{name.replace('-', '_')}.cli").parser()
         lines = []
         for command, made in _commands(parser):
-            made.formatter_class = lambda prog: argparse.HelpFormatter(prog, max_help_position=32, width=100)
-            lines += [f"## {name} {command}", "", "```text", made.format_help().rstrip(), "```", ""]
+            lines += [f"## {name} {command}", "", _prose(made.description or ""), ""]
+            lines += ["| | |", "|---|---|", *_options(made), ""]
         return "\n".join(lines)
 
 
@@ -103,6 +103,19 @@ def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.A
             for command, made in action.choices.items():
                 inner = list(_commands(made))
                 yield from ((f"{command} {name}", parser) for name, parser in inner) if inner else [(command, made)]
+
+
+def _options(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """Yield the rows of a table of a command's arguments."""
+    for action in parser._actions:
+        if isinstance(action, argparse._HelpAction) or action.help is argparse.SUPPRESS:
+            continue
+        words = [f"`{word}`" for word in action.option_strings if not word.startswith("--no")]
+        if action.nargs != 0 and not isinstance(action, argparse.BooleanOptionalAction):
+            shown = action.metavar or (",".join(map(str, action.choices)) if action.choices else action.dest.upper())
+            words[-1:] = [f"{words[-1]} `{shown}`" if words else f"`{shown}`"]
+        text = parser._get_formatter()._expand_help(action) if action.help else ""
+        yield f"| {', '.join(words)} | {_prose(text).replace('|', CELL)} |".replace("NAME|FILE", f"NAME{CELL}FILE")
 
 
 def _message_of(kind: str) -> tuple[str, str] | None:

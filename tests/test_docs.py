@@ -1,4 +1,4 @@
-"""The pages of docs/: their commands and snippets run as they stand, and the site that is made of them has no bad link."""
+"""The pages of docs/: their commands and snippets run as they stand, and their site has no bad link."""
 
 import os
 import re
