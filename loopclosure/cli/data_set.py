@@ -9,6 +9,7 @@ from loopclosure.cli.run import WrongUsage
 from loopclosure.places import datasets
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.frames import Selection
+from loopclosure.places.overlap import ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.truth import Exclusion
 
@@ -16,7 +17,7 @@ KINDS = ("tum", "fabmap", "images", "traverses", "pairs")
 # Which options belong to which data set: given with another one they would be ignored, so they are refused.
 BELONGS = {
     "truth": ("images", "fabmap"),
-    "references": ("images",),
+    "references": ("images", "tum"),
     "camera": ("fabmap",),
     "coordinates": ("fabmap",),
     "tolerance": ("traverses",),
@@ -25,6 +26,8 @@ BELONGS = {
     "max_angle": ("tum",),
     "soft_distance": ("tum",),
     "soft_angle": ("tum",),
+    "fov": ("tum",),
+    "overlap": ("tum",),
     "exclude_frames": ("tum", "fabmap", "images"),
     "exclude_seconds": ("tum",),
 }
@@ -40,7 +43,7 @@ def add_data_set(p: argparse.ArgumentParser) -> None:
     data.add_argument("--pairs", metavar="FOLDER", help="places photographed twice (pairs.csv)")
     add_selection(p, "--", "")
     p.add_argument("--truth", metavar="MASK", help=".mat .npy .txt or image: which frames show the same place")
-    p.add_argument("--references", metavar="FOLDER", help="of --images, if they are another folder")
+    p.add_argument("--references", metavar="FOLDER", help="of --images or --tum, if they are another folder")
     p.add_argument("--camera", choices=CAMERAS, help="of --fabmap (default: both)")
     p.add_argument("--coordinates", metavar="FILE", help="of --fabmap, if not in the folder")
     p.add_argument("--tolerance", type=int, metavar="FRAMES", help="of --traverses (default: 0)")
@@ -49,6 +52,16 @@ def add_data_set(p: argparse.ArgumentParser) -> None:
     p.add_argument("--max-angle", type=float, metavar="DEG", help=f"of --tum (default: {MAX_ANGLE_DEG:g})")
     p.add_argument("--soft-distance", type=float, metavar="M", help="a match up to here is ignored, not wrong")
     p.add_argument("--soft-angle", type=float, metavar="DEG", help="the same, for the angle")
+    p.add_argument(
+        "--fov", type=float, metavar="DEG", help=f"horizontal field of view (default: {ViewOverlap().fov_deg:g})"
+    )
+    p.add_argument(
+        "--overlap",
+        type=float,
+        metavar="SHARE",
+        help="the soft zone: a match is no mistake if so much of each view is visible in the other "
+        f"(default: {ViewOverlap().least:g})",
+    )
     p.add_argument(
         "--exclude-frames",
         type=int,
@@ -87,6 +100,8 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     chosen = selection(a)
     excluded = a.exclude_frames is not None or a.exclude_seconds is not None
     exclusion = Exclusion(a.exclude_frames or 0, a.exclude_seconds or 0.0) if excluded else None
+    if kind in ("tum", "images") and a.references is not None and excluded:
+        raise WrongUsage("--exclude-frames means nothing with --references: nothing is near in time")
     if kind == "tum":
         return datasets.load_tum(
             a.tum,
@@ -96,6 +111,11 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
             max_angle_deg=MAX_ANGLE_DEG if a.max_angle is None else a.max_angle,
             soft_distance_m=a.soft_distance,
             soft_angle_deg=a.soft_angle,
+            references=a.references,
+            view_overlap=ViewOverlap(
+                ViewOverlap().fov_deg if a.fov is None else a.fov,
+                ViewOverlap().least if a.overlap is None else a.overlap,
+            ),
         )
     if kind == "fabmap":
         camera = a.camera or "both"
@@ -105,8 +125,6 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     if kind == "images":
         if a.truth is None:
             raise WrongUsage("--images needs --truth, the mask that says which frames show the same place")
-        if a.references is not None and excluded:
-            raise WrongUsage("--exclude-frames means nothing with --references: nothing is near in time")
         return datasets.load_folder(a.images, a.truth, a.references, chosen, exclusion or datasets.FOLDER_EXCLUSION)
     if kind == "traverses":
         queries, references = a.traverses

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +13,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.cameras import comparable, images_of_places, mask_of_places
 from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_bgr
 from loopclosure.places.masks import read_coordinates, read_place_pairs, read_truth_matrix
+from loopclosure.places.overlap import ViewOverlap, Views, depth_of, overlap_matrix, views
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
@@ -37,6 +38,8 @@ class DataSet:
     stamps               (Q,) seconds, if known
     positions            (Q, 3) meters or (Q, 2), if known: for the map
     quaternions          (Q, 4) xyzw, if known
+    overlap              (Q, R) bool: views that overlap as far as poses and depth tell; None without poses
+    overlap_rule         text: when they overlap
     notes                what a reader of the results should know: what was left out, what looks odd
     """
 
@@ -48,12 +51,22 @@ class DataSet:
     stamps: np.ndarray | None = None
     positions: np.ndarray | None = None
     quaternions: np.ndarray | None = None
+    overlap: np.ndarray | None = None
+    overlap_rule: str = ""
     notes: list[str] = field(default_factory=list)
 
     @property
     def references(self) -> list[Path]:
         """Return the reference images: the queries themselves in one sequence."""
         return self.query_images if self.reference_images is None else self.reference_images
+
+    @property
+    def soft_truth(self) -> Truth | None:
+        """The truth by which a match of overlapping views is no mistake; None where the overlap is not known."""
+        if self.overlap is None:
+            return None
+        description = f"{self.truth.description}; no mistake where views overlap: {self.overlap_rule}"
+        return replace(self.truth, soft=self.truth.soft | self.overlap, description=description)
 
 
 def load_tum(
@@ -66,30 +79,77 @@ def load_tum(
     soft_distance_m: float | None = None,
     soft_angle_deg: float | None = None,
     max_difference_s: float = MAX_DIFFERENCE_S,
+    references: str | Path | None = None,
+    view_overlap: ViewOverlap | None = None,
 ) -> DataSet:
     """Load a TUM RGB-D sequence; truth by the paper's rule from its poses, with wider limits for soft truth, if given.
 
     Frames without a pose within ``max_difference_s`` are left out before ``selection`` counts.
+
+    references    another sequence, with poses in the same frame of reference: each query against all its frames;
+                  ``selection`` applies to the queries only, and no pair is excluded
+    view_overlap  which other views are no mistake in the soft zone
     """
+    rule = f"same place: nearer than {max_distance_m:g} m and turned less than {max_angle_deg:g} degrees"
+    wide = None
+    if soft_distance_m is not None or soft_angle_deg is not None:
+        wide = (
+            max_distance_m if soft_distance_m is None else soft_distance_m,
+            max_angle_deg if soft_angle_deg is None else soft_angle_deg,
+        )
+        if wide[0] < max_distance_m or wide[1] < max_angle_deg:
+            raise InputError(f"soft truth ({wide[0]:g} m, {wide[1]:g} degrees) is narrower than hard truth ({rule})")
+        rule += f" (soft: {wide[0]:g} m, {wide[1]:g} degrees)"
+    view_overlap = view_overlap or ViewOverlap()
+    queries = _posed_images(folder, selection, max_difference_s)
+    others = queries if references is None else _posed_images(references, ALL_FRAMES, max_difference_s)
+    poses, stamps = queries.views.poses, queries.stamps
+    hard = same_place_matrix(poses, others.views.poses, max_distance_m, max_angle_deg)
+    soft = None if wide is None else same_place_matrix(poses, others.views.poses, *wide)
+    height, width = read_bgr(queries.images[0]).shape[:2]
+    overlap = overlap_matrix(queries.views, others.views, view_overlap, height / width)
+    measured = bool(queries.views.measured.any() or others.views.measured.any())
+    known = {
+        "stamps": stamps,
+        "positions": poses.positions,
+        "quaternions": poses.quaternions,
+        "overlap": overlap,
+        "overlap_rule": view_overlap.describe(measured),
+    }
+    notes = [
+        f"frames without a pose, left out: {part.dropped}{'' if references is None else f' of {part.name}'}"
+        for part in ([queries] if references is None else [queries, others])
+        if part.dropped
+    ]
+    name = f"{queries.name}{_selection_text(selection)}"
+    if references is not None:
+        truth = traverse_truth(hard, rule, soft=soft)
+        return _checked(
+            DataSet(f"{name} in {others.name}", queries.images, others.images, truth, notes=notes, **known), hard
+        )
+    truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
+    frames = _excluded_frames(exclusion, stamps)
+    return _checked(DataSet(name, queries.images, None, truth, frames, notes=notes, **known), hard)
+
+
+@dataclass(frozen=True)
+class _PosedImages:
+    """The selected frames of a sequence: N paths, stamps (N,), and views."""
+
+    name: str
+    images: list[Path]
+    stamps: np.ndarray
+    views: Views
+    dropped: int
+
+
+def _posed_images(folder: str | Path, selection: Selection, max_difference_s: float) -> _PosedImages:
     sequence = read_tum_sequence(folder, max_difference_s)
     taken = selection.numbers(len(sequence))
     images = _existing([Path(folder) / sequence.frames[i].path for i in taken])
-    poses, stamps = sequence.poses[taken], sequence.stamps[taken]
-    hard = same_place_matrix(poses, poses, max_distance_m, max_angle_deg)
-    rule = f"same place: nearer than {max_distance_m:g} m and turned less than {max_angle_deg:g} degrees"
-    soft = None
-    if soft_distance_m is not None or soft_angle_deg is not None:
-        wide_m = max_distance_m if soft_distance_m is None else soft_distance_m
-        wide_deg = max_angle_deg if soft_angle_deg is None else soft_angle_deg
-        if wide_m < max_distance_m or wide_deg < max_angle_deg:
-            raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({rule})")
-        soft = same_place_matrix(poses, poses, wide_m, wide_deg)
-        rule += f" (soft: {wide_m:g} m, {wide_deg:g} degrees)"
-    notes = [f"frames without a pose, left out: {sequence.dropped}"] if sequence.dropped else []
-    truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
-    name = f"{sequence.name}{_selection_text(selection)}"
-    frames = _excluded_frames(exclusion, stamps)
-    return _checked(DataSet(name, images, None, truth, frames, stamps, poses.positions, poses.quaternions, notes), hard)
+    stamps = sequence.stamps[taken]
+    seen = views(sequence.poses[taken], depth_of(folder, stamps))
+    return _PosedImages(sequence.name, images, stamps, seen, sequence.dropped)
 
 
 def load_fabmap(
@@ -132,7 +192,7 @@ def load_fabmap(
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
     views = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
     name = f"{folder.resolve().name}, {views}{_selection_text(selection)}"
-    data = DataSet(name, query_images, None, truth, exclusion.frames, None, positions, None, notes)
+    data = DataSet(name, query_images, None, truth, exclusion.frames, positions=positions, notes=notes)
     return _checked(data, hard & judged)
 
 
