@@ -6,10 +6,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from loopclosure.cli import detect, evaluate, similarity
+from loopclosure.cli import compare, detect, evaluate, similarity
 from loopclosure.cli.run import Commands, run
 
-_COMMANDS = (evaluate, detect, similarity)
+_COMMANDS = (evaluate, compare, detect, similarity)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

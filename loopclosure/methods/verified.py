@@ -18,6 +18,9 @@ from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
 
+# The least of what published systems ask for (12 to 22): inliers are the score, and a threshold on it comes later.
+MIN_INLIERS = 12
+
 
 @dataclass
 class Verified:
@@ -30,7 +33,7 @@ class Verified:
     """
 
     inner: Method
-    check: GeometricCheck = field(default_factory=GeometricCheck)
+    check: GeometricCheck = field(default_factory=lambda: GeometricCheck(min_inliers=MIN_INLIERS))
     k: int = 20
     exclude_frames: int = 0
 
@@ -75,8 +78,7 @@ def verified(argument: str, context: MethodContext, inner: Method | None) -> Ver
     """Build ``verified[:setting=value,...]+METHOD``."""
     if inner is None:
         raise InputError("verified needs a method whose best matches it verifies; write verified+METHOD")
-    method, check = configure(
-        "verified", argument, Verified(inner, exclude_frames=context.exclude_frames), GeometricCheck()
-    )
+    plain = Verified(inner, exclude_frames=context.exclude_frames)
+    method, check = configure("verified", argument, plain, plain.check)
     method.check = check
     return method

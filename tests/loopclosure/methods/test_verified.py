@@ -52,7 +52,7 @@ def test_only_the_same_walls_are_accepted_with_their_inliers(walls):
     rng = np.random.default_rng(0)
     result = Verified(Fixed(rng.normal(size=(12, 12))), k=12).score(Images(walls), silent)
     assert accepted(result.scores) == [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]
-    assert np.nanmin(result.scores) >= 20 - 1
+    assert np.nanmin(result.scores) > 12 - 1
     assert list(result.seconds) == ["fixed", "local features", "verification"]
     assert result.training_stages == ("training",)
     assert result.notes[0] == "as given"
