@@ -85,6 +85,9 @@ class MethodContext:
 METHODS: dict[str, str] = {
     "fabmap": "loopclosure.methods.baselines:fabmap",
     "bow": "loopclosure.methods.baselines:bag_of_words",
+    "vlad": "loopclosure.methods.references:vlad_method",
+    "hog": "loopclosure.methods.references:hog",
+    "cohog": "loopclosure.methods.references:cohog",
     "thumbnails": "loopclosure.methods.baselines:thumbnails",
     "seqslam": "loopclosure.methods.seqslam:seqslam",
     "features": "loopclosure.methods.features:features",

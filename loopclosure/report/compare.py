@@ -73,12 +73,9 @@ def read_reports(paths: Sequence[str | Path]) -> list[Report]:
         f"{label}/{Path(path).name}" if labels.count(label) > 1 else label
         for label, path in zip(labels, paths, strict=True)
     ]
-    twice = next((label for label in labels if labels.count(label) > 1), None)
-    if twice is not None:
-        raise InputError(
-            "is given twice; name two reports",
-            next(p for p, label in zip(paths, labels, strict=False) if label == twice),
-        )
+    for label, path in zip(labels, paths, strict=True):
+        if labels.count(label) > 1:
+            raise InputError("is given twice; name two reports", path)
     return [_read(Path(path), label) for path, label in zip(paths, labels, strict=True)]
 
 
