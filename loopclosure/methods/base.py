@@ -91,6 +91,7 @@ METHODS: dict[str, str] = {
     "thumbnails": "loopclosure.methods.baselines:thumbnails",
     "seqslam": "loopclosure.methods.seqslam:seqslam",
     "features": "loopclosure.methods.features:features",
+    "describe": "loopclosure.methods.described:described",
     "verified": "loopclosure.methods.verified:verified",
     "detector": "loopclosure.methods.online:online",
 }

@@ -128,5 +128,10 @@ def test_unknown_methods_list_the_known(spec):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_name_of_the_registry_is_there(name):
-    argument = {"features": ":a.npz", "verified": "+thumbnails", "detector": ":a.npz:threshold=-1"}.get(name, "")
-    assert make_method(name + argument).name
+    needed = {
+        "features": ":a.npz",
+        "describe": ":a.py:function",
+        "verified": "+thumbnails",
+        "detector": ":a.npz:threshold=-1",
+    }
+    assert make_method(name + needed.get(name, "")).name

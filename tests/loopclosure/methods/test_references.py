@@ -33,7 +33,7 @@ def test_gradients_fall_into_the_bin_of_their_direction(turn_deg, bin_):
 def test_blocks_do_not_depend_on_brightness_and_contrast():
     image = blots(0)
     darker = (image * 0.5 + 20).astype(np.uint8)
-    a, b, other = (Hog().blocks(cv2.GaussianBlur(picture, (5, 5), 1)) for picture in (image, darker, blots(1)))
+    a, b, other = (Hog().blocks(picture) for picture in (image, darker, blots(1)))
     assert np.sum(a * b) > 0.97 * np.sum(a * a)
     assert np.sum(a * other) < 0.8 * np.sum(a * a)
 
