@@ -100,7 +100,8 @@ def test_excluded_frames_are_no_candidates(walls):
 
 
 def test_a_known_camera(walls):
-    method = make_method("verified:focal_px=260,center_x_px=160,center_y_px=120,k=12,inliers=25+thumbnails", MethodContext())
+    camera = "focal_px=260,center_x_px=160,center_y_px=120"
+    method = make_method(f"verified:{camera},k=12,inliers=25+thumbnails", MethodContext())
     found = accepted(method.score(Images(walls), silent).scores)
     assert found == [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]
 
