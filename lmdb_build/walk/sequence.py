@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdb_build.picture import write_jpeg
+from lmdb_build.picture import write_depth, write_jpeg
 from lmdb_build.walk.house import House, build_house
 from lmdb_build.walk.render import Camera, Light, Renderer
 from lmdb_build.walk.season import redecorate, weather
@@ -51,7 +51,7 @@ class Walk:
     """A walk: ``frames`` pictures of ``width`` x ``height`` pixels over ``laps`` laps of a house.
 
     ``start_s`` is the time of the first picture, in seconds. Walks that differ only in ``season`` are traverses of one
-    route.
+    route. With ``depth``, each picture's depth is written too.
     """
 
     frames: int = 400
@@ -62,6 +62,7 @@ class Walk:
     seed: int = 1
     start_s: float = 1000.0
     season: int = 1
+    depth: bool = False
 
     def check(self) -> None:
         """Raise InputError for numbers out of range."""
@@ -104,9 +105,14 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     pose_times = step_s * (np.arange(-POSES_PER_IMAGE, (walk.frames + 1) * POSES_PER_IMAGE) + 0.3) / POSES_PER_IMAGE
     poses = carrier.poses(pose_times)
     frames = [Frame(walk.start_s + time, f"rgb/{walk.start_s + time:.6f}.jpg") for time in times]
-    for frame, picture in zip(frames, _pictures(house, walk, carrier, times), strict=True):
-        path = folder / frame.path
+    depths = [Frame(frame.stamp, f"depth/{frame.stamp:.6f}.png") for frame in frames] if walk.depth else []
+    if depths:
+        (folder / "depth").mkdir(exist_ok=True)
+    for number, (picture, depth) in enumerate(_pictures(house, walk, carrier, times)):
+        path = folder / frames[number].path
         write_jpeg(path, picture)
+        if depths:
+            write_depth(folder / depths[number].path, depth)
         yield path
     camera = walk.camera
     calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "
@@ -116,10 +122,13 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     write_groundtruth(
         folder / "groundtruth.txt", Trajectory(walk.start_s + pose_times, poses.positions, poses.quaternions)
     )
+    if depths:
+        write_rgb_list(folder / "depth.txt", depths, "depth maps")
     write_rgb_list(folder / "rgb.txt", frames)  # last: it makes the sequence complete
 
 
-def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iterator[Image]:
+def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iterator[tuple[Image, NDArray[np.float32]]]:
+    """Yield each picture (H, W, 3), and its depth (H, W) in meters."""
     rng = _generator(walk, 4)
     outside = weather(walk.seed, walk.season)
     noise = rng.normal(0, NOISE * outside.noise, (walk.height + 64, walk.width + 64, 3)).astype(np.int8)
@@ -135,7 +144,7 @@ def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iter
         picture = cv2.GaussianBlur(renderer.draw(position, rotation), (3, 3), outside.blur)
         picture = cv2.convertScaleAbs(picture, alpha=1 - outside.veil, beta=128 * outside.veil)
         y, x = rng.integers(0, 64, 2)
-        yield cv2.add(picture, noise[y : y + walk.height, x : x + walk.width], dtype=cv2.CV_8U)
+        yield cv2.add(picture, noise[y : y + walk.height, x : x + walk.width], dtype=cv2.CV_8U), renderer.depth
 
 
 def _generator(walk: Walk, *stream: int) -> np.random.Generator:

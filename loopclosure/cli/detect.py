@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.cli.data_set import add_selection, selection
-from loopclosure.cli.run import Commands, WrongUsage, show_progress
+from loopclosure.cli.data_set import add_selection, add_topics, selection
+from loopclosure.cli.run import Commands, WrongUsage, show_progress, warn
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -17,6 +17,8 @@ from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetect
 from loopclosure.detector.export import write_g2o, write_loops_csv
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.features import WhitenBy
+from loopclosure.places.bags import is_bag
+from loopclosure.places.extraction import extract
 from loopclosure.places.frames import Selection
 
 # The detector's settings that --resume takes from the saved one.
@@ -42,8 +44,9 @@ NEEDS = {
 def add_to(commands: Commands) -> None:
     """Add the command."""
     p = commands.add("detect", _detect, "find the loops in a folder of images or a video")
-    p.add_argument("source", help="a folder or list of images, a TUM RGB-D sequence, or a video file")
+    p.add_argument("source", help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag")
     add_selection(p, "--", "")
+    add_topics(p)
     p.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv, and loops.g2o with poses, go")
     how = p.add_mutually_exclusive_group()
     how.add_argument(
@@ -84,7 +87,15 @@ def add_to(commands: Commands) -> None:
 
 def _detect(a: argparse.Namespace) -> None:
     options = _checked_options(a)
-    recording = run.open_recording(a.source, selection(a))
+    source = Path(a.source)
+    if is_bag(source):
+        source, said = extract(source, Path(a.out) / "frames", a.topic or "", a.pose_topic or "", show_progress)
+        print(said)
+    elif a.topic or a.pose_topic:
+        raise WrongUsage("--topic and --pose-topic belong to bags")
+    recording = run.open_recording(source, selection(a))
+    for doubt in recording.doubts:
+        warn(doubt)
     features = read_features(a.features) if a.features else None
     validation = read_features(a.calibrate_features) if a.calibrate_features else None
     describe = run.load_describe(a.describe, options) if features is None else None
@@ -110,7 +121,7 @@ def _detect(a: argparse.Namespace) -> None:
     if np.isfinite(detector.poses).any():
         left_out = write_g2o(out / "loops.g2o", detector.poses, detector.loops, run.from_poses(detector))
         note = f", {left_out} loops without a pose left out" if left_out else ""
-        print(f"pose graph, its relative poses from groundtruth.txt{note}: {out / 'loops.g2o'}")
+        print(f"pose graph, its relative poses from the known poses{note}: {out / 'loops.g2o'}")
         print(run.judged_by_poses(detector))
     if a.save:
         detector.save(a.save)

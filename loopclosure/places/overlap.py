@@ -8,8 +8,9 @@ assumed distances.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -17,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopclosure.errors import InputError
+from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.same_place import distances_m, view_angles_deg
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Poses, read_rgb_list, rotation_matrices
+from loopclosure.places.trajectory import Poses, rotation_matrices
 
 ASSUMED_M = (2.0, 4.0, 8.0)
+FOV_DEG = 60.0  # of a camera that is not known
 GRID = (6, 8)  # rows and columns of points in a view
 # Depth images of TUM RGB-D: 16 bits, 5000 per meter, 0 where there is no depth.
 DEPTH_UNITS_PER_M = 5000.0
@@ -33,16 +36,28 @@ WIDEST_TURN_DEG = 90.0
 class ViewOverlap:
     """When two views overlap; the defaults were chosen once, for indoor robots and hand-held cameras.
 
-    fov_deg   horizontal field of view of the camera; pixels are square, the principal point is the center
+    fov_deg   horizontal field of view; None: the camera's where it is known, or 60. Pixels are square, the principal
+              point is the center
     least     the least share of each of the two views that must be visible in the other
     """
 
-    fov_deg: float = 60.0
+    fov_deg: float | None = None
     least: float = 0.25
 
     def __post_init__(self) -> None:
-        if not 0 < self.fov_deg < 180 or not 0 < self.least <= 1:
-            raise InputError(f"overlap: {self.fov_deg:g} degrees, share {self.least:g}; expected 0..180 and 0..1")
+        if not 0 < self.fov < 180 or not 0 < self.least <= 1:
+            raise InputError(f"overlap: {self.fov:g} degrees, share {self.least:g}; expected 0..180 and 0..1")
+
+    @property
+    def fov(self) -> float:
+        """The horizontal field of view in degrees."""
+        return FOV_DEG if self.fov_deg is None else self.fov_deg
+
+    def of_camera(self, camera: Intrinsics | None) -> ViewOverlap:
+        """Return the same with the field of view of a known camera, if none was given."""
+        if self.fov_deg is not None or camera is None or camera.size is None:
+            return self
+        return replace(self, fov_deg=math.degrees(2 * math.atan(camera.size[0] / 2 / camera.fx)))
 
     def describe(self, measured: bool) -> str:
         """Say in words when views overlap."""
@@ -50,7 +65,7 @@ class ViewOverlap:
         return (
             f"at least {100 * self.least:g} % of each view is visible in the other, by the poses and "
             f"{f'measured depth, or {distances} where it is missing' if measured else distances} "
-            f"(horizontal field of view {self.fov_deg:g} degrees)"
+            f"(horizontal field of view {self.fov:.3g} degrees)"
         )
 
 
@@ -86,18 +101,6 @@ def views(poses: Poses, depth_images: Sequence[Path | None] = ()) -> Views:
     return Views(poses, ranges, measured)
 
 
-def depth_of(folder: str | Path, stamps: NDArray[np.float64]) -> list[Path | None]:
-    """Return for each frame (N,) of a TUM RGB-D folder the depth image nearest in time; [] if the folder has none."""
-    listed = Path(folder) / "depth.txt"
-    if not listed.is_file():
-        return []
-    images = read_rgb_list(listed)
-    times = np.array([image.stamp for image in images])
-    nearest = np.abs(times[None, :] - stamps[:, None]).argmin(axis=1)
-    near = np.abs(times[nearest] - stamps) <= MAX_DIFFERENCE_S
-    return [Path(folder) / images[i].path if ok else None for i, ok in zip(nearest, near, strict=True)]
-
-
 def overlap_matrix(
     queries: Views, references: Views, settings: ViewOverlap | None = None, aspect: float = 0.75
 ) -> NDArray[np.bool_]:
@@ -110,7 +113,7 @@ def overlap_matrix(
 
 def _shares(a: Views, b: Views, settings: ViewOverlap, aspect: float) -> NDArray[np.float64]:
     """Return the share of the points of each view of ``a`` (N) that each view of ``b`` (M) sees: (N, M)."""
-    half = np.tan(np.radians(settings.fov_deg) / 2)
+    half = np.tan(np.radians(settings.fov) / 2)
     rows, columns = GRID
     y, x = np.mgrid[:rows, :columns].reshape(2, -1)
     rays = np.stack([(2 * (x + 0.5) / columns - 1) * half, (2 * (y + 0.5) / rows - 1) * half * aspect], axis=1)

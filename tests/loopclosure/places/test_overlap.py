@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 from loopclosure.places.datasets import load_tum
+from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.overlap import ViewOverlap, overlap_matrix, views
 from loopclosure.places.trajectory import Poses
 
@@ -91,6 +92,13 @@ def test_a_sequence_with_depth_says_so(two_laps, tmp_path):
     assert "by the poses and measured depth, or assumed distances of 2, 4, 8 m where it is missing" in data.overlap_rule
     assert data.soft_truth is not None
     assert (data.soft_truth.soft | ~data.truth.hard).all()
+
+
+def test_the_field_of_view_is_the_cameras_where_it_is_known():
+    wide = Intrinsics(40, 40, 32, 24, size=(64, 48))
+    assert ViewOverlap().of_camera(wide).fov == pytest.approx(77.32, abs=0.01)
+    assert ViewOverlap(50).of_camera(wide).fov == 50
+    assert ViewOverlap().of_camera(Intrinsics(40, 40, 32, 24)).fov == ViewOverlap().of_camera(None).fov == 60
 
 
 def test_queries_in_another_recording_of_the_same_place(two_laps):
