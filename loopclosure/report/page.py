@@ -207,7 +207,7 @@ def _apart(evaluation: Evaluation, query: int, reference: int) -> str:
         return ""
     a, b = (Poses(data.positions[i], data.quaternions[i]) for i in (query, reference))
     seen = "views overlap" if data.overlap[query, reference] else "views do not overlap"
-    return f"; {float(distances_m(a, b)):.2g} m and {float(angles_deg(a, b)):.2g} degrees apart, {seen}"
+    return f"; {float(distances_m(a, b)):.2g} m and {float(angles_deg(a, b)):.0f} degrees apart, {seen}"
 
 
 def _save(figure: Figure, path: Path) -> str:
