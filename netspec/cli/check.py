@@ -46,8 +46,8 @@ def _check(arguments: argparse.Namespace) -> int:
         allow_python=arguments.allow_python_layers,
         passes=arguments.passes if arguments.plan else None,
     )
-    for line in dict.fromkeys(line for part in checked for line in part.advice):
-        print(f"warning: {printable(line)}", file=sys.stderr)
+    for line in dict.fromkeys(str(found) for part in checked for found in part.advice):
+        print(f"warning: {line}", file=sys.stderr)
     faults = dict.fromkeys(str(fault) for part in checked for fault in part.faults)
     if faults:
         print("\n".join(faults), file=sys.stderr)
