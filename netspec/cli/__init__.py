@@ -6,11 +6,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import caffe_tools, check, draw, export, extract, fmt, lint, measure, run_script, train
+from netspec.cli import caffe_tools, check, diff, draw, export, extract, fmt, lint, measure, run_script, train
 from netspec.cli.run import Commands
 from netspec.command_line import run
 
-_FAMILIES = (train, measure, check, draw, fmt, lint, extract, export, run_script, caffe_tools)
+_FAMILIES = (train, measure, check, draw, diff, fmt, lint, extract, export, run_script, caffe_tools)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
