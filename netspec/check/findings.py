@@ -11,9 +11,9 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from netspec.errors import Where, did_you_mean, printable
+from netspec.errors import SpecError, Where, did_you_mean, printable
 from netspec.proto.source_map import Place
 
 # What a rule looks at, see Rule.
@@ -74,6 +74,21 @@ def findings(looks_at: str, *subject: object) -> list[Finding]:
         if each.looks_at == looks_at
         for where, message in each.find(*subject)
     ]
+
+
+def said_as_json(faults: Iterable[SpecError], found: Iterable[Finding]) -> dict[str, list[dict[str, Any]]]:
+    """Return ``faults`` and ``warnings``, each a list of file, line, column, layer, type, message; and the rule.
+
+    Lines and columns begin at 1; 0 is a place that is not known.
+    """
+    return {
+        "faults": [{**_place(fault.where or Where("")), "message": fault.message} for fault in faults],
+        "warnings": [{**_place(each.where), "message": each.message, "rule": each.rule} for each in found],
+    }
+
+
+def _place(where: Where) -> dict[str, Any]:
+    return {"file": where.file, "line": where.line, "column": where.column, "layer": where.layer, "type": where.type}
 
 
 def not_ignored(found: Iterable[Finding], file: str, layers: Sequence[Place] = ()) -> list[Finding]:

@@ -6,7 +6,20 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import caffe_tools, check, diff, draw, export, extract, fmt, lint, measure, run_script, train
+from netspec.cli import (
+    caffe_tools,
+    check,
+    completion,
+    diff,
+    draw,
+    export,
+    extract,
+    fmt,
+    lint,
+    measure,
+    run_script,
+    train,
+)
 from netspec.cli.run import Commands
 from netspec.command_line import run
 
@@ -31,4 +44,5 @@ def parser() -> argparse.ArgumentParser:
     commands = Commands(made)
     for family in _FAMILIES:
         family.add_to(commands)
+    completion.add_to(commands, parser)
     return made

@@ -20,7 +20,8 @@ WIRE_GAP = 14  # between a wire that passes a row and what is beside it
 SWEEPS = 12  # over all rows, to reduce crossings
 CHAIN, BRANCH, PASSING = 6.0, 0.5, 8.0  # cost of a wire's step aside: its ends have no other wires, or have; it passes
 CENTERED = 0.5  # cost of a box off the middle of its neighbors
-NARROW = 0.1  # cost of width, for each row
+NARROW = (0.1, 1.0)  # cost of width, for each row: what is wider than a screen is pressed
+SCREEN = 1280
 EARLY = 1e-3  # cost of a row further down
 ENTRY_GAP = 12  # between the ends of wires in one box
 
@@ -95,7 +96,11 @@ def lay_out(sizes: Sequence[Size], wires: Sequence[Wire]) -> Layout:
     _reduce_crossings(rows, links)
     ports = _ports(rows, links, sizes, wires)
     entries = _entries(rows, links, sizes, [ports[wire.source][wire.port] for wire in wires])
-    return _columns(rows, links, entries, ports, sizes, wires)
+    for narrow in NARROW:
+        laid = _columns(rows, links, entries, ports, sizes, wires, narrow)
+        if laid.width <= SCREEN:
+            break
+    return laid
 
 
 def _ranks(count: int, wires: Sequence[Wire]) -> list[int]:
@@ -270,8 +275,9 @@ def _columns(
     ports: list[tuple[int, ...]],
     sizes: Sequence[Size],
     wires: Sequence[Wire],
+    narrow: float,
 ) -> Layout:
-    """Return the layout whose wires step aside least."""
+    """Return the layout whose wires step aside least; ``narrow`` is the cost of width."""
     if not sizes:
         return Layout(rows, ports, 0)
     index = {cell: k for k, cell in enumerate(cell for row in rows for cell in row.cells)}
@@ -307,9 +313,9 @@ def _columns(
         first, last = row.cells[0], row.cells[-1]
         apart.append((len(index), index[last], -_reach(last, sizes)[1]))
         apart.append((index[first], len(index) + 1, -_reach(first, sizes)[0]))
-    narrow = np.zeros(len(index) + 2)
-    narrow[len(index)] = NARROW * len(rows)
-    solved = _least_aside(narrow, apart, aside)
+    costs = np.zeros(len(index) + 2)
+    costs[len(index)] = narrow * len(rows)
+    solved = _least_aside(costs, apart, aside)
     # Rounding each axis down keeps whole distances between neighbors.
     axis = {cell: int(np.floor(solved[k] + 1e-6)) for cell, k in index.items()}
     lowest = min(axis[cell] - _reach(cell, sizes)[0] for row in rows for cell in row.cells)

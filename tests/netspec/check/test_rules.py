@@ -1,5 +1,6 @@
 """``netspec lint``: each rule finds its mistake at its place, and keeps silent where a comment says so."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -191,6 +192,28 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["lint", "--rules"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == len(RULES)
     assert main(["lint"]) == 2
+
+
+def test_faults_and_findings_as_json_for_editors(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("net.prototxt").write_text(DUMMY + CONV + NORM + IP + LOSS)
+    Path("faulty.prototxt").write_text(SOUND.replace('bottom: "c"', 'bottom: "cc"'))
+    assert main(["lint", "--json", "net.prototxt", "faulty.prototxt"]) == 1
+    found, faulty = map(json.loads, capsys.readouterr().out.splitlines())
+    place = {"file": "net.prototxt", "line": 4, "column": 3, "layer": "c", "type": "Convolution"}
+    message = 'its bias is subtracted again by BatchNorm "n"; set bias_term: false'
+    rule = "bias-before-batchnorm"
+    assert found == {
+        "file": "net.prototxt", "faults": [], "warnings": [{**place, "message": message, "rule": rule}]
+    }  # fmt: skip
+    assert [(each["line"], each["layer"]) for each in faulty["faults"]] == [(5, "ip")]
+    assert main(["check", "--json", "faulty.prototxt"]) == 1
+    out, err = capsys.readouterr()
+    assert json.loads(out)["faults"] == faulty["faults"]
+    assert "\nfaulty.prototxt:5:41: " in err
+    Path("bad.prototxt").write_text("layer {")
+    assert main(["check", "--json", "bad.prototxt"]) == 1
+    (fault,) = json.loads(capsys.readouterr().out)["faults"]
+    assert (fault["line"], fault["column"]) == (1, 8)
 
 
 def pair_shape(path: Path) -> dict[str, tuple[int, ...]]:
