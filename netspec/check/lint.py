@@ -10,6 +10,7 @@ from netspec.check.check import Checked, check_file
 from netspec.check.findings import Finding
 from netspec.errors import SpecError, UnknownShape
 from netspec.layers.base import Shape
+from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, PhaseValue
 
 MISSING_DATA = "missing-data"
@@ -20,13 +21,14 @@ class Linted:
     """What is found in a file.
 
     ``faults`` keep a net from being built. ``unknown`` ask for shapes; until they are given, rules that need them are
-    not applied. A file that is not ``readable`` has faults only.
+    not applied. A file that is not ``readable`` has faults only. ``nets`` are what was built.
     """
 
     found: list[Finding] = field(default_factory=list)
     faults: list[SpecError] = field(default_factory=list)
     unknown: list[SpecError] = field(default_factory=list)
     readable: bool = True
+    nets: list[Net] = field(default_factory=list)
 
 
 def lint_file(
@@ -55,6 +57,7 @@ def lint_file(
         [fault for fault in faults if not isinstance(fault, UnknownShape)],
         [fault for fault in faults if isinstance(fault, UnknownShape)],
         any(part.net is not None for part in parts),
+        [part.net for part in parts if part.net is not None],
     )
 
 

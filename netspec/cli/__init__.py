@@ -16,6 +16,7 @@ from netspec.cli import (
     extract,
     fmt,
     lint,
+    lsp,
     measure,
     run_script,
     train,
@@ -23,7 +24,7 @@ from netspec.cli import (
 from netspec.cli.run import Commands
 from netspec.command_line import run
 
-_FAMILIES = (train, measure, check, draw, diff, fmt, lint, extract, export, run_script, caffe_tools)
+_FAMILIES = (train, measure, check, draw, diff, fmt, lint, lsp, extract, export, run_script, caffe_tools)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
