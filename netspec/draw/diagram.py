@@ -199,7 +199,8 @@ def _alone(plan: Plan) -> list[bool]:
     maker: dict[int, int] = {}
     for node in plan.nodes:
         for v in node.bottoms:
-            readers[v] += v >= 0
+            if v >= 0:
+                readers[v] += 1
     alone = []
     for i, node in enumerate(plan.nodes):
         inside = node.in_place == (True,) and len(node.bottoms) == 1 and node.bottoms[0] in maker

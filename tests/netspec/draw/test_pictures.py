@@ -144,6 +144,7 @@ def test_a_net_that_cannot_be_built_is_drawn_without_its_shapes() -> None:
     assert any('unknown bottom blob "data"' in str(fault) for fault in diagram.faults)
     assert list(faults(picture_of(diagram))) == []
     assert list(faults(picture_of(read('name: "empty"')))) == []
+    assert [box.name for box in read('layer { name: "s" type: "Silence" bottom: "no" }').boxes] == ["s"]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("pygls")
 
 from lsprotocol import types as lsp
-from pygls.lsp.client import BaseLanguageClient
+from pygls.lsp.client import LanguageClient
 
 NET = """layer { name: "in" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 } } }
 layer { name: "n" type: "BatchNorm" bottom: "x" top: "y" }
@@ -25,7 +25,7 @@ def test_an_editor_opens_a_net_asks_and_changes_it(tmp_path: Path) -> None:
 
 
 async def session(path: Path) -> None:
-    client = BaseLanguageClient("test", "1")
+    client: Any = LanguageClient("test", "1")
     published: asyncio.Queue[Any] = asyncio.Queue()
     client.feature(lsp.TEXT_DOCUMENT_PUBLISH_DIAGNOSTICS)(lambda params: published.put_nowait(params.diagnostics))
     await client.start_io(sys.executable, "-m", "netspec", "lsp")
