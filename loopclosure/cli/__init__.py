@@ -6,10 +6,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from loopclosure.cli import close, detect, evaluate, similarity
+from loopclosure.cli import close, compare, detect, evaluate, similarity
 from loopclosure.cli.run import Commands, run
 
-_COMMANDS = (evaluate, detect, close, similarity)
+_COMMANDS = (evaluate, compare, detect, close, similarity)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,6 +10,7 @@ from loopclosure.places import datasets
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
 from loopclosure.places.frames import Selection
+from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import ImageSequence, PoseChoice, benchmark_parts, read_sequence
@@ -24,7 +25,7 @@ BELONGS = {
     "pose_form": POSED,
     "topic": ("bag",),
     "pose_topic": ("bag",),
-    "references": ("images",),
+    "references": ("images", "tum", "euroc", "kitti"),
     "camera": ("fabmap",),
     "coordinates": ("fabmap",),
     "tolerance": ("traverses",),
@@ -33,6 +34,8 @@ BELONGS = {
     "max_angle": POSED,
     "soft_distance": POSED,
     "soft_angle": POSED,
+    "fov": POSED,
+    "overlap": POSED,
     "exclude_frames": (*POSED, "fabmap"),
     "exclude_seconds": POSED,
 }
@@ -52,7 +55,7 @@ def add_data_set(p: argparse.ArgumentParser) -> None:
     p.add_argument("--truth", metavar="MASK", help=".mat .npy .txt or image: which frames show the same place")
     add_poses(p)
     add_topics(p)
-    p.add_argument("--references", metavar="FOLDER", help="of --images, if they are another folder")
+    p.add_argument("--references", metavar="FOLDER", help="of --images, --tum, --euroc or --kitti, if another folder")
     p.add_argument("--camera", choices=CAMERAS, help="of --fabmap (default: both)")
     p.add_argument("--coordinates", metavar="FILE", help="of --fabmap, if not in the folder")
     p.add_argument("--tolerance", type=int, metavar="FRAMES", help="of --traverses (default: 0)")
@@ -61,6 +64,16 @@ def add_data_set(p: argparse.ArgumentParser) -> None:
     p.add_argument("--max-angle", type=float, metavar="DEG", help=f"of poses (default: {MAX_ANGLE_DEG:g})")
     p.add_argument("--soft-distance", type=float, metavar="M", help="a match up to here is ignored, not wrong")
     p.add_argument("--soft-angle", type=float, metavar="DEG", help="the same, for the angle")
+    p.add_argument(
+        "--fov", type=float, metavar="DEG", help=f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"
+    )
+    p.add_argument(
+        "--overlap",
+        type=float,
+        metavar="SHARE",
+        help="the soft zone: a match is no mistake if so much of each view is visible in the other "
+        f"(default: {ViewOverlap().least:g})",
+    )
     p.add_argument(
         "--exclude-frames",
         type=int,
@@ -132,9 +145,13 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     chosen = selection(a)
     excluded = a.exclude_frames is not None or a.exclude_seconds is not None
     exclusion = Exclusion(a.exclude_frames or 0, a.exclude_seconds or 0.0) if excluded else None
+    if a.references is not None and excluded:
+        raise WrongUsage("--exclude-frames means nothing with --references: nothing is near in time")
     if kind in LAYOUTS or (kind == "images" and a.poses):
         if a.truth:
             raise WrongUsage("--truth and --poses both say which frames show the same place; give one")
+        if a.references and a.poses:
+            raise WrongUsage("--poses are those of one sequence; with --references each must have its own")
         return datasets.load_sequence(
             sequence(a, getattr(a, kind), kind),
             chosen,
@@ -143,6 +160,8 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
             max_angle_deg=a.max_angle,
             soft_distance_m=a.soft_distance,
             soft_angle_deg=a.soft_angle,
+            references=sequence(a, a.references, kind) if a.references else None,
+            view_overlap=ViewOverlap(a.fov, ViewOverlap().least if a.overlap is None else a.overlap),
         )
     if kind == "fabmap":
         camera = a.camera or "both"
@@ -152,8 +171,6 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     if kind == "images":
         if a.truth is None:
             raise WrongUsage("--images needs --truth, the mask that says which frames show the same place, or --poses")
-        if a.references is not None and excluded:
-            raise WrongUsage("--exclude-frames means nothing with --references: nothing is near in time")
         return datasets.load_folder(a.images, a.truth, a.references, chosen, exclusion or datasets.FOLDER_EXCLUSION)
     if kind == "traverses":
         queries, references = a.traverses

@@ -17,11 +17,9 @@ from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetect
 from loopclosure.detector.export import write_g2o, write_loops_csv
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.features import WhitenBy
-from loopclosure.places import datasets
 from loopclosure.places.bags import is_bag
 from loopclosure.places.extraction import extract
 from loopclosure.places.frames import Selection
-from loopclosure.places.truth import Exclusion
 
 # The detector's settings that --resume takes from the saved one.
 SETTINGS = (
@@ -109,7 +107,8 @@ def _detect(a: argparse.Namespace) -> None:
         validation = None if validation is None else validation.whitened(whitening)
     detector = _detector(a, describe, views)
     if a.calibrate:
-        data = _validation_set(a, detector.settings)
+        stride = Selection(stride=a.stride)  # that of the source
+        data = run.validation_set(a.calibrate, a.calibrate_truth, detector.settings, stride)
         precision = PRECISION if a.precision is None else a.precision
         print(run.calibrate_on_data_set(detector, data, precision, validation, show_progress))
     # Frames of the run that is resumed have numbers but no names here.
@@ -160,13 +159,3 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     if a.verify:
         check = GeometricCheck() if a.min_inliers is None else GeometricCheck(min_inliers=a.min_inliers)
     return LoopDetector(describe, check=check, views=views, **_changes(a))
-
-
-def _validation_set(a: argparse.Namespace, settings: DetectorSettings) -> datasets.DataSet:
-    """Load the frames that the threshold is chosen on, with the stride of the source."""
-    chosen = Selection(stride=a.stride)
-    if a.calibrate_truth:
-        exclusion = Exclusion(settings.exclude_recent)
-        return datasets.load_folder(a.calibrate, a.calibrate_truth, None, chosen, exclusion)
-    exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
-    return datasets.load_tum(a.calibrate, chosen, exclusion)

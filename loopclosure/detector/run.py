@@ -14,10 +14,10 @@ import numpy as np
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.whitening import Whitening
-from loopclosure.detector.detector import Describe, LoopDetector, LoopResult
+from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetector, LoopResult
 from loopclosure.detector.export import RelativePose, relative_pose
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import DataSet
+from loopclosure.places.datasets import DataSet, load_folder, load_tum
 from loopclosure.places.frames import (
     ALL_FRAMES,
     VIDEO_SUFFIXES,
@@ -29,6 +29,7 @@ from loopclosure.places.frames import (
 from loopclosure.places.same_place import same_place
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses
+from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
@@ -118,6 +119,18 @@ def run_detector(
         else:
             results.append(detector.add_descriptor(rows[i], stamp, _pose(recording, i), image))
     return results
+
+
+def validation_set(
+    source: str | Path, truth: str | Path | None, settings: DetectorSettings, selection: Selection = ALL_FRAMES
+) -> DataSet:
+    """Load the frames that a threshold is chosen on: a TUM sequence, or a folder with the mask ``truth``.
+
+    Candidates near in time are excluded as by the detector's ``settings``.
+    """
+    if truth:
+        return load_folder(source, truth, None, selection, Exclusion(settings.exclude_recent))
+    return load_tum(source, selection, Exclusion(settings.exclude_recent, settings.exclude_seconds))
 
 
 def calibrate_on_data_set(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +13,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.cameras import comparable, images_of_places, mask_of_places
 from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_bgr
 from loopclosure.places.masks import read_coordinates, read_matches, read_place_pairs, read_truth_matrix
+from loopclosure.places.overlap import ViewOverlap, Views, overlap_matrix, views
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
 from loopclosure.places.sequences import ImageSequence, posed, read_sequence
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
@@ -38,6 +39,8 @@ class DataSet:
     stamps               (Q,) seconds, if known
     positions            (Q, 3) meters or (Q, 2), if known: for the map
     quaternions          (Q, 4) xyzw, if known
+    overlap              (Q, R) bool: views that overlap as far as poses and depth tell; None without poses
+    overlap_rule         text: when they overlap
     notes                what a reader of the results should know: what was left out, what looks odd
     """
 
@@ -49,12 +52,22 @@ class DataSet:
     stamps: np.ndarray | None = None
     positions: np.ndarray | None = None
     quaternions: np.ndarray | None = None
+    overlap: np.ndarray | None = None
+    overlap_rule: str = ""
     notes: list[str] = field(default_factory=list)
 
     @property
     def references(self) -> list[Path]:
         """Return the reference images: the queries themselves in one sequence."""
         return self.query_images if self.reference_images is None else self.reference_images
+
+    @property
+    def soft_truth(self) -> Truth | None:
+        """The truth by which a match of overlapping views is no mistake; None where the overlap is not known."""
+        if self.overlap is None:
+            return None
+        description = f"{self.truth.description}; no mistake where views overlap: {self.overlap_rule}"
+        return replace(self.truth, soft=self.truth.soft | self.overlap, description=description)
 
 
 def load_tum(
@@ -63,10 +76,14 @@ def load_tum(
     exclusion: Exclusion = TUM_EXCLUSION,
     *,
     max_difference_s: float = MAX_DIFFERENCE_S,
+    references: str | Path | None = None,
+    view_overlap: ViewOverlap | None = None,
     **limits: float | None,
 ) -> DataSet:
-    """Load a TUM RGB-D sequence; ``limits`` are those of :func:`load_sequence`."""
-    return load_sequence(read_sequence(folder, "tum", max_difference_s), selection, exclusion, **limits)
+    """Load a TUM RGB-D sequence; ``limits`` and the others are those of :func:`load_sequence`."""
+    sequence = read_sequence(folder, "tum", max_difference_s)
+    others = None if references is None else read_sequence(references, "tum", max_difference_s)
+    return load_sequence(sequence, selection, exclusion, references=others, view_overlap=view_overlap, **limits)
 
 
 def load_sequence(
@@ -78,37 +95,83 @@ def load_sequence(
     max_angle_deg: float | None = None,
     soft_distance_m: float | None = None,
     soft_angle_deg: float | None = None,
+    references: ImageSequence | None = None,
+    view_overlap: ViewOverlap | None = None,
 ) -> DataSet:
     """Make a data set of a sequence with poses; truth by the paper's rule, with wider limits for soft truth, if given.
 
     Frames without a pose are left out before ``selection`` counts. Without an ``exclusion``, pairs less than 10 s apart
     are excluded; 10 frames where the frames have no time.
+
+    references    another sequence, with poses in the same frame of reference: each query against all its frames;
+                  ``selection`` applies to the queries only, and no pair is excluded
+    view_overlap  which other views are no mistake in the soft zone
     """
-    with_pose = posed(sequence)
-    taken = selection.numbers(len(with_pose))
-    images = _existing([sequence.folder / with_pose.frames[i].path for i in taken])
-    poses = with_pose.poses[taken]
-    stamps = None if sequence.stamps is None else with_pose.stamps[taken]
-    exclusion = exclusion or (FOLDER_EXCLUSION if stamps is None else TUM_EXCLUSION)
     hard_m = MAX_DISTANCE_M if max_distance_m is None else max_distance_m
     hard_deg = MAX_ANGLE_DEG if max_angle_deg is None else max_angle_deg
-    hard = same_place_matrix(poses, poses, hard_m, hard_deg)
     rule = f"same place: nearer than {hard_m:g} m and turned less than {hard_deg:g} degrees"
-    soft = None
+    wide = None
     if soft_distance_m is not None or soft_angle_deg is not None:
         wide_m = hard_m if soft_distance_m is None else soft_distance_m
         wide_deg = hard_deg if soft_angle_deg is None else soft_angle_deg
         if wide_m < hard_m or wide_deg < hard_deg:
             raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({rule})")
-        soft = same_place_matrix(poses, poses, wide_m, wide_deg)
+        wide = (wide_m, wide_deg)
         rule += f" (soft: {wide_m:g} m, {wide_deg:g} degrees)"
+    queries = _posed_images(sequence, selection)
+    others = queries if references is None else _posed_images(references, ALL_FRAMES)
+    poses, stamps = queries.views.poses, queries.stamps
+    hard = same_place_matrix(poses, others.views.poses, hard_m, hard_deg)
+    soft = None if wide is None else same_place_matrix(poses, others.views.poses, *wide)
+    overlap_rule = (view_overlap or ViewOverlap()).of_camera(sequence.camera)
+    height, width = read_bgr(queries.images[0]).shape[:2]
+    overlap = overlap_matrix(queries.views, others.views, overlap_rule, height / width)
+    measured = bool(queries.views.measured.any() or others.views.measured.any())
+    if references is None:
+        exclusion = exclusion or (FOLDER_EXCLUSION if stamps is None else TUM_EXCLUSION)
+        truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
+        frames = exclusion.frames if stamps is None else _excluded_frames(exclusion, stamps)
+    else:
+        truth = traverse_truth(hard, rule, soft=soft)
+        frames = 0
+    data = DataSet(
+        name=f"{queries.name}{_selection_text(selection)}{'' if references is None else f' in {others.name}'}",
+        query_images=queries.images,
+        reference_images=None if references is None else others.images,
+        truth=truth,
+        exclude_frames=frames,
+        stamps=stamps,
+        positions=poses.positions,
+        quaternions=poses.quaternions,
+        overlap=overlap,
+        overlap_rule=overlap_rule.describe(measured),
+        notes=[*queries.notes, *(() if references is None else (f"{others.name}: {note}" for note in others.notes))],
+    )
+    return _checked(data, hard)
+
+
+@dataclass(frozen=True)
+class _PosedImages:
+    """The selected frames of a sequence that have a pose: N paths, stamps (N,) or None, views, and notes."""
+
+    name: str
+    images: list[Path]
+    stamps: np.ndarray | None
+    views: Views
+    notes: list[str]
+
+
+def _posed_images(sequence: ImageSequence, selection: Selection) -> _PosedImages:
+    with_pose = posed(sequence)
+    taken = selection.numbers(len(with_pose))
+    images = _existing([sequence.folder / with_pose.frames[i].path for i in taken])
+    assert sequence.poses is not None, "posed refuses it"
+    numbers = np.flatnonzero(np.all(np.isfinite(sequence.poses), axis=1))[taken]
+    depths = [] if sequence.depths is None else [sequence.depths[i] for i in numbers]
+    stamps = None if sequence.stamps is None else with_pose.stamps[taken]
     notes = [f"frames without a pose, left out: {with_pose.dropped}"] if with_pose.dropped else []
     notes += with_pose.doubts
-    truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
-    name = f"{sequence.name}{_selection_text(selection)}"
-    frames = exclusion.frames if stamps is None else _excluded_frames(exclusion, stamps)
-    data = DataSet(name, images, None, truth, frames, stamps, poses.positions, poses.quaternions, notes)
-    return _checked(data, hard)
+    return _PosedImages(sequence.name, images, stamps, views(with_pose.poses[taken], depths), notes)
 
 
 def load_fabmap(
@@ -151,7 +214,7 @@ def load_fabmap(
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
     views = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
     name = f"{folder.resolve().name}, {views}{_selection_text(selection)}"
-    data = DataSet(name, query_images, None, truth, exclusion.frames, None, positions, None, notes)
+    data = DataSet(name, query_images, None, truth, exclusion.frames, positions=positions, notes=notes)
     return _checked(data, hard & judged)
 
 
