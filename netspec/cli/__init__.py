@@ -6,11 +6,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import caffe_tools, check, data, export, extract, measure, plot, run_script, train, watch
+from netspec.cli import caffe_tools, check, data, export, extract, look, measure, plot, run_script, train, watch
 from netspec.cli.run import Commands
 from netspec.command_line import run
 
-_FAMILIES = (train, measure, check, extract, plot, watch, data, export, run_script, caffe_tools)
+_FAMILIES = (train, measure, check, extract, plot, watch, data, look, export, run_script, caffe_tools)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
