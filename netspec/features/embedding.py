@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -62,6 +63,6 @@ def in_plane(values: np.ndarray, method: str = PCA) -> tuple[np.ndarray, str]:
     from sklearn.manifold import TSNE as TSne
 
     perplexity = min(_PERPLEXITY, (len(values) - 1) / 3)
-    start = points / max(float(points[:, 0].std()), 1e-12) * 1e-4
+    start: Any = points / max(float(points[:, 0].std()), 1e-12) * 1e-4
     moved = TSne(init=start, perplexity=perplexity, random_state=0, learning_rate="auto").fit_transform(values)
     return np.asarray(moved), f"t-SNE, perplexity {perplexity:g}: only who is near whom has a meaning"

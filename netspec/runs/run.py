@@ -25,7 +25,6 @@ _OUTPUT = re.compile(r" *(Train|Test) net output #(\d+): (.*) = (\S+?)(?: \(\* .
 _SCORE = re.compile(r" *Test score #(\d+): (\S+)")  # until 2014
 _TEST_LOSS = re.compile(r"Test loss: (\S+)")
 _WAITING = re.compile(r"Waiting for data: (\S+) %")
-_GPU_MEMORY = re.compile(r"GPU memory: at most (\S+) bytes")
 _SNAPSHOT = re.compile(r"Snapshotting to .*?(\S+_iter_(\d+)\.caffemodel\S*)")
 _SETTING = re.compile(r"(max_iter|display|test_interval|average_loss|type|net|snapshot_prefix): (.*)")
 _WINDOWS = {"1.#QNAN": "nan", "-1.#IND": "nan", "1.#INF": "inf", "-1.#INF": "-inf"}
@@ -40,7 +39,7 @@ class Run:
     and, by the number of the test net, of the test nets: name -> curve. Of a blob of several numbers, the second is
     ``name[1]``. ``losses`` are the names of outputs that have a loss weight. ``speed`` is in iterations per second,
     ``waiting`` the share of time in which the net waited for data, in percent. ``times`` are seconds since the first
-    line, at the iterations of ``loss``. ``gpu_memory`` is in bytes, None on a CPU.
+    line, at the iterations of ``loss``.
     """
 
     name: str
@@ -56,7 +55,6 @@ class Run:
     settings: dict[str, str] = field(default_factory=dict)
     state: str = RUNNING
     process: int | None = None
-    gpu_memory: int | None = None
     fault: str = ""
 
     @property
@@ -128,8 +126,6 @@ class LogReader:
             self._output("Test", -1, "test loss", found[1], True)
         elif found := _WAITING.match(message):
             run.waiting.add(self._position, _number(found[1]))
-        elif found := _GPU_MEMORY.match(message):
-            run.gpu_memory = int(_number(found[1]))
         elif found := _SNAPSHOT.search(message):
             run.snapshots.append((int(found[2]), found[1]))
         elif message.startswith("Optimization stopped early"):

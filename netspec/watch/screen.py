@@ -101,8 +101,6 @@ def _machine(run: Run, memory: tuple[int, int] | None) -> list[str]:
         told.append(f"waiting for data {run.waiting.last:g} % of the time")
     if memory:
         told.append(f"memory {amount(memory[0])}, at most {amount(memory[1])}")
-    if run.gpu_memory:
-        told.append(f"GPU memory at most {amount(run.gpu_memory)}")
     if run.snapshots and run.state != FAILED:
         told.append(f"last snapshot at {run.snapshots[-1][0]:,}")
     return [", ".join(told)] if told else []
