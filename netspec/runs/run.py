@@ -20,13 +20,15 @@ RUNNING, DONE, STOPPED, FAILED = "running", "done", "stopped early", "failed"
 _PREFIX = re.compile(r"([IWEF])(?:\d{4})?(\d\d)(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{6}) +(\d+) (\S+?)\] ?(.*)")
 _LOSS = re.compile(r"Iteration (\d+)(?: \((\S+) iter/s[^)]*\))?[^=]*, loss = (\S+)")
 _RATE = re.compile(r"Iteration (\d+), lr = (\S+)")
-_TESTING = re.compile(r"Iteration (\d+), Testing net \(#(\d+)\)")
-_OUTPUT = re.compile(r" *(Train|Test) net output #(\d+): (.*) = (\S+?)(?: \(\* .* loss\))?$")
-_SCORE = re.compile(r" *Test score #(\d+): (\S+)")  # until 2014
+_TESTING = re.compile(r"Iteration (\d+), Testing net(?: \(#(\d+)\))?")
+_OUTPUT = re.compile(r"(Train|Test) net output #(\d+): (.*) = (\S+?)(?: \(\* .* loss\))?$")
+_SCORE = re.compile(r"Test score #(\d+): (\S+)")  # until 2014
 _TEST_LOSS = re.compile(r"Test loss: (\S+)")
 _WAITING = re.compile(r"Waiting for data: (\S+) %")
-_SNAPSHOT = re.compile(r"Snapshotting to .*?(\S+_iter_(\d+)\.caffemodel\S*)")
+_SNAPSHOT = re.compile(r"Snapshotting to (?:.* file )?(\S+_iter_(\d+)(?:\.caffemodel\S*)?)")
 _SETTING = re.compile(r"(max_iter|display|test_interval|average_loss|type|net|snapshot_prefix): (.*)")
+# Python's, a signal's, and netspec's own: `solver.prototxt:3:1: ...`.
+_FAULT = re.compile(r"Traceback |\*\*\* .*SIG|\S[^:]*:\d+:\d+: |there is not enough memory")
 _WINDOWS = {"1.#QNAN": "nan", "-1.#IND": "nan", "1.#INF": "inf", "-1.#INF": "-inf"}
 _YEAR = 366 * 86400.0
 
@@ -94,8 +96,10 @@ class LogReader:
         if not prefix:
             if self._in_settings and (found := _SETTING.match(line)):
                 self.run.settings[found[1]] = found[2].strip().strip('"')
-            elif line.startswith("Traceback ") or (line.startswith("***") and "SIG" in line):
+            elif _FAULT.match(line):
                 self._end(FAILED, line)
+            else:
+                self._read(line, None)  # where GLOG_log_prefix=false left out the beginning of the lines
             return
         message = prefix[10]
         self._in_settings = message.startswith("Initializing solver from parameters")
@@ -105,22 +109,23 @@ class LogReader:
         if prefix[1] == "F":
             self._end(FAILED, message)
 
-    def _read(self, message: str, seconds: float) -> None:
+    def _read(self, message: str, seconds: float | None) -> None:
         run = self.run
         if found := _LOSS.search(message):
             iteration = self._at(found[1])
             run.loss.add(iteration, _number(found[3]))
-            run.times.add(iteration, seconds)
+            if seconds is not None:
+                run.times.add(iteration, seconds)
             if found[2]:
                 run.speed.add(iteration, _number(found[2]))
-        elif found := _OUTPUT.match(message):
+        elif found := _OUTPUT.search(message):
             self._output(found[1], int(found[2]), found[3], found[4], "loss)" in message)
         elif found := _RATE.search(message):
             run.rate.add(self._at(found[1]), _number(found[2]))
         elif found := _TESTING.search(message):
             self._at(found[1])
-            self._net = int(found[2])
-        elif found := _SCORE.match(message):
+            self._net = int(found[2] or 0)
+        elif found := _SCORE.search(message):
             self._output("Test", int(found[1]), f"score {found[1]}", found[2], False)
         elif found := _TEST_LOSS.match(message):
             self._output("Test", -1, "test loss", found[1], True)

@@ -53,6 +53,33 @@ def test_sentences_of_other_versions() -> None:
     assert run.speed == Curve([200], [12.5])
 
 
+def test_a_log_of_2014() -> None:
+    run = read(
+        "Iteration 500, lr = 0.001",
+        "Iteration 500, loss = 1.5",
+        "Iteration 500, Testing net",
+        "Test score #0: 0.5504",
+        "Test score #1: 1.27805",
+        "Snapshotting to lenet_iter_500",
+        "Snapshotting solver state to lenet_iter_500.solverstate",
+    )
+    assert run.tests == {0: {"score 0": Curve([500], [0.5504]), "score 1": Curve([500], [1.27805])}}
+    assert (run.loss, run.rate) == (Curve([500], [1.5]), Curve([500], [0.001]))
+    assert run.snapshots == [(500, "lenet_iter_500")]
+
+
+def test_a_log_without_prefixes_and_one_of_several_nodes() -> None:
+    reader = LogReader("log")
+    for line in ("Iteration 10, loss = 0.5", "    Train net output #0: loss: a = b = 0.25 (* 1 = 0.25 loss)",
+                 "[n0.d0.r0] Iteration 20 (2.5 iter/s, 4s/10 iter), 0.1/90.1ep, loss = 0.75",
+                 "[n0.d0.r0]     Test net output #0: top-1 = 0.5"):  # fmt: skip
+        reader.feed(line)
+    assert reader.run.loss == Curve([10, 20], [0.5, 0.75])
+    assert reader.run.train == {"loss: a = b": Curve([10], [0.25])}
+    assert reader.run.tests == {0: {"top-1": Curve([20], [0.5])}}
+    assert not len(reader.run.times)
+
+
 @pytest.mark.parametrize("text", ["nan", "-nan", "1.#QNAN", "-1.#IND"])
 def test_a_loss_that_is_no_number(text: str) -> None:
     assert np.isnan(read("Iteration 1, loss = " + text).loss.values).all()
@@ -90,6 +117,7 @@ def test_the_years_end_does_not_turn_time_back() -> None:
         ("I0101 00:00:00.000000 1 solver.cpp:311] Optimization stopped early.", "stopped early"),
         ("F0101 00:00:00.000000 1 math.cpp:1] Check failed: error == cudaSuccess (2 vs. 0)  out of memory", "failed"),
         ("*** Aborted at 1 (unix time) try SIGABRT", "failed"),
+        ("a b.prototxt:3:1: Iteration 500: the loss is nan; lower base_lr, or go on with --nan warn", "failed"),
         ("I0101 00:00:00.000000 1 net.cpp:1] something", "running"),
     ],
 )
