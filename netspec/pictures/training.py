@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import matplotlib
 import numpy as np
@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from netspec.pictures.style import COLORS, FAULT, GRID, STYLE
-from netspec.runs.curve import Curve, smoothed, thinned
+from netspec.runs.curve import Curve, shown_range, smoothed, thinned
 from netspec.runs.run import Run
 
 WIDTH, LOSS_HEIGHT, HEIGHT = 9.0, 3.4, 2.3  # inches
@@ -23,15 +23,20 @@ MOST_POINTS = 2000  # of a curve, of which more cannot be seen
 MOST_ELEMENTS = 6  # of an output blob; blobs of more numbers are left out
 LEGEND_WIDTH = 100  # characters
 MARKERS = "osDv^<>"
+MOST_MARKERS = 80  # in the width of the picture
 _DASHED = (0, (4, 2))
 
 
 @dataclass(frozen=True)
 class Look:
-    """How curves are drawn: the window of the smoothing in points (None: a 25th of them), and a logarithmic axis."""
+    """How curves are drawn: the window of the smoothing in points (None: a 25th of them), and a logarithmic axis.
+
+    Tests that are at least ``apart`` iterations apart get markers.
+    """
 
     smooth: int | None = None
     log: bool = False
+    apart: float = 0.0
 
 
 def training_figure(runs: Sequence[Run], look: Look | None = None) -> Figure:
@@ -40,7 +45,7 @@ def training_figure(runs: Sequence[Run], look: Look | None = None) -> Figure:
     The loss of training is pale as it is and strong smoothed; tests are dashed, with markers. The parts have ids, such
     as ``run0-raw``, so that a page can hide them.
     """
-    look = look or Look()
+    look = replace(look or Look(), apart=max((run.iteration for run in runs), default=0) / MOST_MARKERS)
     others = other_outputs(runs)
     rates = any(len(run.rate) for run in runs)
     heights = [LOSS_HEIGHT] + [HEIGHT] * (len(others) + rates)
@@ -98,7 +103,7 @@ def _draw_losses(axis: Axes, run: Run, number: int, look: Look) -> None:
     for net, curves in run.tests.items():
         for name, curve in curves.items():
             if name in run.losses:
-                _draw_test(axis, curve, number, net)
+                _draw_test(axis, curve, number, net, look)
 
 
 def _draw_output(axis: Axes, run: Run, name: str, number: int, look: Look) -> None:
@@ -109,12 +114,12 @@ def _draw_output(axis: Axes, run: Run, name: str, number: int, look: Look) -> No
         _line(axis, x, smoothed(y, look.smooth), f"run{number}-smooth", color=color, linewidth=1.6)
     for net, curves in run.tests.items():
         if name in curves and name not in run.losses:
-            _draw_test(axis, curves[name], number, net)
+            _draw_test(axis, curves[name], number, net, look)
 
 
-def _draw_test(axis: Axes, curve: Curve, number: int, net: int) -> None:
+def _draw_test(axis: Axes, curve: Curve, number: int, net: int, look: Look) -> None:
     x, y = curve.arrays()
-    marker = MARKERS[net % len(MARKERS)] if len(x) <= 60 else ""
+    marker = MARKERS[net % len(MARKERS)] if len(x) < 2 or np.median(np.diff(x)) >= look.apart else ""
     color = COLORS[number % len(COLORS)]
     _line(axis, x, y, f"run{number}-test", color=color, linestyle=_DASHED, linewidth=1.1, marker=marker, markersize=4)
 
@@ -140,17 +145,15 @@ def _line(axis: Axes, x: np.ndarray, y: np.ndarray, name: str, **options: object
 
 
 def _scale_losses(axis: Axes, runs: Sequence[Run], look: Look) -> None:
-    """Show the whole range but for a few outliers, which a loss often has at its start."""
+    """Show the whole range but for a few outliers."""
     if look.log:
         axis.set_yscale("log")
         return
-    values = np.concatenate([run.loss.arrays()[1] for run in runs] or [np.zeros(0)])
-    values = values[np.isfinite(values)]
-    if len(values) < 20:
-        return
-    low, high = float(values.min()), float(np.percentile(values, 98))
-    if values.max() > low + 3 * (high - low) > low:
-        axis.set_ylim(low - 0.05 * (high - low), low + 1.6 * (high - low))
+    tests = [curves[name] for run in runs for curves in run.tests.values() for name in run.losses & set(curves)]
+    found = shown_range([curve.arrays()[1] for curve in [*(run.loss for run in runs), *tests]])
+    if found is not None and found[1] > found[0]:
+        margin = 0.05 * (found[1] - found[0])
+        axis.set_ylim(found[0] - margin, found[1] + margin)
 
 
 def _scale_rates(axis: Axes, runs: Sequence[Run]) -> None:

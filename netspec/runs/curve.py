@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 _POINTS_OF_WINDOW = 25  # a curve is smoothed over this part of its points
+_USUAL, _MANY = 98, 20  # percent of the values that are not left out of a drawing, where there are so many
 
 
 @dataclass
@@ -70,3 +71,19 @@ def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.nda
             keep |= {int(finite[np.argmin(y[finite])]), int(finite[np.argmax(y[finite])])}
     chosen = sorted(keep)
     return x[chosen], y[chosen]
+
+
+def shown_range(curves: list[np.ndarray]) -> tuple[float, float] | None:
+    """Return the least and the greatest value to draw of curves (n,); None where no value is finite.
+
+    A few values of a curve far above the rest, which a loss often has at its start, are left out.
+    """
+    finite = [values[np.isfinite(values)] for values in curves]
+    finite = [values for values in finite if len(values)]
+    if not finite:
+        return None
+    low = min(float(values.min()) for values in finite)
+    most = max(float(values.max()) for values in finite)
+    usual = max(float(np.percentile(values, _USUAL if len(values) >= _MANY else 100)) for values in finite)
+    high = low + 1.6 * (usual - low)
+    return (low, high) if most > low + 3 * (usual - low) > low else (low, most)

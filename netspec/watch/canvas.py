@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from netspec.log import number
+from netspec.runs.curve import shown_range
 
 _EMPTY = 0x2800
 _DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))  # of a column, from the top
@@ -34,7 +34,8 @@ def plot_lines(
         return []
     places = np.concatenate([points[0], others[0]])
     x0, x1 = float(places.min()), float(places.max())
-    y0, y1 = _range(points[1] if len(points[1]) else others[1], others[1])
+    y0, y1 = shown_range([points[1], others[1]]) or (0.0, 0.0)
+    y0, y1 = (y0, y1) if y1 > y0 else (y0 - 0.5, y0 + 0.5)
     columns, rows = max(10, width - _LABEL), max(2, height - 1)
     codes = np.full((rows, columns), _EMPTY)
     _draw(codes, points, (x0, x1, y0, y1))
@@ -73,14 +74,6 @@ def bar(share: float, width: int) -> str:
 def _finite(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     known = np.isfinite(y)
     return x[known], y[known]
-
-
-def _range(curve: np.ndarray, marks: np.ndarray) -> tuple[float, float]:
-    """Return the least and the greatest value to show: a few values far above the rest are cut off."""
-    low = float(min(curve.min(), marks.min() if len(marks) else math.inf))
-    top, most = float(np.percentile(curve, 98)), float(max(curve.max(), marks.max() if len(marks) else -math.inf))
-    high = low + 1.6 * (top - low) if len(curve) >= 20 and most > low + 3 * (top - low) > low else most
-    return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
 def _scaled(values: np.ndarray, low: float, high: float, count: int) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Pictures of trainings: what is in them, and the three forms in which they are written."""
 
+import json
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -52,6 +53,12 @@ def test_a_few_great_losses_do_not_hide_the_rest() -> None:
     assert training_figure([Run("x", curve)]).axes[0].get_ylim()[1] < 2
 
 
+def test_tests_far_above_the_training_are_in_the_picture() -> None:
+    run = Run("x", Curve(list(range(100)), [1 + 0.01 * (k % 10) for k in range(100)]), losses={"loss"})
+    run.tests[0] = {"loss": Curve([50], [3.0])}
+    assert training_figure([run]).axes[0].get_ylim()[1] > 3
+
+
 def test_the_command_writes_png_svg_and_html(run: Run_) -> None:
     for ending in ("png", "svg", "html"):
         result = run("plot", CAFFES, "--names", "<a> & $b_1$", "--out", f"x.{ending}")
@@ -65,6 +72,12 @@ def test_the_command_writes_png_svg_and_html(run: Run_) -> None:
     assert 'id="run0-smooth"' in page
     assert re.search(r'role="img" aria-label="[^"]*last loss 0\.0543485', page)
     assert not re.search(r'(src|href)="http', page)
+    found = re.search(r'<script type="application/json" id="curves">(.*?)</script>', page)
+    assert found is not None
+    curves = json.loads(found[1])
+    assert curves["runs"][0]["name"] == "<a> & $b_1$"
+    assert dict(curves["runs"][0]["curves"])["test loss"] == [[0, 0.147966], [25, 0.0510559], [50, 0.0502543]]
+    assert 0 < curves["left"] < curves["right"] < 1
 
 
 def test_equal_names_are_told_apart_by_their_folders(run: Run_) -> None:

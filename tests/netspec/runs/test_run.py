@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from netspec.errors import SpecError
-from netspec.runs.curve import Curve, smoothed, thinned
+from netspec.runs.curve import Curve, shown_range, smoothed, thinned
 from netspec.runs.run import Follower, LogReader, Run, read_log
 from netspec.runs.summary import iterations_per_second, summary
 from paths import GOLDEN
@@ -166,3 +166,12 @@ def test_thinning_keeps_extremes_and_ends() -> None:
     assert len(few) <= 102
     assert {0, 1234, 4321, 9999} <= set(few)
     np.testing.assert_array_equal(kept, y[few.astype(int)])
+
+
+def test_the_range_that_is_drawn_leaves_out_few_values_and_no_curve() -> None:
+    loss = np.concatenate([[80.0], np.linspace(2, 1, 99)])
+    low, high = shown_range([loss]) or (0, 0)
+    assert (low, high) == (1, pytest.approx(2.6, abs=0.1))
+    assert shown_range([loss, np.array([5.0, 6.0])]) == (1, pytest.approx(9.0))
+    assert shown_range([np.array([80.0, 1, 2])]) == (1, 80)
+    assert shown_range([np.full(3, np.nan)]) is None
