@@ -8,13 +8,15 @@ Caffe: src/caffe/util/db_lmdb.cpp, src/caffe/util/db_leveldb.cpp
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 import weakref
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from itertools import islice
+from multiprocessing.util import Finalize
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from types import ModuleType, TracebackType
 
 import lmdb
@@ -151,11 +153,13 @@ class _LevelDbReader(Reader):
 
     def __init__(self, source: str) -> None:
         plyvel = _plyvel()
-        self._folder = TemporaryDirectory(prefix="netspec-leveldb-")
+        folder = mkdtemp(prefix="netspec-leveldb-")
+        # Unlike weakref's, this runs at the end of a worker too, and never in a process that was forked later.
+        Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
         for name in set(os.listdir(source)) - {"LOCK", "LOG", "LOG.old"}:
-            os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(self._folder.name, name))
+            os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
         try:
-            self._db = plyvel.DB(self._folder.name, create_if_missing=False)
+            self._db = plyvel.DB(folder, create_if_missing=False)
         except (plyvel.Error, OSError) as fault:
             raise ValueError(f"cannot be opened as a LevelDB ({fault})") from None
         with self._db.iterator(include_value=False) as keys:

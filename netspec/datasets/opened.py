@@ -25,18 +25,21 @@ def of_layer(layer: ReadingLayer) -> Opened:
 
 
 class PerProcess:
-    """Calls ``open_it`` once in each process that uses it: files and locks must not cross into a worker."""
+    """Calls ``open_it`` once in each process that uses it: files and locks must not cross into a worker.
+
+    A forked worker keeps what its parent opened, unused: to close it there could disturb the parent.
+    """
 
     def __init__(self, open_it: Callable[[], Opened]) -> None:
         self._open = open_it
-        self._opened: Opened | None = None
-        self._process = 0
+        self._opened: dict[int, Opened] = {}
 
     def __call__(self) -> Opened:
         """Return what was opened in this process."""
-        if self._opened is None or self._process != os.getpid():
-            self._opened, self._process = self._open(), os.getpid()
-        return self._opened
+        process = os.getpid()
+        if process not in self._opened:
+            self._opened[process] = self._open()
+        return self._opened[process]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_opened": None}
+        return {**self.__dict__, "_opened": {}}

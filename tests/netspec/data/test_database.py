@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import gc
 import os
 import sys
+import tempfile
 import threading
 from pathlib import Path
 
@@ -297,6 +299,10 @@ def test_reading_a_leveldb_neither_locks_nor_changes_it(tmp_path: Path) -> None:
     reader = open_reader(str(tmp_path / "db"), "leveldb")
     assert [len(reader.record(i)) for i in range(3000)] == list(range(3000))
     assert {path.name: path.read_bytes() for path in (tmp_path / "db").iterdir()} == during
+    folders = set(Path(tempfile.gettempdir()).glob("netspec-leveldb-*"))
+    del reader
+    gc.collect()
+    assert len(folders - set(Path(tempfile.gettempdir()).glob("netspec-leveldb-*"))) >= 1
     other.close()
     assert set(before) - set(during) <= {name for name in before if name.endswith(".log") or "MANIFEST" in name}
 
