@@ -17,6 +17,7 @@ from netspec.command_line import DONE, WrongUsage
 if TYPE_CHECKING:
     from netspec.runs.run import Follower
 
+QUIET = 60.0  # seconds without a line after which a process that is not here counts as gone
 _HOME, _CLEAR_LINE, _CLEAR_REST = "\x1b[H", "\x1b[K", "\x1b[J"
 _NEW_SCREEN, _OLD_SCREEN = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
 
@@ -105,8 +106,9 @@ def _lines(follower: Follower) -> list[str]:
     from netspec.watch.process import is_alive, memory_of
     from netspec.watch.screen import screen
 
-    run = follower.run
+    run, now = follower.run, time.time()
     alive = is_alive(run.process) if run.process is not None else None
     size = shutil.get_terminal_size((100, 40))
     memory = memory_of(run.process) if alive and run.process is not None else None
-    return screen(run, memory, alive is False, size.columns, size.lines, time.time())
+    lost = alive is False and now - follower.changed > QUIET  # else it may run on another machine
+    return screen(run, memory, lost, size.columns, size.lines, now)

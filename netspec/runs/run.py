@@ -179,10 +179,11 @@ class LogReader:
 
 
 class Follower:
-    """Reads a log that grows: ``run`` has what was there at the last :meth:`poll`."""
+    """Reads a log that grows: ``run`` has what was there at the last :meth:`poll`, which grew at ``changed`` [s]."""
 
     def __init__(self, path: str | Path, name: str = "") -> None:
         self._path, self._name = Path(path), name or str(path)
+        self.changed = 0.0
         self._begin()
 
     def _begin(self) -> None:
@@ -203,7 +204,7 @@ class Follower:
                 status = os.fstat(file.fileno())
                 if status.st_size < self._offset or (self._file and status.st_ino != self._file):
                     self._begin()
-                self._file = status.st_ino
+                self._file, self.changed = status.st_ino, status.st_mtime
                 file.seek(self._offset)
                 new = file.read()
         except OSError as fault:

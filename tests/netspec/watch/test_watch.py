@@ -107,6 +107,15 @@ def test_without_a_terminal_it_shows_the_state_once(run: Run_) -> None:
     assert "\x1b" not in result.out
 
 
+def test_a_log_that_still_grows_is_of_a_training_that_runs_elsewhere(run: Run_) -> None:
+    log = Path("train.log")
+    text = CAFFES.read_text()
+    log.write_text(text[: text.index("Iteration 60, loss")].replace(" 12526 ", f" {2**22 + 5} "))
+    assert run("watch", log).out.startswith("train.log: running\n")
+    os.utime(log, (0, time.time() - 3600))
+    assert run("watch", log).out.startswith("train.log: not running\n")
+
+
 def test_it_wants_one_log_or_one_solver(run: Run_) -> None:
     assert run("watch").status == 2
     assert run("watch", CAFFES, "--solver", "x").status == 2
