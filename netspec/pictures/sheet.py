@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from netspec.data.records import Record
 from netspec.data.survey import Survey, as_lines
@@ -96,9 +97,12 @@ def _draw_head(figure: Figure, whole: Axes, lines: Sequence[str], found: Survey,
 def _draw_labels(axis: Axes, found: Survey) -> None:
     labels = sorted(found.labels)
     counts = [found.labels[label] for label in labels]
-    axis.bar(range(len(labels)), counts, color=COLORS[0], width=0.8 if len(labels) < 50 else 1.0)
     if len(labels) <= 12:
+        axis.bar(range(len(labels)), counts, color=COLORS[0])
         axis.set_xticks(range(len(labels)), [f"{label:g}" for label in labels])
+    else:
+        axis.bar(labels, counts, color=COLORS[0], width=0.8 if len(labels) < 50 else 1.0)
+    axis.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     _finish(axis, "records per label")
 
 
