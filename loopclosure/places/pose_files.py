@@ -71,10 +71,17 @@ class PoseFile:
     form: PoseForm
     doubts: tuple[str, ...] = field(default=())
 
-    def of_images(self, images: int, stamps: np.ndarray | None, path: str | os.PathLike[str]) -> np.ndarray:
-        """Return the poses (images, 7) of images with these stamps [s], NaN where there is none near enough in time.
+    def of_images(
+        self,
+        images: int,
+        stamps: np.ndarray | None,
+        path: str | os.PathLike[str],
+        max_difference: float = MAX_DIFFERENCE_S,
+    ) -> np.ndarray:
+        """Return the poses (images, 7) of images with these stamps, NaN where none is within ``max_difference`` [s].
 
-        Without stamps on one side, pose i is that of image i. Raises InputError if their numbers differ then.
+        Without stamps on one side, pose i is that of image i. Raises InputError if their numbers differ then, or if no
+        image has a pose.
         """
         if self.stamps is None or stamps is None:
             if len(self.poses) != images:
@@ -85,15 +92,14 @@ class PoseFile:
                     path,
                 )
             return self.poses
-        return poses_at(stamps, Trajectory(self.stamps, self.poses[:, :3], self.poses[:, 3:]))
-
-
-def poses_at(stamps: np.ndarray, trajectory: Trajectory, max_difference: float = MAX_DIFFERENCE_S) -> np.ndarray:
-    """Return the poses (N, 7) nearest to stamps (N,), NaN where none is within ``max_difference`` seconds."""
-    nearest = associate(stamps, trajectory, max_difference)
-    poses = np.hstack([trajectory.positions, trajectory.quaternions])[nearest]
-    poses[nearest < 0] = np.nan
-    return poses
+        nearest = associate(stamps, Trajectory(self.stamps, self.poses[:, :3], self.poses[:, 3:]), max_difference)
+        if nearest.max() < 0:
+            raise InputError(
+                f"none of {images} images has a pose within {max_difference:g} s: images from {stamps[0]:.3f} to "
+                f"{stamps[-1]:.3f} s, poses from {self.stamps[0]:.3f} to {self.stamps[-1]:.3f} s",
+                path,
+            )
+        return np.where(nearest[:, None] < 0, np.nan, self.poses[nearest])
 
 
 def pose_form(text: str) -> PoseForm:

@@ -17,14 +17,13 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.image_list import list_images
 from loopclosure.places.intrinsics import Intrinsics, kitti_projection, read_intrinsics, yaml_numbers
-from loopclosure.places.pose_files import PoseForm, doubts, moved, poses_at, read_poses
+from loopclosure.places.pose_files import PoseForm, moved, read_poses
 from loopclosure.places.trajectory import (
     MAX_DIFFERENCE_S,
     Frame,
     PosedSequence,
     content_lines,
     number,
-    read_groundtruth,
     read_rgb_list,
 )
 
@@ -93,7 +92,7 @@ def read_sequence(
     if poses is None:
         return sequence
     read = read_poses(poses.path, poses.form)
-    found = read.of_images(len(sequence), sequence.stamps, poses.path)
+    found = read.of_images(len(sequence), sequence.stamps, poses.path, max_difference)
     return replace(sequence, poses=found, doubts=_named(read.doubts, poses.path))
 
 
@@ -177,17 +176,9 @@ def _with_tum_files(sequence: ImageSequence, max_difference: float, own_poses: b
     assert stamps is not None
     if own_poses:
         path = folder / "groundtruth.txt"
-        trajectory = read_groundtruth(path)
-        poses = poses_at(stamps, trajectory, max_difference)
-        if not np.isfinite(poses).any():
-            raise InputError(
-                f"none of its {len(sequence)} images has a pose within {max_difference:g} s: images from "
-                f"{stamps[0]:.3f} to {stamps[-1]:.3f} s, poses from {trajectory.stamps[0]:.3f} to "
-                f"{trajectory.stamps[-1]:.3f} s",
-                folder,
-            )
-        every = np.hstack([trajectory.positions, trajectory.quaternions])
-        sequence = replace(sequence, poses=poses, doubts=_named(doubts(every, trajectory.stamps), path))
+        read = read_poses(path, PoseForm("tum"))
+        poses = read.of_images(len(sequence), stamps, path, max_difference)
+        sequence = replace(sequence, poses=poses, doubts=_named(read.doubts, path))
     if (folder / "depth.txt").is_file():
         depths = read_rgb_list(folder / "depth.txt")
         taken = np.array([depth.stamp for depth in depths])
@@ -242,7 +233,7 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
         path = base / name / "data.csv"
         if path.is_file():
             body = read_poses(path, PoseForm("euroc"))
-            found = body.of_images(len(sequence), times, path)
+            found = body.of_images(len(sequence), times, path, max_difference)
             known = np.isfinite(found[:, 0])
             found[known] = moved(found[known], mount)
             return replace(sequence, poses=found, doubts=_named(body.doubts, path))
@@ -276,7 +267,7 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     for path in (folder / "poses.txt", folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"):
         if path.is_file():
             read = read_poses(path, PoseForm("kitti"))
-            found = moved(read.of_images(len(sequence), times, path), beside)
+            found = moved(read.of_images(len(sequence), times, path, max_difference), beside)
             return replace(sequence, poses=found, doubts=_named(read.doubts, path))
     return sequence
 
@@ -305,5 +296,5 @@ def _existing(image: Path, listing: Path, line_number: int) -> Path:
     return image
 
 
-def _named(doubts: list[str] | tuple[str, ...], path: Path) -> tuple[str, ...]:
+def _named(doubts: tuple[str, ...], path: Path) -> tuple[str, ...]:
     return tuple(f"{path}: {doubt}" for doubt in doubts)
