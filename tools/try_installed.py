@@ -14,12 +14,23 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-EXTRAS = {"onnx", "onnxruntime", "openvino", "plyvel", "skimage", "pydot", "fissix", "tensorboard"}
+EXTRAS = {
+    "onnx",
+    "onnxruntime",
+    "openvino",
+    "plyvel",
+    "skimage",
+    "pydot",
+    "fissix",
+    "tensorboard",
+    "pygls",
+    "lsprotocol",
+}
 SCRIPTS = Path(sys.executable).parent
 
 
 def modules(package: str) -> list[str]:
-    """Return a package's modules, those left out that are named like programs or old names."""
+    """Return a package's modules, but for its __main__, which would run."""
     found = importlib.import_module(package)
     walked = pkgutil.walk_packages(found.__path__[:1], f"{package}.")
     return [module.name for module in walked if not module.name.endswith("__main__")]
@@ -49,8 +60,8 @@ def main(golden: Path) -> None:
     import netspec
 
     assert "site-packages" in netspec.__file__, netspec.__file__
-    shutil.copytree(golden / "train" / "sgd_step", "sgd_step", dirs_exist_ok=True)
-    shutil.copytree(golden / "pairs", "pairs", dirs_exist_ok=True)
+    shutil.copytree(golden / "train" / "sgd_step", "sgd_step")
+    shutil.copytree(golden / "pairs", "pairs")
     assert run("netspec", "--version") == f"netspec {version('netspec-caffe')}\n"
     run("netspec", "check", "--data", "sgd_step/solver.prototxt")
     out = run("netspec", "watch", "--solver", "sgd_step/solver.prototxt")
