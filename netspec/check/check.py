@@ -96,7 +96,8 @@ def check_file(
         return _check_solver(solver, node, path, given or solver.weights, manner)
     if unknown:
         return [Checked(str(path), None, gathered([*unknown, *unknown_types(net, source)]))]
-    checked = _check_net(with_state(net, phase, level, stages), source, str(path), given, manner)
+    net = with_state(net, phase, level, stages)
+    checked = _check_net(net, source, str(path), given, manner)
     checked.faults += not_to_be_given(manner.shapes, [net], path)
     return [checked]
 

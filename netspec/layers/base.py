@@ -118,7 +118,7 @@ def _nowhere(*path: str | int) -> Where:
     return Where("<layer>")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Context:
     """What a layer may know of the net around it.
 
@@ -148,6 +148,10 @@ class Context:
     accumulate_in_place: bool = False
     created: Callable[[], None] = lambda: None  # called when ``construct`` has run: Caffe's log goes by it
     take: Callable[[int], None] = lambda size: None  # called before memory is taken, in bytes: it may refuse
+
+
+_PLAIN = frozenset({bool, int, float, str, tuple, list})
+_NO_BLOBS = torch.nn.ParameterList()  # of all layers without blobs; stays empty
 
 
 class Layer(torch.nn.Module):
@@ -189,13 +193,21 @@ class Layer(torch.nn.Module):
         self.phase: int = param.phase if param.HasField("phase") else self.context.phase
         self.bottom_shapes: list[Shape] = [tuple(s) for s in bottom_shapes]
         self.num_tops: int = max(len(param.top), self.tops[0] if self.is_loss else 0)
-        self.blobs = torch.nn.ParameterList()
+        self.blobs = _NO_BLOBS
         self.blob_shapes: list[Shape] = []
         self.construct()
         self.context.created()
         self.refuse(self._wrong_counts())
         self.setup()
         self.top_shapes: list[Shape] = [self.possible(s) for s in self.reshape(self.bottom_shapes)]
+
+    @override
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set plain values, which a module need not register, without its search for what they may be: it is slow."""
+        if type(value) in _PLAIN:
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
 
     def __init_subclass__(cls, **named: Any) -> None:
         """Where a class replaces ``forward``, do not let it inherit what was said of the forward pass it replaces."""
@@ -382,6 +394,8 @@ class Layer(torch.nn.Module):
                     data = fillers.fill(filler, axes, self.context.random.on("cpu")).to(device)
             except ValueError as fault:
                 self.context.report(self.error(str(fault), *self._path_to(filler)))
+        if not self.blobs:
+            self.blobs = torch.nn.ParameterList()
         self.blobs.append(Learned(fillers.constant(axes, value, device) if data is None else data))
         self.blob_shapes.append(tuple(shape))
 

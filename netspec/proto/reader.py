@@ -93,7 +93,7 @@ class _Reader:
         if not field.repeated and field.present(message):
             first = children[alias][0].where.line
             raise self._error(f'"{alias}" was already given in line {first}; it can be given only once', name)
-        nodes = children.setdefault(alias, [])
+        nodes = children.setdefault(field.name, [])
         if self._at(":"):
             self._next()
         elif field.type != Declared.TYPE_MESSAGE:
@@ -298,6 +298,8 @@ class _Reader:
     # ---- Errors ----
 
     def _check_required(self, message: Message) -> None:
+        if message.IsInitialized():
+            return
         for field in fields_of(message.DESCRIPTOR).values():
             if field.required and not field.present(message):
                 place = self._open[-1][1]
