@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -45,7 +46,25 @@ def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
         known = False
     if not known:
         raise SpecError(f"expected a binary {name}, found {_guess(data)}", where)
+    _escape_names(message)
     return message
+
+
+def _escape_names(message: Message) -> None:
+    """Write the bytes of names that are not UTF-8, which C++ takes and Python does not, as escapes."""
+    for field, value in message.ListFields():
+        parts = value if isinstance(value, Sequence) and not isinstance(value, (str, bytes)) else [value]
+        if field.message_type:
+            for part in parts:
+                _escape_names(part)
+        elif field.type == field.TYPE_STRING and any(isinstance(part, bytes) for part in parts):
+            escaped = [part.decode(errors="backslashreplace") if isinstance(part, bytes) else part for part in parts]
+            if parts is value:
+                value[:] = escaped
+            elif field.is_extension:
+                message.Extensions[field] = escaped[0]
+            else:
+                setattr(message, field.name, escaped[0])
 
 
 def read_net_binary(path: str | Path) -> NetParameter:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import struct
+import warnings
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -57,13 +61,22 @@ layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip"
 class Format:
     """``write(path)`` writes a good file, ``read(path)`` reads it; ``path`` ends in ``suffix``.
 
-    Of a format whose file lies in a folder of its own, ``inside`` is its name there.
+    Of a format whose file lies in a folder of its own, ``inside`` is its name there. Where checksums would hide most
+    damage, ``open`` takes the file apart, and ``close`` makes one of damaged parts, whose checksums are right.
     """
 
     suffix: str
     write: Callable[[Path], object]
     read: Callable[[Path], object]
     inside: str = ""
+    open: Callable[[bytes], bytes] = bytes
+    close: Callable[[bytes], bytes] = bytes
+
+    def good(self, folder: Path) -> bytes:
+        """Return the bytes of a good file, which is written to a folder."""
+        path = folder / f"good{self.suffix}"
+        self.write(path)
+        return (path / self.inside if self.inside else path).read_bytes()
 
 
 @cache
@@ -162,6 +175,25 @@ def either_picture(path: Path) -> None:
             continue
 
 
+def members(data: bytes) -> bytes:
+    """Return the files of a zip archive, one after the other: name and contents, each after its length."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        parts = [(name.encode(), archive.read(name)) for name in archive.namelist()]
+    return b"".join(struct.pack("<B", len(n)) + n + struct.pack("<I", len(c)) + c for n, c in parts)
+
+
+def archive(parts: bytes) -> bytes:
+    """Return the zip archive of files that :func:`members` returned, whatever was done to them."""
+    stream, made = io.BytesIO(parts), io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # two of one name
+        while length := stream.read(1):
+            name = stream.read(length[0]).decode("latin-1").replace("\0", "") or "x"
+            size = int.from_bytes(stream.read(4), "little")
+            archive.writestr(zipfile.ZipInfo(name), stream.read(size))
+    return made.getvalue()
+
+
 POSES = "".join(f"{i}.5 {i} 0 1 0 0 0 1\n" for i in range(6))
 WINDOWS = "# 0\na.png\n3\n48\n64\n2\n4 0.9 0 0 20 20\n0 0.1 10 10 40 40\n# 1\nb.png\n3\n48\n64\n0\n"
 PARAM = SimpleNamespace(fg_threshold=0.5, bg_threshold=0.5, root_folder="")
@@ -180,10 +212,12 @@ FORMATS = {
         ".binaryproto", lambda path: write_mean(str(path), numbers(3, 4, 4)), lambda path: read_mean(str(path))
     ),
     "mean.npy": Format(".npy", lambda path: np.save(path, numbers(3, 4, 4)), lambda path: read_mean_option(str(path))),
-    "detector": Format(".npz", detector, go_on),
-    "detector with points": Format(".npz", lambda path: detector(path, GeometricCheck(min_inliers=8)), go_on),
-    "word model": Format(".npz", word_model, WordModel.load),
-    "features": Format(".npz", features, read_features),
+    "detector": Format(".npz", detector, go_on, open=members, close=archive),
+    "detector with points": Format(
+        ".npz", lambda path: detector(path, GeometricCheck(min_inliers=8)), go_on, "", members, archive
+    ),
+    "word model": Format(".npz", word_model, WordModel.load, "", members, archive),
+    "features": Format(".npz", features, read_features, "", members, archive),
     "truth.mat": Format(".mat", truth, read_truth_matrix),
     "truth.npy": Format(".npy", lambda path: np.save(path, np.eye(6)), read_truth_matrix),
     "truth.txt": Format(".txt", lambda path: np.savetxt(path, np.eye(6), "%d"), read_truth_matrix),
