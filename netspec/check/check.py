@@ -19,6 +19,7 @@ from netspec.check.lint import missing_data, net_advice, solver_advice
 from netspec.errors import ForkFault, SpecError
 from netspec.graph.filter import with_state, with_train_state
 from netspec.layers.base import Shape
+from netspec.limits import most
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions, not_to_be_given
@@ -135,7 +136,7 @@ def _check_net(
         passes=manner.passes or (),
     )
     built = build_net(net, source, options)
-    if fault := built.need.fault():
+    if fault := built.need.fault(most()):
         faults.append(fault)
     if files := [path.strip() for paths in weights for path in paths.split(",")]:
         load_weights(built, files, manner.strict, report=faults.append)

@@ -26,12 +26,12 @@ from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
-from netspec.limits import amount, is_out_of_memory, most
+from netspec.limits import amount, is_out_of_memory
 from netspec.limits import memory as memory_of_machine
 from netspec.net.chains import chains
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
-from netspec.net.need import BYTES, Need, limit_text
+from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.net.options import BuildOptions
 from netspec.net.programs import Programs
 from netspec.net.table import table
@@ -163,7 +163,7 @@ class Net(torch.nn.Module):
             owned = len(self.learnable)
             self._adopt_params(layers, i, layer, options.report)
             self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
-        if self.device.type == "cpu" and (fault := self.need.fault()):
+        if self.device.type != "meta" and (fault := self.need.fault(limit_on(self.device))):
             options.report(fault)
         if len(layers) == len(self.plan.nodes):
             self._finish(list(layers.values()))
@@ -175,15 +175,15 @@ class Net(torch.nn.Module):
         Raises SpecError where that, or what the whole net needs, is too much. Only a net that takes much is looked at
         as a whole.
         """
-        if self.device.type != "cpu" or self.need.total + size <= most() // MUCH:
+        if self.device.type == "meta" or self.need.total + size <= (limit := limit_on(self.device)) // MUCH:
             return
         if not self._surveyed:
-            self._surveyed, self._too_much = True, self._survey(options).fault()
+            self._surveyed, self._too_much = True, self._survey(options).fault(limit)
         if self._too_much:
             raise self._too_much
-        if self.need.parameters + size > most():
+        if self.need.parameters + size > limit:
             raise SpecError(
-                f"needs {amount(size)} of memory beside {self.need}; {limit_text()}", _Tie(self.plan, i).at()
+                f"needs {amount(size)} of memory beside {self.need}; {limit_text(limit)}", _Tie(self.plan, i).at()
             )
 
     def _survey(self, options: BuildOptions) -> Need:
