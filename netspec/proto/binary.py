@@ -53,16 +53,15 @@ def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
 
 def _escape_names(message: Any) -> None:
     """Write the bytes of names that are not UTF-8, which C++ takes and Python does not, as escapes."""
-    value: Any
     for field, value in message.ListFields():
-        parts = value if isinstance(value, Sequence) and not isinstance(value, (str, bytes)) else [value]
+        parts: Any = value if isinstance(value, Sequence) and not isinstance(value, (str, bytes)) else [value]
         if field.message_type:
             for part in parts:
                 _escape_names(part)
         elif field.type == field.TYPE_STRING and any(isinstance(part, bytes) for part in parts):
             escaped = [part.decode(errors="backslashreplace") if isinstance(part, bytes) else part for part in parts]
             if parts is value:
-                value[:] = escaped
+                parts[:] = escaped
             elif field.is_extension:
                 message.Extensions[field] = escaped[0]
             else:
