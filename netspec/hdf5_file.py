@@ -137,6 +137,21 @@ def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
     return ""
 
 
+def layer_groups(data: Hdf5Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
+    """Yield the layers of a file of weights, /data/<layer>/<i>, in Caffe's (alphabetical) order.
+
+    A layer with a slash in its name is a group within a group.
+    """
+    for name in data.names():
+        group = data.group(name)
+        if group is not None:
+            found = {key: group.dataset(key) for key in group.names()}
+            arrays = {key: dataset for key, dataset in found.items() if dataset is not None}
+            if arrays or not found:
+                yield prefix + name, arrays
+            yield from layer_groups(group, f"{prefix}{name}/")
+
+
 def _parts(path: str) -> list[str]:
     return [part for part in path.split("/") if part]
 

@@ -27,6 +27,7 @@ _RANGES: dict[int, tuple[int, int]] = {
     Declared.TYPE_UINT32: (0, (1 << 32) - 1),
     Declared.TYPE_UINT64: (0, (1 << 64) - 1),
 }
+_LONGEST = 100  # digits: more than any number has, and less than Python refuses to print
 _BOOLEANS = {"true": True, "True": True, "t": True, "false": False, "False": False, "f": False}
 _V1_TYPES = V1LayerParameter.LayerType.keys()
 _LAYERS = ("caffe.LayerParameter", "caffe.V1LayerParameter")
@@ -270,6 +271,8 @@ class _Reader:
 
     def _natural(self, token: Token) -> int:
         text = token.text
+        if len(text) > _LONGEST:
+            raise self._error(f"a number of {len(text):,} digits is out of every range", token)
         if text[:2] in ("0x", "0X"):
             return int(text, 16)
         if text[0] != "0":
