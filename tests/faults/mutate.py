@@ -33,7 +33,20 @@ from netspec.errors import SpecError  # noqa: E402
 
 MEMORY = 1 << 30  # bytes
 SECONDS = 10
-WORDS = (b"\x00", b"\xff", b"\x7f\xff\xff\xff", b"\xff" * 8, b"\x00" * 8, b"-1", b"1e999", b"nan", b" ", b"\n", b"\xc3")
+WORDS = (
+    b"9" * 5000,
+    b"\x00",
+    b"\xff",
+    b"\x7f\xff\xff\xff",
+    b"\xff" * 8,
+    b"\x00" * 8,
+    b"-1",
+    b"1e999",
+    b"nan",
+    b" ",
+    b"\n",
+    b"\xc3",
+)
 
 
 def mutant(data: bytes, draw: random.Random) -> bytes:
