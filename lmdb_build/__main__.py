@@ -1,7 +1,14 @@
-"""``python -m lmdb_build``."""
+"""The program ``lmdb-build``, and ``python -m lmdb_build``."""
 
 import sys
 
-from lmdb_build.cli import main
+from netspec.__main__ import program
 
-sys.exit(main())
+
+def main() -> int:
+    """Run one command of lmdb_build."""
+    return program("lmdb_build.cli")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -10,6 +10,7 @@ import io
 import math
 import os
 import pickle
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -142,6 +143,8 @@ def _read(stream: IO[bytes], size: int) -> np.ndarray:
         raise ValueError(f"an array of shape {shape}, {dtype}, in {size} bytes")
     data = stream.read(count * dtype.itemsize)
     values = np.frombuffer(data, dtype, count).copy() if dtype.itemsize else np.zeros(count, dtype)
+    if dtype.kind == "U" and np.any(values.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder)) > sys.maxunicode):
+        raise ValueError("an array of characters that Unicode does not have")  # Python's strings would be broken
     return values.reshape(shape[::-1]).T if by_columns else values.reshape(shape)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)  # of a large net there are millions
 class Where:
     """A place in a file: ``file:line:column``, or the file alone where no line is known (line 0).
 

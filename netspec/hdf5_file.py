@@ -9,7 +9,9 @@ write, tries again when the process ends, and kills it.
 from __future__ import annotations
 
 import io
+import math
 import os
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,14 +19,17 @@ from typing import Any
 
 import h5py
 import numpy as np
-from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]
+from h5py import h5o, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault_at
-from netspec.limits import bomb
+from netspec.limits import ALWAYS, amount, bomb
 from netspec.whole_file import whole_file
 
 _MOST_LINKS = 16  # from link to link
+_MOST_DEFLATED = 1032  # times its size: what deflate can unpack to
+_SUM = 4  # bytes of a checksum
+_FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
 LIBRARY_FAULTS = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError)
 
 
@@ -78,6 +83,8 @@ class Hdf5Group:
             raise SpecError(f"dataset {self._path}/{name} is stored in another file, which is not read")
         if too_large := bomb(found.nbytes, self._file_size):
             raise SpecError(f"dataset {self._path}/{name} {too_large}")
+        if found.chunks is not None and (wrong := _wrong_chunks(found, found.chunks)):
+            raise SpecError(f"dataset {self._path}/{name} {wrong}")
         return found
 
     def values(self, name: str) -> np.ndarray:
@@ -106,6 +113,28 @@ class Hdf5Group:
             else:
                 return None
         return found
+
+
+def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
+    """Return what is wrong with a dataset's chunks of this shape, if anything.
+
+    The library makes room for whatever size a chunk announces, and for all that it unpacks to.
+    """
+    packing = dataset.id.get_create_plist()
+    filters = [packing.get_filter(i)[0] for i in range(packing.get_nfilters())]
+    if set(filters) - _FILTERS or filters.count(h5z.FILTER_DEFLATE) > 1:
+        return "is packed in a way that is not read; write it with gzip, lzf, or not packed"
+    size = math.prod(shape) * dataset.dtype.itemsize
+    stored: list[tuple[tuple[int, ...], int]] = []
+    dataset.id.chunk_iter(lambda chunk: stored.append((chunk.chunk_offset, chunk.size)))
+    for place, packed in stored:
+        if packed > size + size // 8 + 4096:  # packing adds a few bytes to what cannot be packed
+            return f"has a chunk of {amount(packed)}, and its chunks hold {amount(size)}"
+        if h5z.FILTER_DEFLATE in filters and packed * _MOST_DEFLATED > ALWAYS:
+            mask, data = dataset.id.read_direct_chunk(place)
+            if not mask and len(zlib.decompressobj().decompress(data, size + _SUM + 1)) > size + _SUM:
+                return f"has a chunk that unpacks to more than the {amount(size)} of its numbers"
+    return ""
 
 
 def layer_groups(data: Hdf5Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
-from collections.abc import Iterator
+import stat
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -31,9 +33,12 @@ def memory() -> int:
         return machine
 
 
-def most() -> int:
-    """Return the bytes of memory that a net may need: the machine's, unless :func:`limited` sets another limit."""
-    return memory() if _limit is None else _limit
+def most(available: Callable[[], int] = memory) -> int:
+    """Return the bytes of memory that a net may need: all there is, unless :func:`limited` sets another limit.
+
+    ``available`` tells how much there is, by default the machine's memory.
+    """
+    return available() if _limit is None else _limit
 
 
 @contextmanager
@@ -49,8 +54,18 @@ def limited(size: int | None) -> Iterator[None]:
 
 
 def is_out_of_memory(fault: BaseException) -> bool:
-    """Say whether an exception means that there was no memory: torch raises a RuntimeError."""
-    return isinstance(fault, MemoryError) or (isinstance(fault, RuntimeError) and "allocate" in str(fault))
+    """Say whether an exception means that there was no memory, or never could be: torch raises a RuntimeError."""
+    if isinstance(fault, RuntimeError):
+        return any(word in str(fault) for word in ("allocate", "calculation overflowed", "multiplication overflow"))
+    return isinstance(fault, MemoryError)
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return what a file or a pipe holds. Raises OSError, for a device too: it may have no end."""
+    with open(path, "rb") as file:
+        if stat.S_ISCHR(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.ENODEV, "it is a device, not a file", str(path))
+        return file.read()
 
 
 def bomb(size: int, stored: int) -> str:
@@ -70,7 +85,7 @@ def read_amount(text: str) -> int:
 
 def amount(size: int) -> str:
     """Return a number of bytes for people: ``1.5 GiB``."""
-    for power, unit in ((40, "TiB"), (30, "GiB"), (20, "MiB"), (10, "KiB")):
+    for power, unit in ((60, "EiB"), (50, "PiB"), (40, "TiB"), (30, "GiB"), (20, "MiB"), (10, "KiB")):
         if size >= 1 << power:
             return f"{size / (1 << power):.3g} {unit}"
     return f"{size} bytes"

@@ -72,9 +72,9 @@ def test_it_says_what_it_is(wheel: Path) -> None:
         assert any("licenses/LICENSE" in name for name in file.namelist())
     assert "\nName: netspec-caffe\n" in metadata
     assert dict(points["console_scripts"]) == {
-        "netspec": "netspec.cli:main",
-        "loopclosure": "loopclosure.cli:main",
-        "lmdb-build": "lmdb_build.cli:main",
+        "netspec": "netspec.__main__:main",
+        "loopclosure": "loopclosure.__main__:main",
+        "lmdb-build": "lmdb_build.__main__:main",
     }
 
 

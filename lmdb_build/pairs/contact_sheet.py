@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from lmdb_build.pairs.list_file import ListedPair, read_pair_list
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
+from loopclosure.whole_file import whole_file
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 240, 180
 BORDER, CAPTION, TITLE = 6, 40, 44
@@ -48,12 +50,15 @@ def write_contact_sheet(list_file: Path, root: Path, out: Path, rows: int = 6, s
         raise InputError(f"a contact sheet must have at least 1 row, not {rows}")
     sheet = contact_sheet(list_file, root, rows, seed)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        written = cv2.imwrite(str(out), sheet)
-    except (OSError, cv2.error):
-        written = False
-    if not written:
+        done, picture = cv2.imencode(out.suffix, sheet)
+    except cv2.error:
+        done = False
+    if not done:
         raise InputError("cannot be written as a picture; a suffix such as .png says its format", out)
+    with suppress(OSError):  # said when the file is written
+        out.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(out) as unfinished:
+        unfinished.write_bytes(picture.tobytes())
 
 
 def _title(text: str, colour: tuple[int, int, int]) -> NDArray:

@@ -63,18 +63,34 @@ def image_paths(source: str | Path) -> list[Path]:
 
 def read_bgr(path: str | Path) -> np.ndarray:
     """Read an image (H, W, 3) uint8, BGR; InputError if it cannot be read."""
+    return read_pixels(path, cv2.IMREAD_COLOR)
+
+
+def read_pixels(path: str | Path, mode: int) -> np.ndarray:
+    """Read an image as OpenCV lays it out in one of its modes; InputError if it cannot be read."""
     # Read by Python, decoded by OpenCV: imread prints a warning of its own for a missing file.
     try:
-        data = np.fromfile(path, np.uint8)
+        data = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"no such image ({error.strerror})", path) from None
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode) if data and not is_cut_png(data) else None
     except cv2.error:  # too large, for example
         image = None
     if image is None:
         raise InputError("is not a readable image", path)
     return image
+
+
+def is_cut_png(data: bytes) -> bool:
+    """Return whether data is that of a PNG file with a part that announces more than there is.
+
+    OpenCV makes room for the 4 GiB that a part may announce before it looks at how much there is.
+    """
+    at = 8 if data.startswith(b"\x89PNG\r\n\x1a\n") else len(data)
+    while at < len(data):
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return at > len(data)
 
 
 def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:

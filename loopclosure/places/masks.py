@@ -10,6 +10,7 @@ import numpy as np
 
 from loopclosure.arrays import read_lists, read_npy
 from loopclosure.errors import InputError
+from loopclosure.places.frames import read_pixels
 from loopclosure.places.mat_file import read_mat
 
 # The FAB-MAP sets call it truth; several papers' derived files GT.
@@ -128,10 +129,10 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
     if suffix in (".txt", ".csv", ".dat"):
         return _read_text(path, what, last_columns)
     if suffix in LOSSLESS_SUFFIXES:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise InputError(f"is not a readable image; expected {what}", path)
-        return image
+        try:
+            return read_pixels(path, cv2.IMREAD_GRAYSCALE)
+        except InputError as fault:
+            raise InputError(f"{fault.message}; expected {what}", path) from None
     raise InputError(
         f'"{suffix}" is not a known suffix for {what}; known: .mat .npy .txt .csv {" ".join(LOSSLESS_SUFFIXES)}'
         + (" (a JPEG has lost the exact values)" if suffix in (".jpg", ".jpeg") else ""),

@@ -163,7 +163,8 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
         axes.set_yscale("log")
     axes.grid(alpha=0.3, which="both")
     axes.legend()
-    figure.savefig(path, dpi=120)
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=120, format="png")
 
 
 def _draw_distances(runs: Sequence[Run], path: Path) -> None:
@@ -178,4 +179,5 @@ def _draw_distances(runs: Sequence[Run], path: Path) -> None:
         axes.title.set_fontsize(10)
     grid[0][0].set_ylabel("validation pairs")
     grid[0][0].legend(fontsize=8)
-    figure.savefig(path, dpi=120)
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=120, format="png")

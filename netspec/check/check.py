@@ -20,6 +20,7 @@ from netspec.check.forks import gathered, unknown_types
 from netspec.errors import ForkFault, SpecError
 from netspec.graph.filter import with_state, with_train_state
 from netspec.layers.base import Shape
+from netspec.limits import most
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions, not_to_be_given
@@ -97,7 +98,8 @@ def check_file(
         return _check_solver(solver, node, path, given or solver.weights, manner)
     if unknown:
         return [Checked(str(path), None, gathered([*unknown, *unknown_types(net, source)]))]
-    checked = _check_net(with_state(net, phase, level, stages), source, str(path), given, manner)
+    net = with_state(net, phase, level, stages)
+    checked = _check_net(net, source, str(path), given, manner)
     checked.faults += not_to_be_given(manner.shapes, [net], path)
     return [checked]
 
@@ -135,7 +137,7 @@ def _check_net(
         passes=manner.passes or (),
     )
     built = build_net(net, source, options)
-    if fault := built.need.fault():
+    if fault := built.need.fault(most()):
         faults.append(fault)
     if files := [path.strip() for paths in weights for path in paths.split(",")]:
         load_weights(built, files, manner.strict, report=faults.append)

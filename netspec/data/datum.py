@@ -85,7 +85,7 @@ def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
     """Decode an image file's bytes as OpenCV lays them out, uint8 (H, W) or (H, W, C); see :func:`decode_image`."""
     flag = cv2.IMREAD_UNCHANGED if color is None else cv2.IMREAD_COLOR if color else cv2.IMREAD_GRAYSCALE
     try:
-        pixels = cv2.imdecode(np.frombuffer(image, np.uint8), flag) if image else None
+        pixels = cv2.imdecode(np.frombuffer(image, np.uint8), flag) if image and not is_cut_png(image) else None
     except cv2.error:
         pixels = None
     if pixels is None:
@@ -93,6 +93,17 @@ def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
     if pixels.dtype != np.uint8:
         raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits per channel can be read")
     return pixels
+
+
+def is_cut_png(data: bytes) -> bool:
+    """Return whether data is that of a PNG file with a part that announces more than there is.
+
+    OpenCV makes room for the 4 GiB that a part may announce before it looks at how much there is.
+    """
+    at = 8 if data.startswith(b"\x89PNG\r\n\x1a\n") else len(data)
+    while at < len(data):
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return at > len(data)
 
 
 def planar(pixels: np.ndarray) -> np.ndarray:

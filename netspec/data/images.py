@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from netspec.data.datum import decode_pixels, planar
 from netspec.errors import SpecError, Where
+from netspec.limits import read_bytes
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,17 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
     Raises ValueError, which names the file, if the file is missing or is not an image.
     """
     try:
-        pixels = decode_pixels(Path(path).read_bytes(), color)
+        pixels = decode_pixels(read_bytes(path), color)
     except OSError as fault:
         raise ValueError(f'image "{path}" cannot be read: {fault.strerror}') from None
     except ValueError as fault:
         raise ValueError(f'image "{path}" {fault}') from None
     if size:
         height, width = size
-        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_LINEAR)
+        try:
+            pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_LINEAR)
+        except cv2.error:  # it is too large
+            raise ValueError(f'image "{path}" cannot be resized to {height} x {width}') from None
     return planar(pixels)
 
 
@@ -49,7 +52,7 @@ def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Whe
     ``where`` is the place that names the file. Raises SpecError if it cannot be read.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+        lines = read_bytes(path).decode("utf-8-sig").splitlines()
     except OSError as fault:
         raise SpecError(f'list file "{path}" cannot be read: {fault.strerror}', where or Where(path)) from None
     except UnicodeDecodeError:

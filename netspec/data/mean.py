@@ -5,7 +5,6 @@ Caffe: src/caffe/data_transformer.cpp, tools/compute_image_mean.cpp
 
 from __future__ import annotations
 
-from pathlib import Path
 from tokenize import TokenError
 
 import numpy as np
@@ -17,6 +16,7 @@ from netspec.data.database import Reader
 from netspec.data.datum import datum_to_array, parse_datum, times
 from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault
+from netspec.limits import read_bytes
 from netspec.proto.schema import BlobProto
 from netspec.whole_file import whole_file
 
@@ -28,7 +28,7 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     """
     log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
     try:
-        data = Path(path).read_bytes()
+        data = read_bytes(path)
     except OSError as fault:
         raise SpecError(f'mean file "{path}" cannot be read: {fault.strerror}', where) from None
     if fault := pointer_fault(data):

@@ -48,8 +48,15 @@ class Cursor:
 
     def records(self, iteration: int) -> list[int]:
         """Return the numbers of the records of an iteration."""
-        places = (divmod(k, self.count) for k in self.positions(iteration))
-        return [int(self._order(epoch)[i]) if self._shuffle else i for epoch, i in places]
+        return [self._record(position) for position in self.positions(iteration)]
+
+    def first(self) -> int:
+        """Return the number of the first record of all."""
+        return self._record(self.positions(0)[0])
+
+    def _record(self, position: int) -> int:
+        epoch, i = divmod(position, self.count)
+        return int(self._order(epoch)[i]) if self._shuffle else i
 
     def positions(self, iteration: int) -> range:
         """Return the positions of an iteration's records in the endless sequence that all ranks read."""
@@ -110,7 +117,7 @@ class _ImageSource:
     def __init__(self, cursor: Cursor, transformer: Transformer) -> None:
         self.cursor = cursor
         self._transform = transformer
-        first = self._item(cursor.records(0)[0])
+        first = self._item(cursor.first())
         self._first_name = first.name
         self._shape = transformer.output_shape(first.image.shape)
 

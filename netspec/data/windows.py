@@ -22,6 +22,7 @@ from netspec.data.random_words import words_at
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.data.transformer import mean_contradictions
 from netspec.errors import SpecError, Where
+from netspec.limits import read_bytes
 
 CHANNELS = 3  # images are always read in color
 
@@ -56,7 +57,7 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
     """
     path: str = param.source
     try:
-        lines = [(number, line.strip()) for number, line in enumerate(Path(path).read_text().splitlines(), 1)]
+        lines = [(number, line.strip()) for number, line in enumerate(read_bytes(path).decode().splitlines(), 1)]
     except (OSError, UnicodeDecodeError) as fault:
         raise SpecError(f'window file "{path}" cannot be read: {fault}', where) from None
     remaining = iter([(number, line) for number, line in lines if line])

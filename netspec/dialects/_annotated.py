@@ -47,7 +47,7 @@ class AnnotatedSource:
         self._seed, self._stream = seed, stream
         self._parse = message("ssd.AnnotatedDatum").FromString
         self._has_boxes = True
-        image, first = self._read(cursor.records(0)[0])
+        image, first = self._read(cursor.first())
         self._has_boxes = typed or first.HasField("type")
         self._shape = (image.shape[2], *augment.size(image.shape))
         count = sum(len(group.annotation) for group in first.annotation_group)

@@ -23,6 +23,7 @@ from netspec.net.options import BuildOptions, not_to_be_given
 from netspec.proto.schema import NetParameter, ParamSpec
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import write_text
+from netspec.proto.upgrade.rewrite import copy_without
 from netspec.whole_file import whole_file
 
 
@@ -48,9 +49,7 @@ def with_inputs(
         BuildOptions(torch.device("meta"), seed=0, open_data=False, given_shapes=shapes, allow_python=allow_python),
     )
     built = {layer.param.name: layer for layer in probe.layers}
-    result = NetParameter()
-    result.CopyFrom(filtered)
-    del result.layer[:]
+    result = copy_without(filtered, {"layer"})
     places, missing = [], set()
     for i, layer in enumerate(filtered.layer):
         if missing & set(layer.bottom):

@@ -9,6 +9,7 @@ from netspec.errors import SpecError
 from netspec.graph import Report, raise_fault
 from netspec.proto.schema import LayerParameter, NetParameter, NetState, NetStateRule, PhaseValue, SolverParameter
 from netspec.proto.source_map import SourceMap
+from netspec.proto.upgrade.rewrite import copy_without
 
 
 def in_state(net: NetParameter, *states: NetState) -> NetParameter:
@@ -38,9 +39,7 @@ def with_train_state(solver: SolverParameter, level: int | None, stages: Iterabl
 
 def filter_net(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> tuple[NetParameter, SourceMap]:
     """Return the net with only the layers that its ``state`` includes."""
-    filtered = NetParameter()
-    filtered.CopyFrom(net)
-    del filtered.layer[:]
+    filtered = copy_without(net, {"layer"})
     kept = []
     for index, layer in enumerate(net.layer):
         if layer.include and layer.exclude:

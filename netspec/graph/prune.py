@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from netspec.graph import check_blobs
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
+from netspec.proto.upgrade.rewrite import copy_without
 
 
 def prune(
@@ -31,9 +32,7 @@ def prune(
         kept.append(i)
         needed -= fresh - set(given)
         needed.update(layer.bottom)
-    pruned = NetParameter()
-    pruned.CopyFrom(net)
-    del pruned.layer[:]
+    pruned = copy_without(net, {"layer"})
     places = []
     for name, shape in given.items():
         entry = pruned.layer.add(name=name, type="Input", top=[name])

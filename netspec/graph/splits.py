@@ -13,6 +13,7 @@ from netspec.errors import SpecError, did_you_mean
 from netspec.graph import Report, raise_fault
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
+from netspec.proto.upgrade.rewrite import copy_without
 
 Top = tuple[int, int]  # layer index, top index
 MOST_NAMES = 20  # blobs that an error names
@@ -22,9 +23,7 @@ MOST_HINTS = 20  # unknown blobs for which similar names are looked for: that ta
 def insert_splits(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> tuple[NetParameter, SourceMap]:
     """Return the net with Split layers inserted."""
     producer, uses, weights = _count_uses(net, source, report)
-    split = NetParameter()
-    split.CopyFrom(net)
-    del split.layer[:]
+    split = copy_without(net, {"layer"})
     places = []
     used: Counter[Top] = Counter()
     for i, layer in enumerate(net.layer):

@@ -28,8 +28,10 @@ from netspec.graph import Report, raise_fault
 from netspec.layers import fillers
 from netspec.layers.learned import Learned, values_of
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.limits import amount, is_out_of_memory, memory
 from netspec.proto.schema import TEST
 
+MOST_AXES = 32  # of a blob of Caffe's (kMaxBlobAxes)
 MOST = 2**31 - 1  # numbers that a blob of Caffe's can hold (Blob::Reshape)
 
 
@@ -118,7 +120,7 @@ def _nowhere(*path: str | int) -> Where:
     return Where("<layer>")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Context:
     """What a layer may know of the net around it.
 
@@ -148,6 +150,10 @@ class Context:
     accumulate_in_place: bool = False
     created: Callable[[], None] = lambda: None  # called when ``construct`` has run: Caffe's log goes by it
     take: Callable[[int], None] = lambda size: None  # called before memory is taken, in bytes: it may refuse
+
+
+_PLAIN = frozenset({bool, int, float, str, tuple, list})
+_NO_BLOBS = torch.nn.ParameterList()  # of all layers without blobs; stays empty
 
 
 class Layer(torch.nn.Module):
@@ -180,6 +186,7 @@ class Layer(torch.nn.Module):
     remembers: ClassVar[bool] = False  # a pass changes more than its tops: it cannot be prepared
     gathers: ClassVar[bool] = False  # in a test its top is not averaged over the batches: see ``score``
     solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
+    ahead: int = 0  # bytes of batches that it reads before they are asked for
     not_exported: ClassVar[str] = "its class does not define it"  # the reason, where it cannot be exported
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
@@ -189,13 +196,21 @@ class Layer(torch.nn.Module):
         self.phase: int = param.phase if param.HasField("phase") else self.context.phase
         self.bottom_shapes: list[Shape] = [tuple(s) for s in bottom_shapes]
         self.num_tops: int = max(len(param.top), self.tops[0] if self.is_loss else 0)
-        self.blobs = torch.nn.ParameterList()
+        self.blobs = _NO_BLOBS
         self.blob_shapes: list[Shape] = []
         self.construct()
         self.context.created()
         self.refuse(self._wrong_counts())
         self.setup()
         self.top_shapes: list[Shape] = [self.possible(s) for s in self.reshape(self.bottom_shapes)]
+
+    @override
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set plain values, which a module need not register, without its search for what they may be: it is slow."""
+        if type(value) in _PLAIN:
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
 
     def __init_subclass__(cls, **named: Any) -> None:
         """Where a class replaces ``forward``, do not let it inherit what was said of the forward pass it replaces."""
@@ -348,7 +363,13 @@ class Layer(torch.nn.Module):
     def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Reshape if the bottoms' shapes changed, run ``forward``, return a tuple."""
         self.fit([tuple(b.shape) for b in bottoms])
-        tops = self(*bottoms)
+        try:
+            tops = self(*bottoms)
+        except (MemoryError, RuntimeError) as fault:
+            if is_out_of_memory(fault):
+                there = f"this machine has {amount(memory())}"
+                raise self.error(f"its pass needs more memory than there is; {there}") from None
+            raise
         return tops if isinstance(tops, tuple) else (tops,)
 
     def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
@@ -382,6 +403,8 @@ class Layer(torch.nn.Module):
                     data = fillers.fill(filler, axes, self.context.random.on("cpu")).to(device)
             except ValueError as fault:
                 self.context.report(self.error(str(fault), *self._path_to(filler)))
+        if not self.blobs:
+            self.blobs = torch.nn.ParameterList()
         self.blobs.append(Learned(fillers.constant(axes, value, device) if data is None else data))
         self.blob_shapes.append(tuple(shape))
 
@@ -395,9 +418,11 @@ class Layer(torch.nn.Module):
         return [values_of(self.blob(j)) for j in range(len(self.blobs))]
 
     def possible(self, shape: Sequence[int]) -> Shape:
-        """Return a shape as a tuple; refuse one with a negative size, or of more numbers than Caffe can count."""
+        """Return a shape as a tuple; refuse one with a negative size, or of more axes or numbers than Caffe's."""
         if min(shape, default=0) < 0:
             raise self.error(f"found shape {tuple(shape)}, expected no negative size")
+        if len(shape) > MOST_AXES:
+            raise self.error(f"found a blob of {len(shape):,} axes, expected at most {MOST_AXES}")
         if math.prod(shape) > MOST:
             raise self.error(f"found shape {tuple(shape)}, {math.prod(shape):,} numbers, expected at most {MOST:,}")
         return tuple(shape)

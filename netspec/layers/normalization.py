@@ -13,7 +13,7 @@ from typing_extensions import override
 from netspec.exact import ALL, SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization, ChannelProducts, RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.base import Absorbed, Affine, Kernel, Layer, Preparation, Shape, copy_of, finished, rounded
+from netspec.layers.base import MOST, Absorbed, Affine, Kernel, Layer, Preparation, Shape, copy_of, finished, rounded
 from netspec.layers.learned import values_of
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
@@ -474,6 +474,9 @@ class LRN(Layer):
     def setup(self) -> None:
         if self.param.lrn_param.local_size % 2 == 0:
             message = f"local_size must be odd, found {self.param.lrn_param.local_size}"
+            raise self.error(message, "lrn_param", "local_size")
+        if self.param.lrn_param.local_size > MOST:
+            message = f"local_size must be at most {MOST}, found {self.param.lrn_param.local_size}"
             raise self.error(message, "lrn_param", "local_size")
         if self.param.lrn_param.norm_region != ACROSS_CHANNELS:
             self.ignores = frozenset({"lrn_param.k"})

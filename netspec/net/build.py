@@ -68,6 +68,9 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
     if log.logger.isEnabledFor(logging.INFO):
         log.dump("net.cpp:53", "Initializing net from parameters: ", write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source, options.report)
+    for layer in split.layer:
+        if not layer.HasField("phase"):
+            layer.phase = split.state.phase
     built = Net(make_plan(split, source, options.report), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
     if written.layer:  # weights in the prototxt itself

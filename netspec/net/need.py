@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import torch
+
 from netspec.errors import SpecError
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
@@ -19,11 +21,12 @@ class Need:
 
     ``parameters`` counts shared ones once. ``tops`` is what tops need at one time: in phase TEST each is given up after
     its last use, in phase TRAIN the backward pass needs them all. Tops that are in place, or that lie in their bottom's
-    memory, need nothing. Gradients, the solver's history and what kernels need for their work come on top.
+    memory, need nothing. ``ahead`` is what data layers read ahead. Gradients, the solver's history and what kernels
+    need for their work come on top.
     """
 
     def __init__(self, plan: Plan, last_uses: Sequence[Sequence[int]]) -> None:
-        self.parameters = self.tops = 0
+        self.parameters = self.tops = self.ahead = 0
         self._plan = plan
         self._ends = last_uses if plan.net.state.phase == TEST else [()] * len(plan.nodes)
         self._home: dict[int, int] = {}  # the value whose memory a value lies in
@@ -34,8 +37,8 @@ class Need:
 
     @property
     def total(self) -> int:
-        """Bytes of parameters and tops together."""
-        return self.parameters + self.tops
+        """Bytes of all of it together."""
+        return self.parameters + self.tops + self.ahead
 
     def add(self, i: int, layer: Layer, parameters: int) -> None:
         """Count layer ``i``, which comes after all that were counted, with its bytes of parameters."""
@@ -52,29 +55,37 @@ class Need:
         self._alive += made
         self.tops = max(self.tops, self._alive)
         self.parameters += parameters
-        self._largest = max(self._largest, (made + parameters, -i))
+        self.ahead += layer.ahead
+        self._largest = max(self._largest, (made + parameters + layer.ahead, -i))
         for v in self._ends[i]:
             home = self._home.pop(v, None)
             if home is not None:
                 self._users[home] -= 1
                 self._alive -= 0 if self._users[home] else self._sizes.pop(home)
 
-    def fault(self) -> SpecError | None:
-        """Return an error that names the layer that needs most, if the net needs more than :func:`limits.most`."""
-        if self.total <= most():
+    def fault(self, limit: int) -> SpecError | None:
+        """Return an error that names the layer that needs most, if the net needs more than ``limit``, in bytes."""
+        if self.total <= limit:
             return None
         size, i = self._largest[0], -self._largest[1]
         node = self._plan.nodes[i]
+        most_of_all = f"needs {amount(size)} of memory, the most of all layers"
         return SpecError(
-            f"needs {amount(size)} of memory, the most of all layers; the net needs at least {self}; {limit_text()}",
+            f"{most_of_all}; the net needs at least {self}; {limit_text(limit)}",
             self._plan.source.at(i, layer=node.name, type=node.type),
         )
 
     def __str__(self) -> str:
         """Return the sums for people."""
-        return f"{amount(self.total)}: parameters {amount(self.parameters)}, tops {amount(self.tops)}"
+        ahead = f", batches read ahead {amount(self.ahead)}" if self.ahead else ""
+        return f"{amount(self.total)}: parameters {amount(self.parameters)}, tops {amount(self.tops)}{ahead}"
 
 
-def limit_text() -> str:
+def limit_on(device: torch.device) -> int:
+    """Return the bytes that a net may need on a device: the device's memory, or the limit that was set."""
+    return most(lambda: torch.cuda.mem_get_info(device)[1]) if device.type == "cuda" else most()
+
+
+def limit_text(limit: int) -> str:
     """Return what the limit is, and how to set another."""
-    return f"the limit is {amount(most())}, --limit SIZE sets another"
+    return f"the limit is {amount(limit)}, --limit SIZE sets another"

@@ -26,16 +26,16 @@ from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
-from netspec.limits import amount, is_out_of_memory, most
+from netspec.limits import amount, is_out_of_memory
 from netspec.limits import memory as memory_of_machine
 from netspec.net.chains import chains
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
-from netspec.net.need import BYTES, Need, limit_text
+from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.net.options import BuildOptions
 from netspec.net.programs import Programs
 from netspec.net.table import table
-from netspec.proto.schema import PHASE_NAMES, TEST, NetParameter
+from netspec.proto.schema import PHASE_NAMES, TEST
 
 Array = np.ndarray | torch.Tensor
 MUCH = 8  # a net that takes more than this part of the limit is first looked at as a whole
@@ -66,8 +66,7 @@ class Net(torch.nn.Module):
         super().__init__()
         options = options or BuildOptions()
         self.plan = plan
-        self.param = NetParameter()
-        self.param.CopyFrom(plan.net)
+        self.param = plan.net
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
         self.device = options.device
@@ -109,13 +108,11 @@ class Net(torch.nn.Module):
         shapes: dict[int, Shape] = {}
         memory = 0
         for i, (node, param) in enumerate(zip(self.plan.nodes, self.param.layer, strict=True)):
-            if not param.HasField("phase"):
-                param.phase = self.phase
-            at = partial(self.plan.source.at, i, layer=node.name, type=node.type)
+            tie = _Tie(self.plan, i, partial(self._take, options, i))
             log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
             cls = layer_class(node.type)
             if cls is None:
-                options.report(SpecError(unknown_type(node.type), at("type")))
+                options.report(SpecError(unknown_type(node.type), tie.at("type")))
                 continue
             if any(v not in shapes for v in node.bottoms):
                 continue  # an error upstream was reported
@@ -123,7 +120,7 @@ class Net(torch.nn.Module):
                 phase=self.phase,
                 random=self.random,
                 data_seed=self.random.seed if options.data_seed is None else options.data_seed,
-                at=at,
+                at=tie.at,
                 report=options.report,
                 device=options.device,
                 open_data=options.open_data,
@@ -134,8 +131,8 @@ class Net(torch.nn.Module):
                 ranks=options.ranks,
                 exact=options.exact,
                 accumulate_in_place=options.accumulate_in_place,
-                created=partial(self._log_wiring, node),
-                take=partial(self._take, options, at),
+                created=tie.created,
+                take=tie.take,
             )
             try:
                 layer = cls(param, [shapes[v] for v in node.bottoms], context)
@@ -146,8 +143,10 @@ class Net(torch.nn.Module):
                 if not is_out_of_memory(fault):
                     raise
                 raise SpecError(
-                    f"its blobs need more memory than there is: this machine has {amount(memory_of_machine())}", at()
+                    f"its blobs need more memory than there is: this machine has {amount(memory_of_machine())}",
+                    tie.at(),
                 ) from None
+            tie.take_from = None
             weights = _loss_weights(layer, options.report)
             layers[i] = layer
             self.loss_weights.append(weights)
@@ -164,25 +163,28 @@ class Net(torch.nn.Module):
             owned = len(self.learnable)
             self._adopt_params(layers, i, layer, options.report)
             self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
-        if self.device.type == "cpu" and (fault := self.need.fault()):
+        if self.device.type != "meta" and (fault := self.need.fault(limit_on(self.device))):
             options.report(fault)
         if len(layers) == len(self.plan.nodes):
             self._finish(list(layers.values()))
         return torch.nn.ModuleList(layers.values())
 
-    def _take(self, options: BuildOptions, at: Callable[[], Where], size: int) -> None:
-        """Let a layer take memory, in bytes. Raises SpecError where that, or what the whole net needs, is too much.
+    def _take(self, options: BuildOptions, i: int, size: int) -> None:
+        """Let layer ``i`` take memory, in bytes, while the net is built.
 
-        Only a net that takes much is looked at as a whole.
+        Raises SpecError where that, or what the whole net needs, is too much. Only a net that takes much is looked at
+        as a whole.
         """
-        if self.device.type != "cpu" or self.need.total + size <= most() // MUCH:
+        if self.device.type == "meta" or self.need.total + size <= (limit := limit_on(self.device)) // MUCH:
             return
         if not self._surveyed:
-            self._surveyed, self._too_much = True, self._survey(options).fault()
+            self._surveyed, self._too_much = True, self._survey(options).fault(limit)
         if self._too_much:
             raise self._too_much
-        if self.need.parameters + size > most():
-            raise SpecError(f"needs {amount(size)} of memory beside {self.need}; {limit_text()}", at())
+        if self.need.parameters + size > limit:
+            raise SpecError(
+                f"needs {amount(size)} of memory beside {self.need}; {limit_text(limit)}", _Tie(self.plan, i).at()
+            )
 
     def _survey(self, options: BuildOptions) -> Need:
         """Return what the net needs, from the shapes that are known so far, without memory, data or Python layers."""
@@ -206,16 +208,6 @@ class Net(torch.nn.Module):
         weighted = [any(weights) for weights in self.loss_weights]
         apart = [any(flags) for flags in zip(self._overwritten, blocked, weighted, strict=True)]
         return chains(self.plan, list(self.layers), apart)
-
-    def _log_wiring(self, node: Node) -> None:
-        log.info("net.cpp:86", f"Creating Layer {node.name}")
-        for v in node.bottoms:
-            log.info("net.cpp:408", f"{node.name} <- {self.plan.blobs[v]}")
-        for v, in_place in zip(node.tops, node.in_place, strict=True):
-            if in_place:
-                log.info("net.cpp:369", f"{node.name} -> {self.plan.blobs[v]} (in-place)")
-            else:
-                log.info("net.cpp:382", f"{node.name} -> {self.plan.blobs[v]}")
 
     def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer, report: Report) -> None:
         """Connect the shared parameters of layer ``i`` to their owners; list the others as learnable."""
@@ -453,6 +445,39 @@ class Net(torch.nn.Module):
         """Close files and stop threads."""
         for layer in self.layers:
             layer.close()
+
+
+class _Tie:
+    """What layer ``i`` knows of its net; ``take_from`` counts the memory that it takes, while the net is built.
+
+    It has slots and does not keep the net alive, because of nets of very many layers.
+    """
+
+    __slots__ = ("_i", "_plan", "take_from")
+
+    def __init__(self, plan: Plan, i: int, take_from: Callable[[int], None] | None = None) -> None:
+        self._plan, self._i, self.take_from = plan, i, take_from
+
+    def at(self, *path: str | int) -> Where:
+        """Return the place in the prototxt of a field of the layer."""
+        node = self._plan.nodes[self._i]
+        return self._plan.source.at(self._i, *path, layer=node.name, type=node.type)
+
+    def take(self, size: int) -> None:
+        if self.take_from:
+            self.take_from(size)
+
+    def created(self) -> None:
+        """Log what the layer reads and writes."""
+        node, blobs = self._plan.nodes[self._i], self._plan.blobs
+        log.info("net.cpp:86", f"Creating Layer {node.name}")
+        for v in node.bottoms:
+            log.info("net.cpp:408", f"{node.name} <- {blobs[v]}")
+        for v, in_place in zip(node.tops, node.in_place, strict=True):
+            if in_place:
+                log.info("net.cpp:369", f"{node.name} -> {blobs[v]} (in-place)")
+            else:
+                log.info("net.cpp:382", f"{node.name} -> {blobs[v]}")
 
 
 def _tops(plan: Plan, node: Node) -> list[str]:

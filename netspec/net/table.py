@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from netspec.errors import printable
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from netspec.net.net import Net
 
 _HEAD = ("layer", "type", "bottoms", "tops", "shapes", "parameters", "MiB", "multiply-adds")
+MOST_WORDS = 20  # blobs of one layer that are listed
 _WORDS = 5  # columns of words, aligned left; then come the numbers
 
 
@@ -57,7 +59,9 @@ def table(net: Net) -> str:
 
 
 def _listed(words: Iterable[str]) -> str:
-    return ", ".join(words) or "-"
+    first = list(islice(words := iter(words), MOST_WORDS))
+    more = sum(1 for _ in words)
+    return ", ".join(first) + (f", and {more:,} more" if more else "") or "-"
 
 
 def _printed(parameters: int, memory: int, work: int, shared: bool = False) -> tuple[str, str, str]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from google.protobuf.message import DecodeError, Message
 
 from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault
+from netspec.limits import read_bytes
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.current import upgrade_net
@@ -23,7 +25,7 @@ def read_binary(path: str | Path, message_class: type[M]) -> M:
     signature: data that decodes without any known field counts as other contents.
     """
     try:
-        data = Path(path).read_bytes()
+        data = read_bytes(path)
     except OSError as fault:
         raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
     return parse_binary(data, str(path), message_class)
@@ -45,7 +47,25 @@ def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
         known = False
     if not known:
         raise SpecError(f"expected a binary {name}, found {_guess(data)}", where)
+    _escape_names(message)
     return message
+
+
+def _escape_names(message: Any) -> None:
+    """Write the bytes of names that are not UTF-8, which C++ takes and Python does not, as escapes."""
+    for field, value in message.ListFields():
+        parts: Any = value if isinstance(value, Sequence) and not isinstance(value, (str, bytes)) else [value]
+        if field.message_type:
+            for part in parts:
+                _escape_names(part)
+        elif field.type == field.TYPE_STRING and any(isinstance(part, bytes) for part in parts):
+            escaped = [part.decode(errors="backslashreplace") if isinstance(part, bytes) else part for part in parts]
+            if parts is value:
+                parts[:] = escaped
+            elif field.is_extension:
+                message.Extensions[field] = escaped[0]
+            else:
+                setattr(message, field.name, escaped[0])
 
 
 def read_net_binary(path: str | Path) -> NetParameter:
@@ -63,7 +83,7 @@ def parse_net_binary(path: str | Path, upgrade: bool = True) -> tuple[NetParamet
 def is_net_binary(path: str | Path) -> bool:
     """Say whether a file is a .caffemodel, by what it holds: the layers of a net in protobuf's binary form."""
     try:
-        data = Path(path).read_bytes()
+        data = read_bytes(path)
         if b"\0" not in data:  # every number in it has one, and no text does
             return False
         net = NetParameter.FromString(data)

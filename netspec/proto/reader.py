@@ -27,6 +27,7 @@ _RANGES: dict[int, tuple[int, int]] = {
     Declared.TYPE_UINT32: (0, (1 << 32) - 1),
     Declared.TYPE_UINT64: (0, (1 << 64) - 1),
 }
+_LONGEST = 100  # digits: more than any number has, and less than Python refuses to print
 _BOOLEANS = {"true": True, "True": True, "t": True, "false": False, "False": False, "f": False}
 _V1_TYPES = V1LayerParameter.LayerType.keys()
 _LAYERS = ("caffe.LayerParameter", "caffe.V1LayerParameter")
@@ -93,7 +94,7 @@ class _Reader:
         if not field.repeated and field.present(message):
             first = children[alias][0].where.line
             raise self._error(f'"{alias}" was already given in line {first}; it can be given only once', name)
-        nodes = children.setdefault(alias, [])
+        nodes = children.setdefault(field.name, [])
         if self._at(":"):
             self._next()
         elif field.type != Declared.TYPE_MESSAGE:
@@ -270,6 +271,8 @@ class _Reader:
 
     def _natural(self, token: Token) -> int:
         text = token.text
+        if len(text) > _LONGEST:
+            raise self._error(f"a number of {len(text):,} digits is out of every range", token)
         if text[:2] in ("0x", "0X"):
             return int(text, 16)
         if text[0] != "0":
@@ -298,6 +301,8 @@ class _Reader:
     # ---- Errors ----
 
     def _check_required(self, message: Message) -> None:
+        if message.IsInitialized():
+            return
         for field in fields_of(message.DESCRIPTOR).values():
             if field.required and not field.present(message):
                 place = self._open[-1][1]

@@ -7,13 +7,15 @@ from dataclasses import dataclass, field, replace
 
 from netspec.errors import Where
 
+_NONE: dict[str, tuple[Place, ...]] = {}  # one for all places without fields
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, slots=True)
 class Place:
     """Position of one message in its file and, by field name, the positions of all values of its fields, in order."""
 
     where: Where
-    fields: Mapping[str, tuple[Place, ...]] = field(default_factory=dict)
+    fields: Mapping[str, tuple[Place, ...]] = field(default_factory=lambda: _NONE)
 
     def find(self, *path: str | int) -> Where:
         """Return the place of ``path``, e.g. ``("convolution_param", "pad", 1)``, or of its nearest known ancestor.

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from netspec.errors import SpecError, Where
 from netspec.lfs import pointer_fault
+from netspec.limits import read_bytes
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
@@ -76,7 +77,7 @@ def parse_solver_text(
 def text_of(path: str | Path) -> str:
     """Return a file's text without a byte-order mark; the lexer checks bytes that are not UTF-8."""
     try:
-        data = Path(path).read_bytes()
+        data = read_bytes(path)
     except OSError as fault:
         raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
     if fault := pointer_fault(data):

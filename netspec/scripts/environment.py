@@ -15,6 +15,7 @@ from pathlib import Path
 
 from netspec.errors import SpecError
 from netspec.scripts.finder import MARK, NAME, real_caffe
+from netspec.whole_file import whole_file
 
 _PACKAGE = f'''{MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
 """Caffe's Python interface, which netspec provides."""
@@ -63,7 +64,8 @@ def install_caffe(replace: bool = False) -> list[Path]:
         if owner.exists() and not _is_ours(path):
             owner.rename(owner.with_name(owner.name + _ASIDE))
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, "utf-8")
+        with whole_file(path) as unfinished:
+            unfinished.write_text(text, "utf-8")
         if owner is path:
             path.chmod(0o755)
     return list(paths)
@@ -99,7 +101,8 @@ def make_build_folder(folder: Path) -> list[Path]:
         raise SpecError(f"{', '.join(there)}: is there already and not netspec's; name another folder")
     for path, (module, words) in paths.items():
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(_command(module, words), "utf-8")
+        with whole_file(path) as unfinished:
+            unfinished.write_text(_command(module, words), "utf-8")
         path.chmod(0o755)
     return list(paths)
 

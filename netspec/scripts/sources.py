@@ -19,6 +19,7 @@ from typing import Any
 
 from netspec.errors import SpecError, Where
 from netspec.scripts import python2
+from netspec.whole_file import whole_file
 
 RENAMED_METHODS = {"tostring": "tobytes"}  # of arrays, called without arguments
 
@@ -37,7 +38,8 @@ def main_code(data: bytes, path: str, is_python2: bool, keep: Path | None) -> Co
     print(f"netspec run: {path} is Python 2, and runs translated to Python 3; the translation {where}", file=sys.stderr)
     text = python2.translated(data, path)
     if keep:
-        keep.write_text(text, "utf-8", errors="surrogateescape")
+        with whole_file(keep) as unfinished:
+            unfinished.write_text(text, "utf-8", errors="surrogateescape")
     return _compiled(text, path)
 
 

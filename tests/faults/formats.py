@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import struct
+import warnings
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +17,7 @@ import h5py
 import lmdb
 import numpy as np
 import scipy.io
+import torch
 
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.descriptors.feature_file import read_features
@@ -32,14 +37,17 @@ from netspec.data.images import read_image, read_image_list
 from netspec.data.mean import read_mean, read_mean_option, write_mean
 from netspec.data.windows import read_window_file
 from netspec.errors import SpecError
+from netspec.graph import raise_fault
 from netspec.graph.filter import with_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
+from netspec.net.table import table
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
-from netspec.proto.text import parse_net_text
+from netspec.proto.text import parse_net_text, parse_solver_text
 from netspec.scores import Score, Scores, Snapshot, read_scores
+from netspec.solver.checks import check_settings
 from netspec.solver.extra import Extra, Stamp, read_extra, write_extra
 from netspec.solver.snapshot import State, read_state, write_state
 
@@ -57,13 +65,22 @@ layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip"
 class Format:
     """``write(path)`` writes a good file, ``read(path)`` reads it; ``path`` ends in ``suffix``.
 
-    Of a format whose file lies in a folder of its own, ``inside`` is its name there.
+    Of a format whose file lies in a folder of its own, ``inside`` is its name there. Where checksums would hide most
+    damage, ``open`` takes the file apart, and ``close`` makes one of damaged parts, whose checksums are right.
     """
 
     suffix: str
     write: Callable[[Path], object]
     read: Callable[[Path], object]
     inside: str = ""
+    open: Callable[[bytes], bytes] = bytes
+    close: Callable[[bytes], bytes] = bytes
+
+    def good(self, folder: Path) -> bytes:
+        """Return the bytes of a good file, which is written to a folder."""
+        path = folder / f"good{self.suffix}"
+        self.write(path)
+        return (path / self.inside if self.inside else path).read_bytes()
 
 
 @cache
@@ -146,6 +163,39 @@ def all_rows(path: Path) -> None:
             source.batch(i)
 
 
+LAYERS = """
+name: "many" force_backward: true
+layer { name: "data" type: "Input" top: "data" top: "label"
+  input_param { shape { dim: 4 dim: 3 dim: 16 dim: 16 } shape { dim: 4 } } }
+layer { name: "conv" type: "Convolution" bottom: "data" top: "conv" param { name: "w" lr_mult: 1 } param { lr_mult: 2 }
+  convolution_param { num_output: 4 kernel_size: 3 pad: 1 group: 1 dilation: 2 weight_filler { type: "msra" } } }
+layer { name: "norm" type: "LRN" bottom: "conv" top: "norm" lrn_param { local_size: 3 alpha: 1e-4 } }
+layer { name: "pool" type: "Pooling" bottom: "norm" top: "pool" pooling_param { pool: AVE kernel_size: 3 stride: 2 } }
+layer { name: "up" type: "Deconvolution" bottom: "pool" top: "up"
+  convolution_param { num_output: 2 kernel_size: 4 stride: 2 bias_term: false weight_filler { type: "bilinear" } } }
+layer { name: "crop" type: "Crop" bottom: "up" bottom: "data" top: "crop" crop_param { axis: 2 offset: 0 } }
+layer { name: "both" type: "Concat" bottom: "crop" bottom: "data" top: "both" concat_param { axis: 1 } }
+layer { name: "parts" type: "Slice" bottom: "both" top: "p" top: "q" slice_param { axis: 1 slice_point: 2 } }
+layer { name: "bn" type: "BatchNorm" bottom: "p" top: "p" batch_norm_param { eps: 1e-5 } }
+layer { name: "scale" type: "Scale" bottom: "p" top: "p" scale_param { axis: 1 bias_term: true } }
+layer { name: "relu" type: "ReLU" bottom: "p" top: "p" relu_param { negative_slope: 0.1 } exclude { phase: TRAIN } }
+layer { name: "sum" type: "Eltwise" bottom: "p" bottom: "crop" top: "s" eltwise_param { coeff: 1 coeff: -1 } }
+layer { name: "flat" type: "Reshape" bottom: "s" top: "f" reshape_param { shape { dim: 0 dim: -1 } } }
+layer { name: "tile" type: "Tile" bottom: "f" top: "t" tile_param { tiles: 2 } }
+layer { name: "spp" type: "SPP" bottom: "q" top: "spp" spp_param { pyramid_height: 2 } include { stage: "x" } }
+layer { name: "ip" type: "InnerProduct" bottom: "t" top: "ip" inner_product_param { num_output: 3 } }
+layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" loss_weight: 0.5
+  loss_param { ignore_label: 0 normalization: VALID } }
+"""
+
+
+def built(path: Path) -> None:
+    """Build a net without memory, data or files, and what it says."""
+    message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
+    options = BuildOptions(torch.device("meta"), seed=0, open_data=False, write_files=False)
+    table(build_net(with_state(message, TEST, 0, ["x"]), source, options))
+
+
 def text(words: str) -> Callable[[Path], object]:
     return lambda path: path.write_text(words)
 
@@ -162,11 +212,44 @@ def either_picture(path: Path) -> None:
             continue
 
 
+def members(data: bytes) -> bytes:
+    """Return the files of a zip archive, one after the other: name and contents, each after its length."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        parts = [(name.encode(), archive.read(name)) for name in archive.namelist()]
+    return b"".join(struct.pack("<B", len(n)) + n + struct.pack("<I", len(c)) + c for n, c in parts)
+
+
+def archive(parts: bytes) -> bytes:
+    """Return the zip archive of files that :func:`members` returned, whatever was done to them."""
+    stream, made = io.BytesIO(parts), io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # two of one name
+        while length := stream.read(1):
+            name = stream.read(length[0]).decode("latin-1").replace("\0", "") or "x"
+            size = int.from_bytes(stream.read(4), "little")
+            archive.writestr(zipfile.ZipInfo(name), stream.read(size))
+    return made.getvalue()
+
+
 POSES = "".join(f"{i}.5 {i} 0 1 0 0 0 1\n" for i in range(6))
 WINDOWS = "# 0\na.png\n3\n48\n64\n2\n4 0.9 0 0 20 20\n0 0.1 10 10 40 40\n# 1\nb.png\n3\n48\n64\n0\n"
 PARAM = SimpleNamespace(fg_threshold=0.5, bg_threshold=0.5, root_folder="")
 
+SOLVER = """
+net: "net.prototxt" test_iter: 3 test_interval: 10 base_lr: 0.1 lr_policy: "multistep" stepvalue: 5 stepvalue: 9
+gamma: 0.1 momentum: 0.9 weight_decay: 0.0005 regularization_type: "L2" max_iter: 20 snapshot: 10
+snapshot_prefix: "x" solver_mode: CPU type: "SGD" random_seed: 1 iter_size: 2 train_state { level: 1 stage: "a" }
+"""
+
+
+def solved(path: Path) -> None:
+    solver, node = parse_solver_text(path.read_bytes().decode(errors="surrogateescape"), "solver.prototxt")
+    check_settings(solver, node, raise_fault)
+
+
 FORMATS = {
+    "net.prototxt": Format(".prototxt", text(LAYERS), built),
+    "solver.prototxt": Format(".prototxt", text(SOLVER), solved),
     "caffemodel": Format(".caffemodel", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)),
     "caffemodel.h5": Format(
         ".caffemodel.h5", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)
@@ -180,10 +263,12 @@ FORMATS = {
         ".binaryproto", lambda path: write_mean(str(path), numbers(3, 4, 4)), lambda path: read_mean(str(path))
     ),
     "mean.npy": Format(".npy", lambda path: np.save(path, numbers(3, 4, 4)), lambda path: read_mean_option(str(path))),
-    "detector": Format(".npz", detector, go_on),
-    "detector with points": Format(".npz", lambda path: detector(path, GeometricCheck(min_inliers=8)), go_on),
-    "word model": Format(".npz", word_model, WordModel.load),
-    "features": Format(".npz", features, read_features),
+    "detector": Format(".npz", detector, go_on, open=members, close=archive),
+    "detector with points": Format(
+        ".npz", lambda path: detector(path, GeometricCheck(min_inliers=8)), go_on, "", members, archive
+    ),
+    "word model": Format(".npz", word_model, WordModel.load, "", members, archive),
+    "features": Format(".npz", features, read_features, "", members, archive),
     "truth.mat": Format(".mat", truth, read_truth_matrix),
     "truth.npy": Format(".npy", lambda path: np.save(path, np.eye(6)), read_truth_matrix),
     "truth.txt": Format(".txt", lambda path: np.savetxt(path, np.eye(6), "%d"), read_truth_matrix),

@@ -35,17 +35,15 @@ def main(words: list[str]) -> None:
         folder, seeds = Path(place, "read"), Path(place, "seeds")
         folder.mkdir()
         seeds.mkdir()
-        good = folder / f"good{form.suffix}"
-        form.write(good)
-        (seeds / "good").write_bytes((good / form.inside if form.inside else good).read_bytes())
+        (seeds / "good").write_bytes(form.open(form.good(folder)))
 
         def one(data: bytes) -> None:
-            if said := ending(form, folder, data):
+            if said := ending(form, folder, form.close(data)):
                 os.write(2, f"{said}\n".encode())
                 raise AssertionError(said)
 
         size = f"-max_len={4 * (seeds / 'good').stat().st_size}"
-        limits = ["-timeout=10", "-rss_limit_mb=3000", size]
+        limits = ["-timeout=10", "-rss_limit_mb=1600", size]
         atheris.Setup([sys.argv[0], *limits, *options, str(seeds)], one)
         atheris.Fuzz()
 

@@ -33,7 +33,20 @@ from netspec.errors import SpecError  # noqa: E402
 
 MEMORY = 1 << 30  # bytes
 SECONDS = 10
-WORDS = (b"\x00", b"\xff", b"\x7f\xff\xff\xff", b"\xff" * 8, b"\x00" * 8, b"-1", b"1e999", b"nan", b" ", b"\n", b"\xc3")
+WORDS = (
+    b"9" * 5000,
+    b"\x00",
+    b"\xff",
+    b"\x7f\xff\xff\xff",
+    b"\xff" * 8,
+    b"\x00" * 8,
+    b"-1",
+    b"1e999",
+    b"nan",
+    b" ",
+    b"\n",
+    b"\xc3",
+)
 
 
 def mutant(data: bytes, draw: random.Random) -> bytes:
@@ -138,13 +151,13 @@ def main(words: list[str]) -> int:
     wrong = 0
     with tempfile.TemporaryDirectory() as place:
         for name in a.formats or FORMATS:
-            form, good = FORMATS[name], Path(place, f"good{FORMATS[name].suffix}")
-            form.write(good)
-            if said := ending(form, Path(place), (good / form.inside if form.inside else good).read_bytes()):
+            form = FORMATS[name]
+            data = form.good(Path(place))
+            if said := ending(form, Path(place), form.close(form.open(data))):
                 raise SystemExit(f"{name}: the good file is a fault: {said}")
-            data = (good / form.inside if form.inside else good).read_bytes()
             draw = random.Random(f"{name}/{a.seed}")
-            inputs = [mutant(data, draw) for _ in range(a.tries)]
+            inputs = [mutant(data, draw) for _ in range(a.tries // 2)]
+            inputs += [form.close(mutant(form.open(data), draw)) for _ in range(a.tries - len(inputs))]
             faults = run(form, Path(place), inputs)
             print(f"{name}: {len(faults)} of {len(inputs)}", flush=True)
             for said, count in Counter(faults.values()).most_common(8):

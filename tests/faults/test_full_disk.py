@@ -10,9 +10,12 @@ import h5py
 import numpy as np
 import pytest
 
+import lmdb_build.cli
 from faults.commands import CASES, Case, check_npz
 from netspec import whole_file
 from netspec.cli import main
+from netspec.net.build import load_net
+from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 
 resource = pytest.importorskip("resource", reason="limits the size of files")
@@ -56,6 +59,43 @@ def test_a_full_disk(name: str, here: Path, capsys: pytest.CaptureFixture[str]) 
         assert case.main(case.words) == 1
     *_, line = capsys.readouterr().err.strip().splitlines()
     assert "File too large" in line or "No space left on device" in line  # LMDB has words of its own
+    assert contents() == before
+
+
+def sheet() -> int:
+    return lmdb_build.cli.main(["sheet", "pairs.txt", "out/sheet.png"])
+
+
+def test_a_picture_of_pairs_on_a_full_disk(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    CASES["convert"].prepare()
+    assert sheet() == 0
+    before = contents()
+    with full_disk():
+        assert sheet() == 1
+    assert capsys.readouterr().err == "out/sheet.png: cannot be written: File too large\n"
+    assert contents() == before
+
+
+WRITERS = {
+    "upgrade": ["upgrade_net_proto_text", "old.prototxt", "out/new.prototxt"],
+    "fold": ["fold", "net.prototxt", "--weights", "w.caffemodel", "--out", "out/folded"],
+    "torch": ["export", "net.prototxt", "--to", "torch", "--out", "out/net.py"],
+    "safetensors": ["export", "net.prototxt", "--to", "safetensors", "--out", "out/net.safetensors"],
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_else_netspec_writes_on_a_full_disk(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    CASES["extract"].prepare()
+    save_weights(load_net("net.prototxt", seed=0), "w.caffemodel")
+    layers = [f'layers {{ name: "l{i}" type: RELU bottom: "data" top: "{i}" }}' for i in range(60)]
+    Path("old.prototxt").write_text("\n".join(['input: "data"', "input_dim: 2 " * 4, *layers]))
+    assert main(WRITERS[name]) == 0
+    before = contents()
+    capsys.readouterr()
+    with full_disk():
+        assert main(WRITERS[name]) == 1
+    assert "cannot be written: File too large" in capsys.readouterr().err.splitlines()[-1]
     assert contents() == before
 
 

@@ -8,6 +8,7 @@ import sys
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -57,6 +58,15 @@ def test_an_npz_that_announces_too_much(tmp_path: Path) -> None:
 def test_an_npz_that_unpacks_to_too_much(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "x.npz", features=np.zeros((70, 1 << 20), np.float32))
     with pytest.raises(InputError, match=r"would take 280 MiB of memory, in a file of \d+ bytes"):
+        read_features(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("kind", ["<U4", ">U4"])
+def test_an_npz_with_text_that_is_none(kind: str, tmp_path: Path) -> None:
+    names = np.array(["a.png", "b.png"], kind)
+    names.view(np.uint8)[1:3] = 0xEE
+    np.savez(tmp_path / "x.npz", features=np.ones((2, 3)), names=names)
+    with pytest.raises(InputError, match="characters that Unicode does not have"):
         read_features(tmp_path / "x.npz")
 
 
@@ -177,6 +187,75 @@ def test_a_cut_jpeg_is_accepted_by_nobody(tmp_path: Path) -> None:
             read_for_features(path, 3)
         with pytest.raises(InputError, match="image"):
             read_bgr(path)
+
+
+def part(name: bytes, body: bytes, size: int | None = None) -> bytes:
+    """A part of a PNG file, which may announce another size than it has."""
+    length = len(body) if size is None else size
+    return length.to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big")
+
+
+@pytest.mark.parametrize("size", [5_000, (1 << 32) - 1])
+def test_a_png_part_that_announces_too_much(size: int, tmp_path: Path) -> None:
+    """OpenCV makes room for it first: 4 GiB."""
+    header = part(b"IHDR", (24).to_bytes(4, "big") * 2 + b"\x08\x00\x00\x00\x00")
+    body = part(b"IDAT", zlib.compress(bytes(24 * 25)), size)
+    path = tmp_path / "x.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + body + part(b"IEND", b""))
+    with pytest.raises(ValueError, match="image"):
+        read_image(str(path))
+    with pytest.raises(InputError, match="image"):
+        read_bgr(path)
+    with pytest.raises(InputError, match="image; expected"):
+        read_truth_matrix(path)
+
+
+def test_a_truth_that_is_no_image(tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_bytes(bomb(20_000))
+    with pytest.raises(InputError, match="is not a readable image; expected"):
+        read_truth_matrix(tmp_path / "x.png")
+
+
+def packed_rows(path: Path, chunk: bytes, rows: int = 40) -> None:
+    """An HDF5 file whose dataset of one chunk is stored as these bytes."""
+    with h5py.File(path, "w") as file:
+        file["data"], file["label"] = np.zeros((rows, 2)), np.zeros(rows)
+        file.create_dataset("packed", (rows, 4), np.float32, chunks=(rows, 4), compression="gzip")
+        file["packed"].id.write_direct_chunk((0, 0), chunk)
+
+
+def test_an_hdf5_chunk_that_unpacks_to_too_much(tmp_path: Path) -> None:
+    packed_rows(tmp_path / "x.h5", zlib.compress(bytes(640)))
+    all_rows(tmp_path / "x.h5")
+    packed_rows(tmp_path / "x.h5", zlib.compress(bytes(300 << 20)), 40_000)
+    with pytest.raises(SpecError, match="packed has a chunk that unpacks to more than the 625 KiB of its numbers"):
+        all_rows(tmp_path / "x.h5")
+
+
+def test_an_hdf5_chunk_that_is_too_large(tmp_path: Path) -> None:
+    packed_rows(tmp_path / "x.h5", zlib.compress(bytes(300 << 20)))
+    with pytest.raises(SpecError, match=r"packed has a chunk of \d+ KiB, and its chunks hold 640 bytes"):
+        all_rows(tmp_path / "x.h5")
+
+
+def test_hdf5_data_in_another_packing(tmp_path: Path) -> None:
+    packed_rows(tmp_path / "x.h5", zlib.compress(bytes(640)))
+    with h5py.File(tmp_path / "x.h5", "r+") as file:
+        del file["packed"]
+        file.create_dataset("packed", (40, 4), np.int32, chunks=(40, 4), scaleoffset=3)
+    with pytest.raises(SpecError, match="packed in a way that is not read; write it with gzip"):
+        all_rows(tmp_path / "x.h5")
+
+
+@pytest.mark.parametrize(
+    "packing", [{"compression": "lzf"}, {"compression": "gzip", "shuffle": True, "fletcher32": True}]
+)
+def test_hdf5_data_in_usual_packings(packing: dict[str, Any], tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).random((40_000, 4)).astype(np.float32)
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["data"], file["label"] = np.zeros((40_000, 2)), np.zeros(40_000)
+        file.create_dataset("packed", data=noise, chunks=(40_000, 4), **packing)
+    all_rows(tmp_path / "x.h5")
 
 
 # LMDB

@@ -38,7 +38,7 @@ def little_memory() -> Iterator[None]:
             NET,
             'net.prototxt:2:1: layer "large" (InnerProduct): its blobs need more memory than there is',
         ),
-        (WIDE, "there is not enough memory: this machine has "),
+        (WIDE, 'net.prototxt:1:1: layer "wide" (DummyData): its pass needs more memory than there is'),
     ],
     ids=["a parameter", "a blob"],
 )

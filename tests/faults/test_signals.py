@@ -32,8 +32,7 @@ sys.exit(run(parser, ["endless"]))
 MODULES = ("netspec.command_line", "loopclosure.cli.run")
 
 
-def start(module: str, cleaning: int) -> subprocess.Popen[str]:
-    code = CODE.format(module=module, cleaning=cleaning)
+def start(code: str) -> subprocess.Popen[str]:
     environment, pipe = {**os.environ, "PYTHONPATH": str(ROOT)}, subprocess.PIPE
     process = subprocess.Popen([sys.executable, "-c", code], stdout=pipe, stderr=pipe, text=True, env=environment)
     assert line_of(process) == "begun"
@@ -48,7 +47,32 @@ def line_of(process: subprocess.Popen[str]) -> str:
 @pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_one_line_and_status_130(module: str, number: int) -> None:
-    process = start(module, cleaning=0)
+    process = start(CODE.format(module=module, cleaning=0))
+    process.send_signal(number)
+    _, said = process.communicate(timeout=30)
+    assert (process.returncode, said) == (130, "interrupted\n")
+
+
+IMPORTED = """
+import sys
+
+class Slow:
+    def find_spec(self, name, path, target=None):
+        if name == "{package}.cli":
+            import time
+            print("begun", flush=True)
+            time.sleep(60)
+
+sys.meta_path.insert(0, Slow())
+from {package}.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("package", ["netspec", "loopclosure", "lmdb_build"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_line_while_modules_are_imported(package: str, number: int) -> None:
+    process = start(IMPORTED.format(package=package))
     process.send_signal(number)
     _, said = process.communicate(timeout=30)
     assert (process.returncode, said) == (130, "interrupted\n")
@@ -57,7 +81,7 @@ def test_one_line_and_status_130(module: str, number: int) -> None:
 @pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_second_one_ends_at_once(module: str, number: int) -> None:
-    process = start(module, cleaning=60)
+    process = start(CODE.format(module=module, cleaning=60))
     process.send_signal(signal.SIGINT)
     assert line_of(process) == "ending"
     process.send_signal(number)

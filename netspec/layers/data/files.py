@@ -8,6 +8,7 @@ Caffe: src/caffe/layers/base_data_layer.cpp
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -86,13 +87,21 @@ class ReadingLayer(Layer):
         if not self.opens_data:
             self.refuse(self.faults)
             self._shapes = self.shapes_without_data()
+            self.ahead = self._batches_ahead()
             return
+        if known := self.known_shape():
+            self.possible(known)
         self._source = self.attempt(self.open) if self._sound else None
         self.refuse(self.faults)
         self._shapes = list(self.source.shapes)[: self.num_tops]
         make = partial(_make, self.source, self.num_tops, self.context.device.type == "cuda")
+        self.ahead = self._batches_ahead()
         ahead: int = self.param.data_param.prefetch
         self._feed = Feed(make, ahead, workers=max(1, min(ahead, os.cpu_count() or 1)))
+
+    def _batches_ahead(self) -> int:
+        """Return the bytes of the batches read ahead, float32."""
+        return 4 * self.param.data_param.prefetch * sum(map(math.prod, self._shapes))
 
     def shapes_without_data(self) -> list[Shape]:
         """Return the tops' shapes as given by the caller or fixed by the prototxt; a label goes with each image."""
@@ -303,6 +312,7 @@ class ImageData(ReadingLayer):
         seed, rank, ranks = self.context.data_seed, self.context.rank, self.context.ranks
         cursor = Cursor(len(images), self.batch_size, skip, p.shuffle, seed, self.stream, rank, ranks)
         size = (p.new_height, p.new_width) if p.new_height else None
+        self.possible((3, *(size or ())))
         source = ImageListSource(images, p.root_folder, p.is_color, size, cursor, transformer)
         self.log_size(source, "image_data_layer.cpp:90")
         return source

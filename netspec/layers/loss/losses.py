@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -38,6 +37,7 @@ from netspec.layers.loss.base import (
 )
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.limits import read_bytes
 from netspec.proto.schema import BlobProto
 
 FLT_MIN = 1.17549435e-38  # SoftmaxWithLoss takes no logarithm of less
@@ -184,7 +184,7 @@ class InfogainLoss(SoftmaxLoss):
 
     def _read_matrix(self, source: str) -> torch.Tensor:
         try:
-            values = to_array(BlobProto.FromString(Path(source).read_bytes()))
+            values = to_array(BlobProto.FromString(read_bytes(source)))
         except (OSError, DecodeError, ValueError) as fault:
             message = f'cannot read the infogain matrix "{source}" (a binary BlobProto is expected): {fault}'
             raise self.error(message, "infogain_loss_param", "source") from None

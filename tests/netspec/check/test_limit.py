@@ -5,16 +5,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
+from google.protobuf import text_format
 
 from netspec import limits
 from netspec.cli import main
+from netspec.data.images import read_image
 from netspec.errors import SpecError
 from netspec.layers import fillers
 from netspec.layers.base import Shape
+from netspec.net.need import limit_on
 from netspec.net.net import Net
-from netspec.proto.schema import TEST, TRAIN
+from netspec.proto.schema import TEST, TRAIN, LayerParameter
 from netspec.solver.solver import load_solver
 
 MIB = 1 << 20
@@ -85,6 +90,99 @@ def test_one_line(
     assert main([*COMMANDS[command], "--limit", limit]) == 1
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"net.prototxt:{said}")
     assert sum(filled) < 100 * MIB / 8
+
+
+DATA_LAYERS = {
+    "a batch": ("image_data_param { batch_size: 400000000 }", "found shape (400000000, 3, 40, 40)"),
+    "a size": ("image_data_param { new_height: 4000000000 new_width: 4000000000 }", "found shape (1, 3, 4000000000,"),
+    "a size that is cropped": (
+        "image_data_param { new_height: 100000 new_width: 100000 } transform_param { crop_size: 8 }",
+        "found shape (3, 100000, 100000), 30,000,000,000 numbers",
+    ),
+    "a crop": ("transform_param { crop_size: 1000000 }", "found shape (1, 3, 1000000, 1000000)"),
+    "batches ahead": ("data_param { prefetch: 4000000000 }", "batches read ahead 69.9 TiB; the limit is 1 TiB"),
+}
+
+
+@pytest.mark.parametrize("command", ["check", "time", "train"])
+@pytest.mark.parametrize("kind", DATA_LAYERS)
+def test_data_that_takes_too_much(command: str, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Shapes known only from the data are refused before a batch is read."""
+    settings, said = DATA_LAYERS[kind]
+    cv2.imwrite("a.png", np.zeros((40, 40, 3), np.uint8))
+    Path("list.txt").write_text("a.png 1\n")
+    message = LayerParameter(name="data", type="ImageData", top=["data", "label"])
+    text_format.Merge(settings, message)
+    message.image_data_param.source = "list.txt"
+    loss = 'layer { name: "loss" type: "Silence" bottom: "data" bottom: "label" }'
+    Path("net.prototxt").write_text(f"layer {{ {text_format.MessageToString(message, as_one_line=True)} }}\n{loss}")
+    words = ["--data"] if command == "check" else []
+    assert main([*COMMANDS[command], *words, "--limit", "1TiB"]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith('net.prototxt:1:1: layer "data" (ImageData): ')
+    assert said in last
+
+
+def test_a_blob_of_too_many_axes(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("net.prototxt").write_text(
+        f'layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ {"dim: 1 " * 33} }} }} }}'
+    )
+    assert main(["check", "net.prototxt"]) == 1
+    said = 'net.prototxt:1:1: layer "data" (Input): found a blob of 33 axes, expected at most 32\n'
+    assert capsys.readouterr().err == said
+
+
+def test_an_image_that_cannot_be_resized(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(*arguments: object, **named: object) -> None:
+        raise cv2.error("Failed to allocate")
+
+    cv2.imwrite("a.png", np.zeros((40, 40, 3), np.uint8))
+    monkeypatch.setattr(cv2, "resize", no_memory)
+    with pytest.raises(ValueError, match=r'"a.png" cannot be resized to 8 x 9'):
+        read_image("a.png", size=(8, 9))
+
+
+@pytest.mark.parametrize("text", ["pad: 2000000000 dilation: 2000000000", "pad: 40000000 dilation: 40000000"])
+def test_a_pass_that_takes_too_much(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """What a kernel needs for its work is counted nowhere."""
+    Path("net.prototxt").write_text(
+        'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1 dim: 32 dim: 32 } } }\n'
+        'layer { name: "conv" type: "Convolution" bottom: "data" top: "conv" '
+        f"convolution_param {{ num_output: 1 kernel_size: 3 {text} }} }}"
+    )
+    assert main(COMMANDS["time"]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith('net.prototxt:2:1: layer "conv" (Convolution): its pass needs more memory than there is; ')
+
+
+def test_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1, 20 * MIB))
+    assert limit_on(torch.device("cuda", 1)) == 20 * MIB
+    assert limit_on(torch.device("cpu")) == limits.memory()
+    with limits.limited(3 * MIB):
+        assert limit_on(torch.device("cuda")) == 3 * MIB
+
+
+def test_a_net_on_a_gpu(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch, filled: list[int]) -> None:
+    """The device is the CPU, which says that it has what a GPU has."""
+    monkeypatch.setattr("netspec.net.net.limit_on", lambda device: 20 * MIB)
+    with pytest.raises(SpecError, match="the limit is 20 MiB"):
+        net_of(DUMMY)
+    assert sum(filled) == 0
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no devices")
+def test_a_file_without_end(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("list.txt").write_text("/dev/zero 1\n")
+    images = 'layer { name: "d" type: "ImageData" top: "d" top: "l" image_data_param { source: "list.txt" } }'
+    listed = images.replace("list.txt", "/dev/zero")
+    mean = images.replace("} }", '} transform_param { mean_file: "/dev/zero" } }')
+    for text in (images, listed, mean):
+        Path("net.prototxt").write_text(text)
+        assert main(["check", "net.prototxt", "--data"]) == 1
+        assert "it is a device, not a file" in capsys.readouterr().err
+    assert main(["check", "/dev/zero"]) == 1
+    assert capsys.readouterr().err == "/dev/zero: cannot be read: it is a device, not a file\n"
 
 
 def test_what_is_said_of_a_sum(capsys: pytest.CaptureFixture[str]) -> None:

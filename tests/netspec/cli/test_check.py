@@ -34,6 +34,18 @@ def test_check_prints_a_table(run: Run) -> None:
     assert rows["total"].split() == ["total", "5,756", "0.20", "1,340,416"]
 
 
+def test_a_blob_that_many_layers_read(run: Run, tmp_path: Path) -> None:
+    """The widest line makes all lines wide: it lists no more blobs than people read."""
+    net = tmp_path / "net.prototxt"
+    net.write_text(
+        'layer { name: "data" type: "Input" top: "b" input_param { shape { dim: 1 } } }\n'
+        + "".join(f'layer {{ name: "l{i}" type: "ReLU" bottom: "b" top: "t{i}" }}\n' for i in range(1000))
+    )
+    result = run("check", str(net))
+    assert "b_data_0_split_19, and 980 more" in result.out
+    assert len(result.out) < 1_000_000
+
+
 def test_check_shows_caffes_log_when_asked(run: Run) -> None:
     quiet, loud = (run("check", NET, *PAIR_SHAPE, *words) for words in ([], ["-v"]))
     assert quiet.err == ""

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from netspec.errors import SpecError
-from netspec.proto.binary import parse_net_binary, read_binary, read_net_binary
+from netspec.proto.binary import parse_binary, parse_net_binary, read_binary, read_net_binary
 from netspec.proto.schema import BlobProto, NetParameter, SolverState
 from paths import GOLDEN
 
@@ -77,3 +77,12 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         read_binary(tmp_path / "absent", SolverState)
     with pytest.raises(SpecError, match=r"cannot be read: Is a directory$"):
         read_net_binary(tmp_path)
+
+
+def test_names_that_are_not_utf8() -> None:
+    """Caffe takes any bytes; they are shown as escapes."""
+    net = parse_binary(b"\n\x05sm\x06/\xa5\x1a\x01\xff\x1a\x01a", "x.caffemodel", NetParameter)
+    assert net.name == "sm\x06/\\xa5"
+    assert list(net.input) == ["\\xff", "a"]
+    layer = parse_binary(b"\xa2\x06\x03\n\x01\xb0", "x.caffemodel", NetParameter).layer[0]
+    assert layer.name == "\\xb0"

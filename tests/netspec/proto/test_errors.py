@@ -176,3 +176,12 @@ def test_files_that_are_not_utf8(data: bytes, message: str, tmp_path: Path) -> N
     with pytest.raises(SpecError) as caught:
         read_net(path)
     assert str(caught.value) == f"{path}{message}"
+
+
+@pytest.mark.parametrize("number", ["1" * 5000, "-" + "9" * 101, "0" + "7" * 5000, "0x" + "f" * 5000])
+@pytest.mark.parametrize("field", ["max_iter", "random_seed", "solver_mode"])
+def test_a_number_of_very_many_digits(field: str, number: str) -> None:
+    """Python itself refuses to read one of 5,000 digits."""
+    with pytest.raises(SpecError, match=r"a number of [\d,]+ digits is out of every range") as caught:
+        parse_solver_text(f"{field}: {number}", "solver.prototxt")
+    assert len(str(caught.value)) < 100
