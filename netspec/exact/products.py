@@ -259,6 +259,79 @@ class SpreadProducts(ParameterSums):
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
 
 
+class SummedConvolutions(ParameterSums):
+    """What :class:`ColumnProducts` and :class:`SpreadProducts` compute, by torch's kernels, on any device.
+
+    Unlike torch's own functions it adds each gradient of the filters to the sum at once: autograd holds those of one
+    tower until it has those of all towers that share the filters. And it keeps the maps as they come, which others may
+    keep too, instead of the copy that ``lay_out`` makes for the kernel.
+    """
+
+    @staticmethod
+    @override
+    def forward(
+        ctx: Any,
+        maps: torch.Tensor,
+        weight: torch.Tensor,
+        bias: torch.Tensor | None,
+        sliding: Filter,
+        group: int,
+        transposed: bool,
+        lay_out: Callable[[torch.Tensor], torch.Tensor],
+    ) -> torch.Tensor:
+        """Return the responses, in the precision that autocast chooses."""
+        ParameterSums.keep(ctx, maps, (weight, bias), True)
+        ctx.geometry, ctx.lay_out = (sliding, group, transposed), lay_out
+        tops = convolution(lay_out(maps), weight, bias, *ctx.geometry)
+        ctx.kind = tops.dtype
+        return tops
+
+    @staticmethod
+    @once_differentiable
+    @override
+    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
+        """Return the gradients of maps, weight and bias, where they are asked for."""
+        maps, weight, bias = ctx.saved_tensors
+        sums = ParameterSums.sums(ctx)
+        sliding, group, transposed = ctx.geometry
+        maps_diff, *found = torch.ops.aten.convolution_backward(
+            tops_diff,
+            ctx.lay_out(maps).to(ctx.kind),
+            weight.to(ctx.kind),
+            None if bias is None else list(bias.shape),
+            *(sliding.stride, sliding.pad, sliding.dilation, transposed, [0] * len(sliding.kernel), group),
+            ctx.needs_input_grad[:3],
+        )
+        for total, gradient in zip(sums, found, strict=True):
+            if total is not None:
+                total += gradient
+        return (
+            maps_diff if maps_diff is None else maps_diff.to(maps.dtype),
+            *ParameterSums.for_autograd(ctx, sums),
+            None,
+            None,
+            None,
+            None,
+        )
+
+
+def convolution(
+    maps: torch.Tensor,
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    sliding: Filter,
+    group: int,
+    transposed: bool = False,
+) -> torch.Tensor:
+    """Return what torch's kernel for so many axes computes: the filters slide, or each pixel is spread by them."""
+    axes = len(sliding.kernel) - 1
+    if transposed:
+        function = (F.conv_transpose1d, F.conv_transpose2d, F.conv_transpose3d)[axes]
+        return function(maps, weight, bias, sliding.stride, sliding.pad, 0, group, sliding.dilation)
+    function = (F.conv1d, F.conv2d, F.conv3d)[axes]
+    return function(maps, weight, bias, sliding.stride, sliding.pad, sliding.dilation, group)
+
+
 class Columns(torch.autograd.Function):
     """Lay the pixels under each position of a filter one below the other.
 

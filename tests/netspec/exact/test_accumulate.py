@@ -64,13 +64,28 @@ def test_a_net_trains_side_by_side_as_torchs_wrappers_have_it(net_of, tmp_path) 
         torch.testing.assert_close(mine.parameter.grad, theirs.parameter.grad)
 
 
-def test_in_place_leaves_nothing_for_autograd(net_of) -> None:
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+def test_in_place_leaves_nothing_for_autograd(net_of, exact: str) -> None:
     """What one asks for when one builds so."""
-    net = net_of(SIAMESE, phase=0, accumulate_in_place=True)
+    net = net_of(SIAMESE, phase=0, exact=exact, accumulate_in_place=True)
     parameters = [item.parameter for item in net.learnable]
     gradients = torch.autograd.grad(net.forward_loss(**images())[0], parameters, allow_unused=True)
     assert gradients == (None,) * 4
     assert all(parameter.grad is not None for parameter in parameters)
+
+
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+def test_no_gradient_of_a_tower_waits_for_the_other_tower(net_of, exact: str) -> None:
+    """Autograd would hold those of the first tower, as large as the weights, until the second has its own."""
+    net = net_of(SIAMESE, phase=0, exact=exact, accumulate_in_place=True)
+    seen: list[list[torch.Tensor]] = []
+    inputs = {name: values.requires_grad_() for name, values in images().items()}
+    for values in inputs.values():
+        values.register_hook(lambda _: seen.append([item.parameter.grad.clone() for item in net.learnable]))
+    net.forward_loss(**inputs)[0].backward()
+    for item, of_one, of_both in zip(net.learnable, *seen, strict=True):
+        assert of_one.any(), item.layer
+        assert not torch.equal(of_one, of_both), item.layer
 
 
 @pytest.mark.parametrize("in_place", [False, True])
