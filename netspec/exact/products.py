@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -259,6 +259,35 @@ class SpreadProducts(ParameterSums):
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
 
 
+_rounded: dict[int, tuple[torch.Tensor, torch.Tensor]] | None = None  # by id, a weight and its rounded copy
+
+
+@contextmanager
+def weights_rounded_once() -> Iterator[None]:
+    """Within the block, in which weights do not change, :func:`rounded_weight` makes one copy of each."""
+    global _rounded
+    before, _rounded = _rounded, {}
+    try:
+        yield
+    finally:
+        _rounded = before
+
+
+def rounded_weight(weight: torch.Tensor) -> torch.Tensor | None:
+    """Return a weight in the precision that autocast asks for; None where it asks for none, or has that of the weight.
+
+    Towers that share it, and their backward passes, take the same copy.
+    """
+    kind = weight.device.type
+    if kind not in ("cpu", "cuda") or not torch.is_autocast_enabled(kind) or weight.dtype != torch.float32:
+        return None
+    if _rounded is None:
+        return weight.to(torch.get_autocast_dtype(kind))
+    if id(weight) not in _rounded:
+        _rounded[id(weight)] = weight, weight.to(torch.get_autocast_dtype(kind))
+    return _rounded[id(weight)][1]
+
+
 class SummedConvolutions(ParameterSums):
     """What :class:`ColumnProducts` and :class:`SpreadProducts` compute, by torch's kernels, on any device.
 
@@ -282,7 +311,8 @@ class SummedConvolutions(ParameterSums):
         """Return the responses, in the precision that autocast chooses."""
         ParameterSums.keep(ctx, maps, (weight, bias), True)
         ctx.geometry, ctx.lay_out = (sliding, group, transposed), lay_out
-        tops = convolution(lay_out(maps), weight, bias, *ctx.geometry)
+        ctx.rounded = rounded_weight(weight)
+        tops = convolution(lay_out(maps), weight if ctx.rounded is None else ctx.rounded, bias, *ctx.geometry)
         ctx.kind = tops.dtype
         return tops
 
@@ -297,7 +327,7 @@ class SummedConvolutions(ParameterSums):
         maps_diff, *found = torch.ops.aten.convolution_backward(
             tops_diff,
             ctx.lay_out(maps).to(ctx.kind),
-            weight.to(ctx.kind),
+            weight if ctx.rounded is None else ctx.rounded,
             None if bias is None else list(bias.shape),
             *(sliding.stride, sliding.pad, sliding.dilation, transposed, [0] * len(sliding.kernel), group),
             ctx.needs_input_grad[:3],
@@ -305,14 +335,16 @@ class SummedConvolutions(ParameterSums):
         for total, gradient in zip(sums, found, strict=True):
             if total is not None:
                 total += gradient
-        return (
-            maps_diff if maps_diff is None else maps_diff.to(maps.dtype),
-            *ParameterSums.for_autograd(ctx, sums),
-            None,
-            None,
-            None,
-            None,
-        )
+        if maps_diff is not None:
+            maps_diff = _laid_out_like(maps, maps_diff).to(maps.dtype)
+        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
+
+
+def _laid_out_like(maps: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+    """Return the gradient of maps in their order in memory: where the two differ, torch's kernels are slow."""
+    if maps.dim() == 4 and not maps.is_contiguous() and maps.is_contiguous(memory_format=torch.channels_last):
+        return diff.contiguous(memory_format=torch.channels_last)
+    return diff.contiguous()
 
 
 def convolution(

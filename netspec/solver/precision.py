@@ -13,6 +13,8 @@ from typing import Any
 
 import torch
 
+from netspec.exact.products import weights_rounded_once
+
 FP32, TF32, BF16 = PRECISIONS = ("fp32", "tf32", "bf16")
 
 
@@ -30,7 +32,10 @@ def computing(precision: str, device: torch.device) -> Iterator[None]:
     try:
         for library in cuda:
             library.allow_tf32 = precision == TF32
-        with torch.autocast(device.type, torch.bfloat16) if precision == BF16 else nullcontext():
+        with (
+            torch.autocast(device.type, torch.bfloat16) if precision == BF16 else nullcontext(),
+            weights_rounded_once(),
+        ):
             yield
     finally:
         for library, allowed in zip(cuda, before, strict=True):
