@@ -99,7 +99,7 @@ def training_case(name: str, batch: int) -> Iterator[Case]:
     with TemporaryDirectory(prefix="bench-") as folder:
         case = Case(name, batch, Path(folder), name)
         source = str(case.folder / "records")
-        case.prototxt.write_text(write_text(_training(name, source, batch)))
+        case.prototxt.write_text(write_text(training_net(name, source, batch)))
         solver = SolverParameter(
             net=str(case.prototxt),
             base_lr=RATE,
@@ -110,13 +110,13 @@ def training_case(name: str, batch: int) -> Iterator[Case]:
         )
         solver.random_seed = 0
         case.solver.write_text(write_text(solver))
-        shape, classes = _record(name)
+        shape, classes = record(name)
         random = np.random.default_rng(0)
         records = random.integers(0, 256, (batch, *shape), np.uint8)
         labels = np.arange(batch) % classes
         with Writer(source) as writer:
-            for k, (record, label) in enumerate(zip(records, labels, strict=True)):
-                writer.put(b"%08d" % k, array_to_datum(record, int(label)).SerializeToString())
+            for k, (pixels, label) in enumerate(zip(records, labels, strict=True)):
+                writer.put(b"%08d" % k, array_to_datum(pixels, int(label)).SerializeToString())
         np.savez(case.inputs, allow_pickle=False, data=(records - np.float32(128)) / 128, label=labels)
         net = netspec.load_net(case.prototxt, "TRAIN", seed=0)
         netspec.save_weights(net, case.caffemodel)
@@ -132,7 +132,8 @@ def _deploy(name: str) -> Any:
     return read_net(ROOT / "prototxt" / name / "deploy.prototxt" if name in CATALOGUE else name)
 
 
-def _training(name: str, source: str, batch: int) -> Any:
+def training_net(name: str, source: str, batch: int) -> Any:
+    """Return the NetParameter with which a net of the catalogue is trained on the LMDB ``source``."""
     from netspec.proto.text import read_net
 
     if name in ZOO:
@@ -144,7 +145,7 @@ def _training(name: str, source: str, batch: int) -> Any:
     return message
 
 
-def _record(name: str) -> tuple[tuple[int, int, int], int]:
+def record(name: str) -> tuple[tuple[int, int, int], int]:
     """Return the shape of a net's records, and how many labels there are."""
     if name in ZOO:
         return ZOO[name][1], 10

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from benchmarks.growth import KINDS
 from benchmarks.report import Row
 from netspec.command_line import Commands, WrongUsage, run
 
@@ -48,8 +49,16 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--batch", type=int, default=32, help="items of a batch (default: 32)")
     p.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
     p.add_argument("--rounds", type=int, default=7, help="default: 7")
-    p = commands.add("growth", _growth, "time building and running nets of more and more layers")
-    p.add_argument("--layers", type=int, nargs="+", default=[125, 250, 500, 1000, 2000], metavar="N")
+    p = commands.add("growth", _growth, "time and memory of more and more layers, pairs, frames, ...")
+    p.add_argument("kind", choices=KINDS, help="what grows")
+    p.add_argument("sizes", type=int, nargs="*", metavar="SIZE", help="how many of it, several times (default: usual)")
+    p.add_argument("--without-others", action="store_true", help="leave out FAISS, which would be installed")
+    p.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
+    p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
+    p = commands.add("feeding", _feeding, "how long trainings wait for data from databases and image files")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
+    p.add_argument("--batch", type=int, default=4, help="items of a batch (default: 4)")
+    p.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
     commands.add("list", _list, "list the nets of the catalogue")
     return made
 
@@ -110,10 +119,23 @@ def _waiting(arguments: argparse.Namespace) -> None:
         compare(name, arguments.waits, arguments.batch, arguments.threads, arguments.rounds)
 
 
-def _growth(arguments: argparse.Namespace) -> None:
-    from benchmarks.growth import table
+def _feeding(arguments: argparse.Namespace) -> None:
+    from benchmarks.feeding import measure
 
-    print(table(arguments.layers))
+    measure(arguments.nets, arguments.batch, arguments.threads, print)
+
+
+def _growth(arguments: argparse.Namespace) -> None:
+    from benchmarks import environment, growth, report
+
+    kind = growth.KINDS[arguments.kind]
+    yardsticks = environment.python() if kind.beside and not arguments.without_others else None
+    rows = growth.measure(arguments.kind, arguments.sizes or kind.sizes, yardsticks)
+    print(growth.table(rows))
+    if arguments.plot:
+        growth.draw(arguments.plot, rows)
+    if arguments.json:
+        report.write_json(arguments.json, rows, report.machine(yardsticks))
 
 
 def _start(arguments: argparse.Namespace) -> None:

@@ -89,9 +89,14 @@ def machine(python: str | None = None) -> dict[str, Any]:
     return described
 
 
-def write_json(path: str | Path, rows: Sequence[Row], described: Mapping[str, Any]) -> None:
+def write_json(path: str | Path, rows: Sequence[Row | dict[str, float]], described: Mapping[str, Any]) -> None:
     """Write all there is to know."""
-    Path(path).write_text(json.dumps({"machine": described, "rows": [asdict(row) for row in rows]}, indent=1) + "\n")
+    Path(path).write_text(
+        json.dumps(
+            {"machine": described, "rows": [row if isinstance(row, dict) else asdict(row) for row in rows]}, indent=1
+        )
+        + "\n"
+    )
 
 
 def _cpu() -> dict[str, str]:

@@ -17,6 +17,8 @@ from torch import Tensor, nn
 
 from benchmarks.zoo import GOOGLENET, MOBILENET, RESNET50, SQUEEZENET
 
+Normalization = nn.BatchNorm1d | nn.BatchNorm2d
+
 
 class Siamese(nn.Module):
     """One tower of the paper's LeNet-like net, for images (N, 3, size, size)."""
@@ -25,13 +27,20 @@ class Siamese(nn.Module):
         super().__init__()
         self.conv1, self.conv2 = nn.Conv2d(3, 20, 5), nn.Conv2d(20, 50, 5)
         self.ip1 = nn.Linear(50 * (((size - 4) // 2 - 4) // 2) ** 2, 500)
-        self.feat = nn.Linear(500, neurons)
+        self.feat = scaled(500, neurons)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the descriptors (N, neurons)."""
         x = F.max_pool2d(self.conv1(x), 2)
         x = F.max_pool2d(self.conv2(x), 2)
         return self.feat(F.relu(self.ip1(x.flatten(1))))
+
+
+def scaled(inputs: int, outputs: int) -> nn.Sequential:
+    """Return a product and its normalization, with a scale but without a bias."""
+    normalization = nn.BatchNorm1d(outputs)
+    normalization.register_parameter("bias", None)
+    return nn.Sequential(nn.Linear(inputs, outputs, bias=False), normalization)
 
 
 def conv_bn(inputs: int, outputs: int, size: int = 1, bias: bool = False, **others: Any) -> nn.Sequential:
@@ -63,7 +72,7 @@ class Resnet27(nn.Module):
             stages += [ResidualPair(wide) for _ in range(blocks)]
             width = wide
         self.stages = nn.Sequential(*stages)
-        self.feat = nn.Linear(512 * (size // 32) ** 2, neurons)
+        self.feat = scaled(512 * (size // 32) ** 2, neurons)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the descriptors (N, neurons)."""
@@ -313,7 +322,7 @@ def load(twin: nn.Module, caffemodel: str | Path) -> None:
     with torch.no_grad():
         for module in _learning(twin):
             values = next(layers)
-            if isinstance(module, nn.BatchNorm2d):
+            if isinstance(module, Normalization):
                 mean, variance, weight = values
                 values = next(layers)
                 factor = 1 / weight if weight else weight  # Caffe: a net that was not trained has 0
@@ -329,16 +338,16 @@ def parameter_groups(twin: nn.Module, rate: float, decay: float) -> list[dict]:
     """Return what torch.optim takes: biases learn at twice the rate, only weights decay."""
     groups = []
     for module in _learning(twin):
-        weighs = not isinstance(module, nn.BatchNorm2d)
+        weighs = not isinstance(module, Normalization)
         groups.append({"params": [module.weight], "lr": rate, "weight_decay": decay if weighs else 0})
         if module.bias is not None:
             groups.append({"params": [module.bias], "lr": 2 * rate if weighs else rate, "weight_decay": 0})
     return groups
 
 
-def _learning(twin: nn.Module) -> Iterator[nn.Conv2d | nn.Linear | nn.BatchNorm2d]:
+def _learning(twin: nn.Module) -> Iterator[nn.Conv2d | nn.Linear | Normalization]:
     for module in twin.modules():
-        if isinstance(module, nn.Conv2d | nn.Linear | nn.BatchNorm2d):
+        if isinstance(module, nn.Conv2d | nn.Linear | Normalization):
             yield module
 
 

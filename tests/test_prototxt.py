@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -24,6 +25,22 @@ SIDES = {"small": 64}
 
 def side(folder: Path) -> int:
     return SIDES.get(folder.parent.name, 224)
+
+
+def bring_here(folder: Path, batch: int, seed: int = 1) -> None:
+    """Write net.prototxt and solver.prototxt for a database ``pairs`` in the present folder."""
+    text = (folder / "train_val.prototxt").read_text()
+    text = re.sub(r'source: "[^"]*"', 'source: "pairs"', text)
+    text, count = re.subn(r"batch_size: \d+", f"batch_size: {batch}", text)
+    assert count == 2
+    parse_net_text(text, "net")
+    Path("net.prototxt").write_text(text)
+    solver = (folder / "solver.prototxt").read_text()
+    solver = re.sub(r'net: "[^"]*"', 'net: "net.prototxt"', solver)
+    solver = re.sub(r'snapshot_prefix: "[^"]*"', 'snapshot_prefix: "x"', solver)
+    solver = re.sub(r"random_seed: \d+", f"random_seed: {seed}", solver)
+    assert "test_initialization: false" in solver
+    Path("solver.prototxt").write_text(solver)
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}-{path.name}")
@@ -61,8 +78,8 @@ def test_the_nets_of_one_kind_differ_in_their_last_layer_alone() -> None:
         for one, other in (("siamese_8", "siamese_128"), ("siamese_resnet27_256", "siamese_resnet27_512")):
             texts = [(ROOT / f"prototxt/{part}{name}/train_val.prototxt").read_text() for name in (one, other)]
             changed = [pair for pair in zip(*(t.splitlines() for t in texts), strict=True) if pair[0] != pair[1]]
-            of_last = [pair for pair in changed if "num_output" in pair[0]]
-            assert len(of_last) == 2  # once a tower
+            of_last = [pair for pair in changed if "num_output:" in pair[0] or "filler { value:" in pair[0]]
+            assert len(of_last) == 4  # twice per tower: the InnerProduct and the Scale after it
             assert all(line.startswith(("#", "name:")) for pair in changed if pair not in of_last for line in pair)
 
 
@@ -70,10 +87,43 @@ def test_the_residual_net_has_27_convolutions_and_7x7x512_reach_the_features() -
     (checked,) = check_file(ROOT / "prototxt/siamese_resnet27_256/deploy.prototxt", TEST)
     assert checked.net is not None
     kinds = [layer.type for layer in checked.net.param.layer]
-    assert kinds.count("Convolution") == kinds.count("BatchNorm") == kinds.count("Scale") == 27
+    assert kinds.count("Convolution") == 27
+    assert kinds.count("BatchNorm") == kinds.count("Scale") == 27 + 1  # the features' own
     assert kinds.count("Eltwise") == 1 + 2 + 5 + 3
-    last = checked.net.plan.nodes[-1]
+    (last,) = (node for node in checked.net.plan.nodes if node.type == "InnerProduct")
     assert checked.net.shapes[checked.net.plan.blobs[last.bottoms[0]]] == (1, 512, 7, 7)
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_distances_start_at_about_the_margin(name: str) -> None:
+    """What keeps the training from diverging: the features' Scale starts at 1 / sqrt(2 num_output)."""
+    for part in ("", "small/"):
+        layers = {layer.name: layer for layer in read_net(ROOT / f"prototxt/{part}{name}/train_val.prototxt").layer}
+        neurons = layers["feat"].inner_product_param.num_output
+        assert not layers["feat"].inner_product_param.bias_term
+        assert layers["scale_feat"].scale_param.filler.value == pytest.approx((2 * neurons) ** -0.5, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("name", ["siamese_128", "siamese_resnet27_256"])
+def test_it_trains_whatever_the_seed(name: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Features that are all alike have a loss of 0.25; a training that diverges leaves it far behind."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    places = [cv2.resize(rng.integers(0, 256, (5, 5, 3), np.uint8), (64, 64)) for _ in range(5)]
+    with Writer("pairs") as writer:
+        for k in range(8):
+            pair = np.dstack([places[k % 5], places[k % 5 if k < 4 else (k + 1) % 5]]).astype(int)
+            noisy = np.clip(pair + rng.normal(0, 20, pair.shape), 0, 255).astype(np.uint8)
+            writer.put(b"%08d" % k, array_to_datum(noisy.transpose(2, 0, 1), int(k < 4)).SerializeToString())
+    bring_here(ROOT / "prototxt/small" / name, batch=8, seed=seed)
+    trained = netspec.load_solver("solver.prototxt", device="cpu")
+    losses = []
+    for _ in range(5):
+        trained.step(1)
+        losses.append(trained.loss)
+    trained.close()
+    assert max(losses) < 0.5
 
 
 def test_the_solvers_are_the_papers() -> None:
@@ -99,17 +149,7 @@ def test_one_iteration_and_back_into_the_deploy_net(
         for k in range(4):
             pixels = rng.integers(0, 256, (6, side(folder), side(folder)), dtype=np.uint8)
             writer.put(b"%08d" % k, array_to_datum(pixels, k % 2).SerializeToString())
-    text = (folder / "train_val.prototxt").read_text()
-    text = re.sub(r'source: "[^"]*"', 'source: "pairs"', text)
-    text, count = re.subn(r"batch_size: \d+", "batch_size: 2", text)
-    assert count == 2
-    parse_net_text(text, "net")
-    Path("net.prototxt").write_text(text)
-    solver = (folder / "solver.prototxt").read_text()
-    solver = re.sub(r'net: "[^"]*"', 'net: "net.prototxt"', solver)
-    solver = re.sub(r'snapshot_prefix: "[^"]*"', 'snapshot_prefix: "x"', solver)
-    solver = re.sub(r"test_initialization: false", "", solver)
-    Path("solver.prototxt").write_text(solver + "test_initialization: false\n")
+    bring_here(folder, batch=2)
     trained = netspec.load_solver("solver.prototxt", device="cpu")
     before = trained.net.params["feat"][0].detach().clone()
     trained.step(1)

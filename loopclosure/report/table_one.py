@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -157,7 +158,9 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
         ylabel="contrastive loss of the validation pairs",
         title="Validation loss (circle: judged)",
     )
-    axes.set_yscale("log")
+    losses = [loss for run in runs for _, loss in run.losses if math.isfinite(loss) and loss > 0]
+    if losses and max(losses) > 10 * min(losses):  # a diverging start would flatten all that follows
+        axes.set_yscale("log")
     axes.grid(alpha=0.3, which="both")
     axes.legend()
     figure.savefig(path, dpi=120)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import environment
+from benchmarks import environment, feeding, growth
 from benchmarks.cli import main
 from benchmarks.report import Row, table
 from benchmarks.rounds import difference, measure, ratio
@@ -125,9 +125,48 @@ def test_an_environment_that_cannot_be_installed_is_a_fault(
 
 @pytest.mark.slow
 def test_growth_builds_and_runs_nets_of_a_thousand_layers(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["growth", "--layers", "17", "1002"]) == 0
+    assert main(["growth", "layers", "17", "1002"]) == 0
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    assert [row[0] for row in rows] == ["| 17", "| 1002"]
+    assert [row[0] for row in rows] == ["| 17", "| 1,002"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["batch", "pairs", "frames", "places"])
+def test_growth_is_measured_kept_and_drawn(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plot, out = tmp_path / "growth.png", tmp_path / "growth.json"
+    words = ["growth", kind, "1", "30", "--without-others", "--plot", str(plot), "--json", str(out)]
+    assert main(words) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 4
+    assert plot.stat().st_size > 1000
+    rows = json.loads(out.read_text())["rows"]
+    unit = growth.KINDS[kind].unit
+    assert [row[unit] for row in rows] == [1, 30]
+    assert all(value >= 0 for row in rows for value in row.values())
+    assert all(row["memory, MB"] > 10 for row in rows)
+
+
+def test_what_keeps_growth_from_being_measured_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["growth", "pairs", "0"]) == 1
+    assert "pairs 0: " in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_waiting_for_data_is_told_for_each_source(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(feeding, "SECONDS", 0.0)
+    assert main(["feeding", "small/siamese_8", "squeezenet", "--batch", "1", "--threads", "1"]) == 0
+    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[:2] for row in rows] == [
+        ["small/siamese_8", "LMDB of pixels"],
+        *(["squeezenet", source] for source in feeding.SOURCES),
+    ]
+    assert all(0 <= float(row[3].removesuffix(" %")) < 100 for row in rows)
+
+
+def test_a_net_without_a_training_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["feeding", "net.prototxt"]) == 1
+    assert 'no training of "net.prototxt"; there are: siamese_8' in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -1,0 +1,135 @@
+"""How long a training waits for its data, from each kind of source: ``tools/bench feeding``.
+
+The records are pictures of noise, smoothed as photographs are: JPEG files take as long to decode.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.case import CATALOGUE, record, training_net
+from netspec.errors import SpecError
+
+FILE_SIZE = (480, 640)  # height, width of the files that ImageData reads
+SECONDS = 5.0
+Say = Callable[[str], None]
+
+
+def measure(names: list[str], batch: int, threads: int, say: Say) -> None:
+    """Say a table of the share of an iteration that each net waits for its data, source by source."""
+    import torch
+
+    import netspec
+    from netspec.proto.text import write_text
+
+    torch.set_num_threads(threads)
+    say("| net | data | ms per iteration | waiting for data |\n|---|---|---|---|")
+    for name in names:
+        if name not in CATALOGUE:
+            raise SpecError(f'no training of "{name}"; there are: {", ".join(CATALOGUE)}')
+        channels = record(name)[0][0]
+        for kind, prepare in SOURCES.items():
+            if kind != "LMDB of pixels" and channels != 3:
+                continue  # an encoded image has three channels, ImageData reads one image
+            with TemporaryDirectory(prefix="feeding-") as folder:
+                net = training_net(name, "", batch)
+                prepare(net, Path(folder), record(name), 4 * batch)
+                (Path(folder) / "net.prototxt").write_text(write_text(net))
+                solver = netspec.load_solver(_solver(folder), device="cpu")
+                spent, waited = _run(solver)
+                solver.close()
+            say(f"| {name} | {kind} | {1e3 * spent:.0f} | {100 * waited / spent:.1f} % |")
+
+
+def _run(solver: Any) -> tuple[float, float]:
+    """Return the seconds of an iteration, and how many of them it waits for data."""
+    solver.step(2)
+    start, waited, iterations = time.perf_counter(), _waited(solver), 0
+    while iterations < 3 or time.perf_counter() - start < SECONDS:
+        solver.step(1)
+        iterations += 1
+    spent = time.perf_counter() - start
+    return spent / iterations, (_waited(solver) - waited) / iterations
+
+
+def _waited(solver: Any) -> float:
+    return sum(layer.waited for layer in solver.net.layers)
+
+
+def _solver(folder: str) -> str:
+    path = Path(folder) / "solver.prototxt"
+    path.write_text(f'net: "{folder}/net.prototxt" base_lr: 0.0001 lr_policy: "fixed" max_iter: 1000000\n')
+    return str(path)
+
+
+def _picture(random: np.random.Generator, channels: int, height: int, width: int) -> np.ndarray:
+    import cv2
+
+    coarse = random.integers(0, 256, (height // 8, width // 8, channels), np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).reshape(height, width, channels)
+
+
+def _pixels(net: Any, folder: Path, shape: Any, count: int) -> None:
+    from netspec.data.datum import array_to_datum
+
+    _write(net, folder, shape, count, lambda picture, label: array_to_datum(picture.transpose(2, 0, 1), label))
+
+
+def _encoded(net: Any, folder: Path, shape: Any, count: int) -> None:
+    import cv2
+
+    from netspec.data.datum import encoded_datum
+
+    def datum(picture: np.ndarray, label: int) -> Any:
+        return encoded_datum(cv2.imencode(".jpg", picture)[1].tobytes(), label)
+
+    _write(net, folder, shape, count, datum)
+
+
+def _write(net: Any, folder: Path, shape: Any, count: int, datum: Callable[[np.ndarray, int], Any]) -> None:
+    from netspec.data.database import Writer
+
+    (channels, height, width), classes = shape
+    random = np.random.default_rng(0)
+    source = str(folder / "records")
+    with Writer(source) as writer:
+        for k in range(count):
+            picture = _picture(random, channels, height, width)
+            writer.put(b"%08d" % k, datum(picture, k % classes).SerializeToString())
+    for layer in net.layer:
+        if layer.type == "Data":
+            layer.data_param.source = source
+
+
+def _files(net: Any, folder: Path, shape: Any, count: int) -> None:
+    import cv2
+
+    (channels, height, width), classes = shape
+    random = np.random.default_rng(0)
+    lines = []
+    for k in range(count):
+        path = folder / f"{k}.jpg"
+        cv2.imwrite(str(path), _picture(random, channels, *FILE_SIZE))
+        lines.append(f"{path} {k % classes}\n")
+    (folder / "images.txt").write_text("".join(lines))
+    for layer in net.layer:
+        if layer.type == "Data":
+            batch = layer.data_param.batch_size
+            layer.ClearField("data_param")
+            layer.type = "ImageData"
+            reads = layer.image_data_param
+            reads.source, reads.batch_size = str(folder / "images.txt"), batch
+            reads.new_height, reads.new_width = height, width
+
+
+SOURCES: dict[str, Callable[[Any, Path, Any, int], None]] = {
+    "LMDB of pixels": _pixels,
+    "LMDB of JPEG": _encoded,
+    "ImageData, JPEG of 640x480": _files,
+}
