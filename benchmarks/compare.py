@@ -123,7 +123,7 @@ def starts_of(case: Case, ways: Sequence[str], yardsticks: str | None, rounds: i
 class _Absent:
     """A way that there is not for this net."""
 
-    peak = None
+    peak: float | None = None
 
     def __init__(self, name: str, fault: str) -> None:
         self.name, self.fault, self.outputs = name, fault, {}

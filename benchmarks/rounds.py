@@ -110,7 +110,7 @@ def _peak(process: int) -> float | None:
 class Starter:
     """Processes of benchmarks/start.py, one after the other; the time of importing torch is subtracted."""
 
-    peak = None
+    peak: float | None = None
 
     def __init__(self, name: str, python: str, task: Mapping[str, Any]) -> None:
         self.name, self.fault = name, ""
@@ -146,7 +146,8 @@ class Starter:
 class CaffeProgram:
     """The program ``caffe`` itself, begun anew at each turn; times are those in its log."""
 
-    name, peak = "caffe", None
+    name = "caffe"
+    peak: float | None = None
 
     def __init__(self, binary: str, task: Mapping[str, Any], training: bool) -> None:
         self.binary, self.task, self.training = binary, task, training
