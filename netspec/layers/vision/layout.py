@@ -36,8 +36,13 @@ class _SideBySide(torch.autograd.Function):
 
     @staticmethod
     @override
-    def forward(ctx: Any, maps: torch.Tensor) -> torch.Tensor:
+    def forward(maps: torch.Tensor) -> torch.Tensor:
         return maps.contiguous(memory_format=torch.channels_last)
+
+    @staticmethod
+    @override
+    def setup_context(ctx: Any, inputs: tuple[torch.Tensor], output: torch.Tensor) -> None:
+        """Keep nothing."""
 
     @staticmethod
     @override
