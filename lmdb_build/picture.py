@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from loopclosure.errors import InputError
 
 JPEG_QUALITY = 95
+DEPTH_PER_M = 5000
 CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)  # of a picture of size 1: x, y, clockwise
 
 
@@ -29,4 +30,14 @@ def seen_through(
 def write_jpeg(path: Path, picture: NDArray) -> None:
     """Write a picture (H, W, 3) uint8, BGR, as JPEG. Raises InputError where it cannot be written."""
     if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
+        raise InputError("cannot be written", path)
+
+
+def write_depth(path: Path, depth: NDArray) -> None:
+    """Write depth (H, W) in meters as TUM RGB-D does: PNG, 16 bits, 5000 per meter, 0 for not known or 13.1 m and more.
+
+    Raises InputError where it cannot be written.
+    """
+    steps = np.rint(depth * DEPTH_PER_M)
+    if not cv2.imwrite(str(path), np.where(steps < 1 << 16, steps, 0).astype(np.uint16)):
         raise InputError("cannot be written", path)

@@ -1,7 +1,7 @@
 """Arrays of .npz and .npy files, read with care.
 
 numpy makes room for what a header announces before it reads, and a small packed file may unpack to any size: both are
-checked here against what the file holds. No Python object is ever unpickled.
+checked here against what the file holds. Of Python objects only lists of numbers are unpickled, by :func:`read_lists`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import pickle
 import tokenize
 import zipfile
 import zlib
@@ -53,6 +54,64 @@ def read_npy(path: str | Path, expected: str) -> np.ndarray:
             return _read(stream, os.fstat(stream.fileno()).st_size)
     except _FAULTS as error:
         raise _fault(error, path, expected) from None
+
+
+def read_lists(path: str | Path) -> list[Any] | None:
+    """Return the lists in an .npy file whose elements are lists or arrays of integers; None for a plain array.
+
+    Such a file is a pickle, which could run anything: here it may hold integers, lists, tuples and arrays of them, and
+    nothing else. Raises InputError for other files.
+    """
+    path = Path(path)
+    expected = "an array of numbers, or of lists of integers"
+    try:
+        with path.open("rb") as stream:
+            version = np.lib.format.read_magic(stream)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(stream)
+            if not dtype.hasobject:
+                return None
+            values = _Lists(stream).load()
+            if not isinstance(values, np.ndarray) or values.shape != shape:
+                raise ValueError("another array than its header says")
+            return _plain(values)
+    except (*_FAULTS, pickle.UnpicklingError) as error:
+        raise _fault(error, path, expected) from None
+
+
+class _Lists(pickle.Unpickler):
+    """Unpickles numpy arrays and lists; whatever else a pickle names is refused."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module in ("numpy", "numpy.core.multiarray", "numpy._core.multiarray") and name in _KNOWN:
+            return _KNOWN[name]
+        raise pickle.UnpicklingError(f"{module}.{name} is no list of numbers")
+
+
+def _empty_array(*_: Any) -> np.ndarray:
+    """Return the array that a pickle begins with: empty, whatever size the pickle says."""
+    return np.ndarray((0,), np.int8)
+
+
+_KNOWN: dict[str, Any] = {
+    "ndarray": np.ndarray,
+    "dtype": np.dtype,
+    "_reconstruct": _empty_array,
+    "scalar": lambda dtype, data: np.frombuffer(data, dtype)[0],
+}
+
+
+def _plain(value: Any) -> Any:
+    """Return integers and lists of them for what numpy has. Raises ValueError for other values."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (float, np.floating)) and float(value).is_integer():
+        return int(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    raise ValueError(f"a {type(value).__name__}")
 
 
 def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:

@@ -1,4 +1,8 @@
-"""Any set of methods on one data set: scores, measures by both conventions, times."""
+"""Any set of methods on one data set: scores, measures by both conventions and in both zones, times.
+
+The rule zone is the data set's truth as it is. In the soft zone, known where frames have poses, a match of views that
+overlap is no mistake either (:mod:`loopclosure.places.overlap`). What is to be found is the same in both.
+"""
 
 from __future__ import annotations
 
@@ -12,33 +16,89 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, make_method
 from loopclosure.places.datasets import DataSet
+from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import BestMatches, JudgedScores, PrecisionRecall
 from loopclosure.progress import Progress, silent
 
 RECALL_AT = (1, 5, 10)
+SOFT_ZONE = "; soft zone"
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """How good scores are in one zone.
+
+    pairs      the curve over all pairs
+    best       the curve of the best match of each query
+    matches    the best match of each query
+    recall_at  k -> share of the queries with a loop that have one among their best k
+    """
+
+    pairs: PrecisionRecall
+    best: PrecisionRecall
+    matches: BestMatches
+    recall_at: dict[int, float]
+
+    @classmethod
+    def of(cls, scores: np.ndarray, truth: Truth) -> Judgment:
+        """Judge scores (Q, R) by a truth."""
+        judged = JudgedScores(scores, truth)
+        return cls(
+            judged.all_pairs_curve(), judged.best_match_curve(), judged.best_matches, judged.recall_at(RECALL_AT)
+        )
+
+    def measures(self, zone: str = "") -> dict[str, dict[str, float]]:
+        """Return convention + ``zone`` -> name of the measure -> value in 0..1."""
+        table = {
+            curve.convention + zone: {
+                "average precision": curve.average_precision,
+                "recall at 100 % precision": curve.recall_at_full_precision,
+                "best F1": curve.best_f1,
+            }
+            for curve in (self.pairs, self.best)
+        }
+        table[self.best.convention + zone].update({f"recall at {k}": value for k, value in self.recall_at.items()})
+        return table
 
 
 @dataclass(frozen=True)
 class Outcome:
     """One method on one data set: what it answered, and how good that is.
 
-    scores     (Q, R), as the method gave them
-    pairs      the curve over all pairs;  best  the curve of the best match of each query
-    matches    the best match of each query
-    recall_at  k -> share of the queries with a loop that have one among their best k
-    seconds    stage -> total seconds
+    scores   (Q, R), as the method gave them
+    rule     how good they are in the rule zone
+    soft     the same in the soft zone; None where it is not known
+    seconds  stage -> total seconds
     training_stages  the stages done once, on training images
     """
 
     name: str
     scores: np.ndarray
-    pairs: PrecisionRecall
-    best: PrecisionRecall
-    matches: BestMatches
-    recall_at: dict[int, float]
+    rule: Judgment
+    soft: Judgment | None
     seconds: dict[str, float]
     training_stages: tuple[str, ...]
     notes: list[str]
+
+    @property
+    def pairs(self) -> PrecisionRecall:
+        """The curve over all pairs, in the rule zone."""
+        return self.rule.pairs
+
+    @property
+    def best(self) -> PrecisionRecall:
+        """The curve of the best match of each query, in the rule zone."""
+        return self.rule.best
+
+    @property
+    def matches(self) -> BestMatches:
+        """The best match of each query, in the rule zone."""
+        return self.rule.matches
+
+    @property
+    def recall_at(self) -> dict[int, float]:
+        """Of the rule zone: k -> share of the queries with a loop that have one among their best k."""
+        return self.rule.recall_at
 
     @property
     def seconds_on_frames(self) -> float:
@@ -47,17 +107,8 @@ class Outcome:
 
     @cached_property
     def measures(self) -> dict[str, dict[str, float]]:
-        """How good the method is, by convention: convention -> name of the measure -> value in 0..1."""
-        table = {
-            curve.convention: {
-                "average precision": curve.average_precision,
-                "recall at 100 % precision": curve.recall_at_full_precision,
-                "best F1": curve.best_f1,
-            }
-            for curve in (self.pairs, self.best)
-        }
-        table[self.best.convention].update({f"recall at {k}": value for k, value in self.recall_at.items()})
-        return table
+        """How good the method is: convention and zone -> name of the measure -> value in 0..1."""
+        return {**self.rule.measures(), **({} if self.soft is None else self.soft.measures(SOFT_ZONE))}
 
 
 @dataclass(frozen=True)
@@ -104,7 +155,8 @@ def judge(
 ) -> Outcome:
     """Run one method and judge its scores."""
     result = method.score(Images(data.query_images, data.reference_images, list(train_images)), progress)
-    judged_scores = JudgedScores(result.scores, data.truth)
+    rule = Judgment.of(result.scores, data.truth)
+    soft_truth = data.soft_truth
     silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
     notes = list(result.notes)
     if silent_pairs:
@@ -113,10 +165,8 @@ def judge(
     return Outcome(
         name=name,
         scores=result.scores,
-        pairs=judged_scores.all_pairs_curve(),
-        best=judged_scores.best_match_curve(),
-        matches=judged_scores.best_matches,
-        recall_at=judged_scores.recall_at(RECALL_AT),
+        rule=rule,
+        soft=None if soft_truth is None else Judgment.of(result.scores, soft_truth),
         seconds=result.seconds,
         training_stages=result.training_stages,
         notes=notes,

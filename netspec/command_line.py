@@ -24,6 +24,7 @@ from netspec.errors import SpecError
 from netspec.limits import amount, is_out_of_memory, memory
 
 DONE, FAULT, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130  # exit statuses
+SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: there is something to say; a file cannot be read
 SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
 VARIABLE = "GLOG_minloglevel"
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
@@ -47,10 +48,10 @@ class Commands:
         """Return the parser of a new command that runs ``function``, to add its own arguments to.
 
         An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. A command that shows no
-        log itself sets the default ``log_form`` to None.
+        log itself sets the default ``log_form`` to None, one whose faults are no FAULT sets ``fault_status``.
         """
         added = self._parsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
-        added.set_defaults(run=function, log_level=logging.INFO, log_form=log.GlogFormatter())
+        added.set_defaults(run=function, log_level=logging.INFO, log_form=log.GlogFormatter(), fault_status=FAULT)
         added.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
         for name in ("--logtostderr", "--alsologtostderr"):  # it always does
             added.add_argument(name, action="store_true", help=argparse.SUPPRESS)
@@ -73,7 +74,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
             return arguments.run(arguments) or DONE
     except (SpecError, *faults) as fault:
         print(fault, file=sys.stderr)
-        return FAULT
+        return arguments.fault_status
     except WrongUsage as fault:
         print(f"{parser.prog} {arguments.command}: error: {fault}", file=sys.stderr)
         return WRONG_USAGE
@@ -82,7 +83,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
         return FAULT
     except OSError as fault:
         print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
-        return FAULT
+        return arguments.fault_status
     except (MemoryError, RuntimeError) as fault:
         if not is_out_of_memory(fault):
             raise

@@ -75,6 +75,10 @@ class ForkFault(SpecError):
         self.dialects = dialects
 
 
+class UnknownShape(SpecError):
+    """A blob whose shape is known only from data that was not opened."""
+
+
 def did_you_mean(word: str, known: list[str] | tuple[str, ...]) -> str:
     """Return ``; did you mean "x"?`` for the closest known word, or an empty string."""
     import difflib

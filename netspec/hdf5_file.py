@@ -108,6 +108,21 @@ class Hdf5Group:
         return found
 
 
+def layer_groups(data: Hdf5Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
+    """Yield the layers of a file of weights, /data/<layer>/<i>, in Caffe's (alphabetical) order.
+
+    A layer with a slash in its name is a group within a group.
+    """
+    for name in data.names():
+        group = data.group(name)
+        if group is not None:
+            found = {key: group.dataset(key) for key in group.names()}
+            arrays = {key: dataset for key, dataset in found.items() if dataset is not None}
+            if arrays or not found:
+                yield prefix + name, arrays
+            yield from layer_groups(group, f"{prefix}{name}/")
+
+
 def _parts(path: str) -> list[str]:
     return [part for part in path.split("/") if part]
 

@@ -13,6 +13,7 @@ from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_list import (
     CAMERAS,
     MaskSource,
+    TraverseSource,
     folders_source,
     index_source,
     singles_source,
@@ -21,8 +22,11 @@ from lmdb_build.pairs.by_list import (
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
 from loopclosure.descriptors.feature_file import read_features
+from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
+from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
+from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_posed
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S
 from netspec.command_line import Commands, WrongUsage
 
 
@@ -30,13 +34,29 @@ def add_to(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add("pairs", _pairs, "choose labeled pairs and write their lists")
     add = parser.add_argument
-    add("sequences", type=Path, nargs="*", metavar="SEQUENCE", help="folders in TUM RGB-D layout: pairs by pose")
+    add("sequences", type=Path, nargs="*", metavar="SEQUENCE", help=f"pairs by pose: {', '.join(LAYOUTS.values())}")
     add("--out", type=Path, required=True, help="folder for train.txt, val.txt and test.txt")
     add("--root", type=Path, help="folder that the lists' names are relative to (the sources' common parent)")
 
+    posed = parser.add_argument_group("sequences with poses")
+    for layout, what in LAYOUTS.items():
+        about = f"a SEQUENCE that must be {what}; may be repeated"
+        posed.add_argument(f"--{layout}", type=Path, action="append", default=[], metavar="PATH", help=about)
+    posed.add_argument("--topic", default="", help="of the images of bags that have several")
+    posed.add_argument("--pose-topic", default="", metavar="TOPIC", help="of the poses of bags that have several")
+    posed.add_argument("--poses", type=Path, metavar="FILE", help=POSES_HELP)
+    posed.add_argument("--pose-form", default="", metavar="WORDS", help=POSE_FORM_HELP)
+
     source = parser.add_argument_group("other sources, instead of sequences")
     source.add_argument(
-        "--mask", type=Path, metavar="FILE", help="a mask of loops (.mat, .npy, .txt, image) of --images"
+        "--mask",
+        type=Path,
+        metavar="FILE",
+        help="a mask of loops (.mat, .npy, .txt, image) of --images or --traverses; of these also ground_truth*.npy",
+    )
+    source.add_argument("--traverses", type=Path, nargs=2, metavar=("QUERIES", "REFERENCES"), help="with --mask")
+    source.add_argument(
+        "--nordland", type=Path, metavar="FOLDER", help="query/, ref/, ground_truth*.npy: VPR benchmarks"
     )
     source.add_argument("--images", type=Path, metavar="FOLDER", help="the images of --mask, in natural order")
     source.add_argument(
@@ -103,8 +123,8 @@ def add_to(commands: Commands) -> None:
 def _pairs(arguments: argparse.Namespace) -> None:
     named = {split: names for split in SPLITS if (names := getattr(arguments, f"{split}_sequences"))}
     source, root = _source(arguments)
-    by_pose = bool(arguments.sequences or arguments.mask)
-    by = arguments.split or ("sequence" if named or not by_pose else "time")
+    in_time = isinstance(source, (PoseSource, MaskSource))
+    by = arguments.split or ("sequence" if named or not in_time else "time")
     if named and by == "time":
         raise WrongUsage("--train-sequences, --val-sequences and --test-sequences need --split sequence")
     plan = Plan(
@@ -126,20 +146,32 @@ def _pairs(arguments: argparse.Namespace) -> None:
 
 def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     """Open the one source that is named; return it and the root folder."""
-    kinds = ("sequences", "mask", "folders", "table", "singles")
-    given = [kind for kind in kinds if getattr(arguments, kind)]
+    sequences = _sequences(arguments)
+    kinds = ("mask", "traverses", "nordland", "folders", "table", "singles")
+    given = ["sequences"] if sequences else []
+    given += [kind for kind in kinds if getattr(arguments, kind)]
     if arguments.index and "table" not in given:
         given.append("index")
+    if "traverses" in given and "mask" in given:
+        given.remove("mask")
     if len(given) != 1:
-        raise WrongUsage("name sequences or one of --mask, --folders, --table, --index, --singles")
+        raise WrongUsage(
+            "name sequences or one of --mask, --traverses, --nordland, --folders, --table, --index, --singles"
+        )
     kind = given[0]
     if kind == "mask" and not arguments.images:
-        raise WrongUsage("--mask needs --images")
+        raise WrongUsage("--mask needs --images or --traverses")
+    if kind == "traverses" and not arguments.mask:
+        raise WrongUsage(
+            "--traverses needs --mask, which says what shows the same place; --folders goes by equal names"
+        )
     if kind == "index" and not (arguments.group and arguments.track and arguments.time):
         raise WrongUsage("--index without --table needs --group, --track and --time")
     places = {
-        "sequences": [folder.resolve().parent for folder in arguments.sequences],
+        "sequences": [folder.resolve().parent for _, folder in sequences],
         "mask": [arguments.images],
+        "traverses": arguments.traverses,
+        "nordland": [arguments.nordland],
         "folders": arguments.folders,
         "table": [arguments.table.parent] if arguments.table else [],
         "index": [arguments.index.parent] if arguments.index else [],
@@ -148,7 +180,12 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     warped = [arguments.out] if arguments.warp_share or arguments.singles else []
     root = arguments.root or Path(os.path.relpath(os.path.commonpath([str(p.resolve()) for p in [*places, *warped]])))
     if kind == "sequences":
-        return _pose_source(arguments, root), root
+        return _pose_source(arguments, sequences, root), root
+    if kind == "traverses":
+        return TraverseSource(arguments.mask, arguments.traverses[0], arguments.traverses[1], root), root
+    if kind == "nordland":
+        queries, references, truth = benchmark_parts(arguments.nordland)
+        return TraverseSource(truth, queries, references, root), root
     min_gap = None if arguments.min_gap is None else int(arguments.min_gap)
     if kind == "mask":
         return MaskSource(arguments.mask, arguments.images, root, min_gap, arguments.camera), root
@@ -163,10 +200,32 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     return singles_source(arguments.singles, root), root
 
 
-def _pose_source(arguments: argparse.Namespace, root: Path) -> PoseSource:
-    sequences = [read_tum_sequence(folder, arguments.max_difference) for folder in arguments.sequences]
-    for folder, sequence in zip(arguments.sequences, sequences, strict=True):
+def _sequences(arguments: argparse.Namespace) -> list[tuple[str, Path]]:
+    """Return layout and folder of every sequence that is named; bags and videos are extracted below --out."""
+    named = [("", path) for path in arguments.sequences]
+    named += [(layout, path) for layout in LAYOUTS for path in getattr(arguments, layout)]
+    if arguments.poses and len(named) != 1:
+        raise WrongUsage("--poses are those of one sequence; name one")
+    if arguments.pose_form and not arguments.poses:
+        raise WrongUsage("--pose-form means nothing without --poses")
+    found = []
+    for layout, path in named:
+        if layout in RECORDED or (not layout and is_recording(path)):
+            folder, said = extract(path, arguments.out / path.stem, arguments.topic, arguments.pose_topic, bar)
+            print(said)
+            found.append(("images" if arguments.poses else "tum", folder))
+        else:
+            found.append((layout or layout_of(path, "images" if arguments.poses else "tum"), path))
+    return found
+
+
+def _pose_source(arguments: argparse.Namespace, named: list[tuple[str, Path]], root: Path) -> PoseSource:
+    poses = PoseChoice(arguments.poses, pose_form(arguments.pose_form)) if arguments.poses else None
+    sequences = [read_posed(folder, layout, arguments.max_difference, poses) for layout, folder in named]
+    for (_, folder), sequence in zip(named, sequences, strict=True):
         print(f"{folder}: {len(sequence)} images with a pose, {sequence.dropped} without one left out")
+        for doubt in sequence.doubts:
+            _warn(doubt)
     rule = PoseRule(
         max_distance_m=arguments.max_distance,
         max_angle_deg=arguments.max_angle,
@@ -176,7 +235,7 @@ def _pose_source(arguments: argparse.Namespace, root: Path) -> PoseSource:
         clear_view_angle_deg=arguments.clear_view_angle,
     )
     scenes = Scenes(tuple(arguments.same_scene), tuple(arguments.same_frame), arguments.different_scenes)
-    folders = [Path(os.path.relpath(folder.resolve(), root.resolve())).as_posix() for folder in arguments.sequences]
+    folders = [Path(os.path.relpath(folder.resolve(), root.resolve())).as_posix() for _, folder in named]
     return PoseSource(sequences, folders, rule, scenes)
 
 

@@ -10,6 +10,8 @@ from lmdb_build.cli.bar import bar
 from lmdb_build.walk.sequence import Walk, write_walk
 from netspec.command_line import Commands, WrongUsage
 
+SEASON_S = 1_000_000.0  # between the time stamps of two seasons of one walk
+
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
@@ -19,8 +21,12 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--frames", type=int, default=400, help="images per sequence (400)")
     p.add_argument("--size", type=size, default=(320, 240), help="size of an image (320x240)")
     p.add_argument("--laps", type=int, default=3, help="laps through the house (3)")
+    p.add_argument("--depth", action="store_true", help="write depth images too, in TUM's form")
     p.add_argument("--rooms", type=int, default=4, help="rooms per house, an even number (4)")
     p.add_argument("--seed", type=int, default=1, help="random seed (1)")
+    p.add_argument(
+        "--season", type=int, default=1, metavar="N", help="the same houses, repainted, in other light and weather (1)"
+    )
 
 
 def _walk(arguments: argparse.Namespace) -> None:
@@ -35,8 +41,10 @@ def _walk(arguments: argparse.Namespace) -> None:
             height=arguments.size[1],
             laps=arguments.laps,
             rooms=arguments.rooms,
+            depth=arguments.depth,
             seed=1000 * arguments.seed + number,
-            start_s=10_000.0 * number,
+            start_s=10_000.0 * number + SEASON_S * (arguments.season - 1),
+            season=arguments.season,
         )
         folder = arguments.out / f"walk_{number}"
         for _ in bar(write_walk(folder, walk), folder.name, walk.frames):

@@ -13,7 +13,7 @@ from lmdb_build.pairs.table import as_number, cell, read_table, relative
 from loopclosure.errors import InputError
 from loopclosure.places import cameras
 from loopclosure.places.frames import image_paths
-from loopclosure.places.masks import read_truth_matrix
+from loopclosure.places.masks import read_matches, read_truth_matrix
 
 CAMERAS = tuple(camera for camera in cameras.CAMERAS if camera != "joined")  # a pair is two files
 
@@ -73,6 +73,44 @@ class MaskSource:
     def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
         """Nothing: there is no other information than the mask."""
         return []
+
+
+class TraverseSource(MaskSource):
+    """Two traverses of one route, and which images of one show the places of the other.
+
+    A pair is a query and a reference: negatives of one traverse would teach a net to tell traverses apart. The images
+    of both are one run, in the order of the references that they show. See :class:`lmdb_build.pairs.choose.PairSource`.
+    """
+
+    def __init__(self, truth: Path, queries: Path, references: Path, root: Path) -> None:
+        """Read a mask (Q, R), or the lists of a VPR benchmark: see loopclosure.places.masks.read_matches."""
+        paths = image_paths(queries), image_paths(references)
+        count = len(paths[0])
+        hard, soft = read_matches(truth, count, len(paths[1]))
+        shown = np.flatnonzero(hard.any(axis=1))
+        if not len(shown):
+            raise InputError("marks no loop", truth)
+        middles = [np.flatnonzero(row).mean() for row in hard[shown]]
+        places = np.concatenate([np.interp(np.arange(count), shown, middles), np.arange(len(paths[1]), dtype=float)])
+        order = np.argsort(places, kind="stable")
+        is_query = order < count
+        self._hard, self._soft = (_both_ways(mask)[np.ix_(order, order)] for mask in (hard, soft))
+        self._judged = is_query[:, None] != is_query
+        self._marked = np.argwhere(np.triu(self._hard, 1))
+        self._min_gap = 0
+        every = [*paths[0], *paths[1]]
+        self.names = [relative(every[i], root) for i in order]
+        self.tracks = self.groups = np.zeros(len(self.names), np.intp)
+        self.group_names = [f"{queries.name} and {references.name}"]
+        self.stamps = places[order]
+        self.settings = {"source": f"{truth.name} of {queries.name} and {references.name}"}
+
+
+def _both_ways(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a mask (Q, R) of queries and references as one of all images (Q + R, Q + R)."""
+    queries, references = mask.shape
+    nothing = [np.zeros((size, size), bool) for size in (queries, references)]
+    return np.block([[nothing[0], mask], [mask.T, nothing[1]]])
 
 
 class PlaceSource:

@@ -32,7 +32,8 @@ class Quad:
     """A textured rectangle: its upper left corner (3,), and the edges (3,) along the texture's rows and columns.
 
     It is visible from the side to which ``down`` x ``right`` points. ``glow``: the light that it emits.
-    ``shell``: wall, floor or ceiling, which are darker near their edges.
+    ``shell``: wall, floor or ceiling, which are darker near their edges. ``draw``: the function that drew a picture on
+    a wall, so that another season can hang another one.
     """
 
     origin: Vector
@@ -42,6 +43,7 @@ class Quad:
     room: int
     glow: Glow = None
     shell: bool = False
+    draw: Texture | None = None
 
 
 @dataclass(frozen=True)
@@ -325,7 +327,8 @@ def _hang(
                 room.taken.append((number, low, low + wide, HEIGHT_M))
                 right = np.append(wide * wall.right, 0)
                 origin = wall.at(low, 0.02, bottom + tall)
-                quads.append(Quad(origin, right, np.array([0, 0, -tall]), draw(rng, wide, tall), room.index, glow=glow))
+                down = np.array([0, 0, -tall])
+                quads.append(Quad(origin, right, down, draw(rng, wide, tall), room.index, glow=glow, draw=draw))
                 if glow:
                     room.windows.append(wall.at(low + wide / 2, 0.1, bottom + tall / 2))
                 break
@@ -364,6 +367,7 @@ def _cut(quad: Quad) -> list[Quad]:
                     quad.room,
                     quad.glow,
                     quad.shell,
+                    quad.draw,
                 )
             )
     return parts

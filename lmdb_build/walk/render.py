@@ -69,6 +69,7 @@ class Renderer:
         self._rays = np.array(
             [[1 / camera.focal, 0, -u / camera.focal], [0, 1 / camera.focal, -v / camera.focal], [0, 0, 1]]
         )
+        self.depth = np.zeros((camera.height, camera.width), np.float32)
         self.relight(light)
 
     def relight(self, light: Light) -> None:
@@ -76,7 +77,10 @@ class Renderer:
         self._pyramids = [_pyramid(_lit(quad, self.house.rooms[quad.room], light)) for quad in self.house.quads]
 
     def draw(self, position: Array, rotation: Array) -> Image:
-        """Return the picture (H, W, 3), BGR, seen from ``position`` (3,) with camera-to-world ``rotation`` (3, 3)."""
+        """Return the picture (H, W, 3), BGR, seen from ``position`` (3,) with camera-to-world ``rotation`` (3, 3).
+
+        ``depth`` then holds the depth (H, W) of its pixels along the camera's axis, in meters, 0 where nothing is.
+        """
         height, width = self.camera.height, self.camera.width
         picture = np.zeros((height, width, 3), np.uint8)
         nearness = np.zeros((height, width), np.float32)  # 1 / z: linear in the picture, unlike z
@@ -102,6 +106,7 @@ class Renderer:
         to_unit = to_unit @ self._rays
         for index, outline, unit in zip(visible, corners, to_unit, strict=True):
             self._draw_quad(picture, nearness, self._pyramids[index], _clip_near(outline), unit)
+        self.depth = np.divide(1, nearness, out=np.zeros_like(nearness), where=nearness > 0)
         return picture
 
     def _touches_view(self, corners: Array) -> NDArray[np.bool_]:

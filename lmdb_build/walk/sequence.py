@@ -2,8 +2,9 @@
 
 The quick start and the tests use it instead of a data set to download. The camera is carried around a house
 (:mod:`lmdb_build.walk.house`) several times, so that places are seen again: each lap at another time of day, with small
-changes of position and direction. Poses are exact and the geometry is correct, so the paper's rule of the same place
-means the same as with real images. Every picture follows from the seed.
+changes of position and direction. A walk in another season (:mod:`lmdb_build.walk.season`) takes the same path through
+the same house. Poses are exact and the geometry is correct, so the paper's rule of the same place means the same as
+with real images. Every picture follows from the seed.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdb_build.picture import write_jpeg
+from lmdb_build.picture import write_depth, write_jpeg
 from lmdb_build.walk.house import House, build_house
 from lmdb_build.walk.render import Camera, Light, Renderer
+from lmdb_build.walk.season import redecorate, weather
 from lmdb_build.walk.textures import Image
 from loopclosure.errors import InputError
 from loopclosure.places.trajectory import (
@@ -48,7 +50,8 @@ NOISE = 3.0  # standard deviation of the sensor's noise, in gray levels
 class Walk:
     """A walk: ``frames`` pictures of ``width`` x ``height`` pixels over ``laps`` laps of a house.
 
-    ``start_s`` is the time of the first picture, in seconds.
+    ``start_s`` is the time of the first picture, in seconds. Walks that differ only in ``season`` are traverses of one
+    route. With ``depth``, each picture's depth is written too.
     """
 
     frames: int = 400
@@ -58,10 +61,18 @@ class Walk:
     rooms: int = 4
     seed: int = 1
     start_s: float = 1000.0
+    season: int = 1
+    depth: bool = False
 
     def check(self) -> None:
         """Raise InputError for numbers out of range."""
-        limits = {"frames": (2, 1_000_000), "width": (32, 4096), "height": (32, 4096), "laps": (1, 1000)}
+        limits = {
+            "frames": (2, 1_000_000),
+            "width": (32, 4096),
+            "height": (32, 4096),
+            "laps": (1, 1000),
+            "season": (1, 999),
+        }
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"a walk's {name} must be {low} to {high}, not {getattr(self, name)}")
@@ -86,7 +97,7 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     if (folder / "rgb.txt").exists():
         raise InputError("holds a sequence already; give another folder or remove this one", folder)
     (folder / "rgb").mkdir(parents=True, exist_ok=True)
-    house = build_house(walk.seed, walk.rooms)
+    house = redecorate(build_house(walk.seed, walk.rooms), walk.seed, walk.season)
     carrier = _Carrier(house, walk)
     step_s = float(carrier.duration_s) / walk.frames
     times = step_s * np.arange(walk.frames, dtype=np.float64)
@@ -94,9 +105,14 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     pose_times = step_s * (np.arange(-POSES_PER_IMAGE, (walk.frames + 1) * POSES_PER_IMAGE) + 0.3) / POSES_PER_IMAGE
     poses = carrier.poses(pose_times)
     frames = [Frame(walk.start_s + time, f"rgb/{walk.start_s + time:.6f}.jpg") for time in times]
-    for frame, picture in zip(frames, _pictures(house, walk, carrier, times), strict=True):
-        path = folder / frame.path
+    depths = [Frame(frame.stamp, f"depth/{frame.stamp:.6f}.png") for frame in frames] if walk.depth else []
+    if depths:
+        (folder / "depth").mkdir(exist_ok=True)
+    for number, (picture, depth) in enumerate(_pictures(house, walk, carrier, times)):
+        path = folder / frames[number].path
         write_jpeg(path, picture)
+        if depths:
+            write_depth(folder / depths[number].path, depth)
         yield path
     camera = walk.camera
     calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "
@@ -106,34 +122,44 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     write_groundtruth(
         folder / "groundtruth.txt", Trajectory(walk.start_s + pose_times, poses.positions, poses.quaternions)
     )
+    if depths:
+        write_rgb_list(folder / "depth.txt", depths, "depth maps")
     write_rgb_list(folder / "rgb.txt", frames)  # last: it makes the sequence complete
 
 
-def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iterator[Image]:
-    rng = np.random.default_rng([walk.seed, 4])
-    noise = rng.normal(0, NOISE, (walk.height + 64, walk.width + 64, 3)).astype(np.int8)
+def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iterator[tuple[Image, NDArray[np.float32]]]:
+    """Yield each picture (H, W, 3), and its depth (H, W) in meters."""
+    rng = _generator(walk, 4)
+    outside = weather(walk.seed, walk.season)
+    noise = rng.normal(0, NOISE * outside.noise, (walk.height + 64, walk.width + 64, 3)).astype(np.int8)
     poses = carrier.poses(times)
     rotations = rotation_matrices(poses.quaternions)
     laps = np.minimum(carrier.walked_m(times) // house.way_length_m, walk.laps - 1).astype(int)
     renderer: Renderer | None = None
     for index, (position, rotation) in enumerate(zip(poses.positions, rotations, strict=True)):
         if renderer is None:
-            renderer = Renderer(house, walk.camera, lap_light(walk.seed, laps[index], walk.rooms))
+            renderer = Renderer(house, walk.camera, lap_light(walk, laps[index]))
         elif laps[index] != laps[index - 1]:
-            renderer.relight(lap_light(walk.seed, laps[index], walk.rooms))
-        picture = cv2.GaussianBlur(renderer.draw(position, rotation), (3, 3), 0.5)
+            renderer.relight(lap_light(walk, laps[index]))
+        picture = cv2.GaussianBlur(renderer.draw(position, rotation), (3, 3), outside.blur)
+        picture = cv2.convertScaleAbs(picture, alpha=1 - outside.veil, beta=128 * outside.veil)
         y, x = rng.integers(0, 64, 2)
-        yield cv2.add(picture, noise[y : y + walk.height, x : x + walk.width], dtype=cv2.CV_8U)
+        yield cv2.add(picture, noise[y : y + walk.height, x : x + walk.width], dtype=cv2.CV_8U), renderer.depth
 
 
-def lap_light(seed: int, lap: int, rooms: int) -> Light:
+def _generator(walk: Walk, *stream: int) -> np.random.Generator:
+    """Return the generator of one random quantity; season 1 draws what a walk without seasons draws."""
+    return np.random.default_rng([walk.seed, *stream, *([walk.season] if walk.season > 1 else [])])
+
+
+def lap_light(walk: Walk, lap: int) -> Light:
     """Return the light of a lap: daylight on the first, a random time of day on later ones, with some lamps on."""
-    rng = np.random.default_rng([seed, 3, lap])
-    day = 0.9 if lap == 0 else rng.uniform(0.25, 1.1)
+    rng = _generator(walk, 3, lap)
+    day = (0.9 if lap == 0 else rng.uniform(0.25, 1.1)) * weather(walk.seed, walk.season).day
     warmth = rng.uniform(-0.12, 0.12)  # blue sky or evening sun
     daylight = day * np.array([1 - warmth, 1, 1 + warmth])
-    on = rng.uniform(size=rooms) < 0.4 + 0.5 * (day < 0.6)
-    lamps = np.where(on, rng.uniform(0.5, 1.0, rooms), 0.05)[:, None] * np.array([0.78, 0.94, 1.05])
+    on = rng.uniform(size=walk.rooms) < 0.4 + 0.5 * (day < 0.6)
+    lamps = np.where(on, rng.uniform(0.5, 1.0, walk.rooms), 0.05)[:, None] * np.array([0.78, 0.94, 1.05])
     return Light(0.3 * daylight + 0.22, daylight, lamps)
 
 
@@ -146,6 +172,9 @@ class _Carrier:
         rng = np.random.default_rng([walk.seed, 5])
         self._phases = rng.uniform(0, 2 * np.pi, 6)
         self._glances = int(rng.integers(7, 12))
+        self._again = walk.season > 1
+        if self._again:
+            self._phases = _generator(walk, 5).uniform(0, 2 * np.pi, 6)
         step = np.roll(house.way, -1, axis=0) - np.roll(house.way, 1, axis=0)
         self._yaw = _smooth_angles(np.arctan2(step[:, 1], step[:, 0]), 0.35 / house.step_m)
 
@@ -162,7 +191,8 @@ class _Carrier:
         x, y = _periodic(at, self.house.way[:, 0]), _periodic(at, self.house.way[:, 1])
         # The direction of the path may make a full turn in a lap: interpolate it as a vector.
         along = np.arctan2(_periodic(at, np.sin(self._yaw)), _periodic(at, np.cos(self._yaw)))
-        later = np.clip(walked / lap_m - 0.9, 0, 0.1) / 0.1  # 0 on the first lap, 1 on the others
+        # 0 on the first lap of all, 1 on the others.
+        later = np.ones_like(walked) if self._again else np.clip(walked / lap_m - 0.9, 0, 0.1) / 0.1
         side = later * SIDE_STEP_M * _sway(walked, (7.3, 17.1), self._phases[1:3])
         turn = later * TURN_DEG * _sway(walked, (9.7, 23.9), self._phases[3:5])
         glance = GLANCE_DEG * np.sin(2 * np.pi * self._glances * walked / lap_m)

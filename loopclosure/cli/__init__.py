@@ -6,10 +6,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from loopclosure.cli import detect, evaluate, similarity
+from loopclosure.cli import close, compare, detect, evaluate, similarity
 from loopclosure.cli.run import Commands, run
 
-_COMMANDS = (evaluate, detect, similarity)
+_COMMANDS = (evaluate, compare, detect, close, similarity)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -19,7 +19,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
-    made = argparse.ArgumentParser(prog="loopclosure", description="Evaluate and detect loop closures.")
+    made = argparse.ArgumentParser(prog="loopclosure", description="Evaluate, detect and close loops.")
     commands = Commands(made)
     for command in _COMMANDS:
         command.add_to(commands)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.cli.data_set import add_selection, selection
-from loopclosure.cli.run import Commands, WrongUsage, show_progress
+from loopclosure.cli.data_set import add_selection, add_topics, selection
+from loopclosure.cli.run import Commands, WrongUsage, show_progress, warn
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -17,9 +17,9 @@ from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetect
 from loopclosure.detector.export import write_g2o, write_loops_csv
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.features import WhitenBy
-from loopclosure.places import datasets
+from loopclosure.places.bags import is_bag
+from loopclosure.places.extraction import extract
 from loopclosure.places.frames import Selection
-from loopclosure.places.truth import Exclusion
 
 # The detector's settings that --resume takes from the saved one.
 SETTINGS = (
@@ -44,8 +44,9 @@ NEEDS = {
 def add_to(commands: Commands) -> None:
     """Add the command."""
     p = commands.add("detect", _detect, "find the loops in a folder of images or a video")
-    p.add_argument("source", help="a folder or list of images, a TUM RGB-D sequence, or a video file")
+    p.add_argument("source", help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag")
     add_selection(p, "--", "")
+    add_topics(p)
     p.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv, and loops.g2o with poses, go")
     how = p.add_mutually_exclusive_group()
     how.add_argument(
@@ -86,7 +87,15 @@ def add_to(commands: Commands) -> None:
 
 def _detect(a: argparse.Namespace) -> None:
     options = _checked_options(a)
-    recording = run.open_recording(a.source, selection(a))
+    source = Path(a.source)
+    if is_bag(source):
+        source, said = extract(source, Path(a.out) / "frames", a.topic or "", a.pose_topic or "", show_progress)
+        print(said)
+    elif a.topic or a.pose_topic:
+        raise WrongUsage("--topic and --pose-topic belong to bags")
+    recording = run.open_recording(source, selection(a))
+    for doubt in recording.doubts:
+        warn(doubt)
     features = read_features(a.features) if a.features else None
     validation = read_features(a.calibrate_features) if a.calibrate_features else None
     describe = run.load_describe(a.describe, options) if features is None else None
@@ -98,7 +107,8 @@ def _detect(a: argparse.Namespace) -> None:
         validation = None if validation is None else validation.whitened(whitening)
     detector = _detector(a, describe, views)
     if a.calibrate:
-        data = _validation_set(a, detector.settings)
+        stride = Selection(stride=a.stride)  # that of the source
+        data = run.validation_set(a.calibrate, a.calibrate_truth, detector.settings, stride)
         precision = PRECISION if a.precision is None else a.precision
         print(run.calibrate_on_data_set(detector, data, precision, validation, show_progress))
     # Frames of the run that is resumed have numbers but no names here.
@@ -111,7 +121,7 @@ def _detect(a: argparse.Namespace) -> None:
     if np.isfinite(detector.poses).any():
         left_out = write_g2o(out / "loops.g2o", detector.poses, detector.loops, run.from_poses(detector))
         note = f", {left_out} loops without a pose left out" if left_out else ""
-        print(f"pose graph, its relative poses from groundtruth.txt{note}: {out / 'loops.g2o'}")
+        print(f"pose graph, its relative poses from the known poses{note}: {out / 'loops.g2o'}")
         print(run.judged_by_poses(detector))
     if a.save:
         detector.save(a.save)
@@ -149,13 +159,3 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     if a.verify:
         check = GeometricCheck() if a.min_inliers is None else GeometricCheck(min_inliers=a.min_inliers)
     return LoopDetector(describe, check=check, views=views, **_changes(a))
-
-
-def _validation_set(a: argparse.Namespace, settings: DetectorSettings) -> datasets.DataSet:
-    """Load the frames that the threshold is chosen on, with the stride of the source."""
-    chosen = Selection(stride=a.stride)
-    if a.calibrate_truth:
-        exclusion = Exclusion(settings.exclude_recent)
-        return datasets.load_folder(a.calibrate, a.calibrate_truth, None, chosen, exclusion)
-    exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
-    return datasets.load_tum(a.calibrate, chosen, exclusion)

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
-from loopclosure.errors import InputError
+from loopclosure.errors import InputError, printable
 from loopclosure.progress import Item
 
 DONE, FAULT, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130  # exit statuses
@@ -91,6 +91,11 @@ def interruptible() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def warn(doubt: str) -> None:
+    """Print a doubt about the user's files."""
+    print(printable(f"warning: {doubt}"), file=sys.stderr)
 
 
 def show_progress(items: Iterable[Item], stage: str, total: int | None = None) -> Iterable[Item]:

@@ -264,7 +264,9 @@ class LoopDetector:
             about = json.loads(str(arrays["about"]))
             if about["format"] != FORMAT:
                 raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
-            check = None if about["check"] is None else from_json(GeometricCheck, about["check"])
+            check = None
+            if about["check"] is not None:  # files from before a setting was added do not have it
+                check = from_json(GeometricCheck, {**asdict(GeometricCheck()), **about["check"]})
             detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check)
             detector._frames = _frames(arrays, detector.settings.views, check is not None)
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,11 +29,9 @@ class Sigmas:
     translation_m: float
     rotation_rad: float
 
-    def information(self) -> str:
-        """Return the upper triangle of the 6 x 6 information matrix, which is diagonal."""
-        diagonal = [self.translation_m**-2] * 3 + [self.rotation_rad**-2] * 3
-        matrix = np.diag(diagonal)
-        return " ".join(f"{matrix[i, j]:.9g}" for i in range(6) for j in range(i, 6))
+    def information(self) -> np.ndarray:
+        """Return the information matrix (6, 6), which is diagonal."""
+        return np.diag([self.translation_m**-2] * 3 + [self.rotation_rad**-2] * 3)
 
 
 ODOMETRY_SIGMAS = Sigmas(0.05, 0.02)
@@ -88,27 +86,36 @@ def write_g2o(
               since the loop is there to correct their drift.
     """
     poses = np.asarray(poses, np.float64)
-    known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))
-    if not len(known):
+    known: list[int] = np.flatnonzero(np.all(np.isfinite(poses), axis=1)).tolist()
+    if not known:
         raise InputError("no frame has a pose; a pose graph needs the poses of the frames")
-    lines = [f"VERTEX_SE3:QUAT {i} {_numbers(poses[i])}" for i in known]
-    for a, b in itertools.pairwise(known):
-        lines.append(f"EDGE_SE3:QUAT {a} {b} {_numbers(relative_pose(poses[a], poses[b]))} {odometry.information()}")
+    edges = [(a, b, relative_pose(poses[a], poses[b]), odometry.information()) for a, b in itertools.pairwise(known)]
     left_out = 0
-    with_pose = set(known.tolist())
+    with_pose = set(known)
     for loop in loops:
         assert loop.accepted is not None
         step = relative(loop.query_id, loop.accepted)
         if step is None or not {loop.query_id, loop.accepted} <= with_pose:
             left_out += 1
             continue
-        lines.append(f"EDGE_SE3:QUAT {loop.accepted} {loop.query_id} {_numbers(step)} {closure.information()}")
+        edges.append((loop.accepted, loop.query_id, step, closure.information()))
+    write_pose_graph(path, {i: poses[i] for i in known}, edges)
+    return left_out
+
+
+def write_pose_graph(
+    path: str | Path, vertices: Mapping[int, np.ndarray], edges: Iterable[tuple[int, int, np.ndarray, np.ndarray]]
+) -> None:
+    """Write vertices, number -> pose (7,), and edges: i, j, pose (7,) of j in the frame of i, information (6, 6)."""
+    lines = [f"VERTEX_SE3:QUAT {i} {_numbers(pose)}" for i, pose in vertices.items()]
+    upper = np.triu_indices(6)
+    for i, j, pose, information in edges:
+        lines.append(f"EDGE_SE3:QUAT {i} {j} {_numbers(pose)} {_numbers(information[upper])}")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as unfinished:
         unfinished.write_text("\n".join(lines) + "\n", encoding="ascii")
-    return left_out
 
 
-def _numbers(pose: np.ndarray) -> str:
-    return " ".join(f"{value:.9g}" for value in pose)
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(f"{value:.9g}" for value in values)

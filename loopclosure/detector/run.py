@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,10 +14,10 @@ import numpy as np
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.whitening import Whitening
-from loopclosure.detector.detector import Describe, LoopDetector, LoopResult
+from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetector, LoopResult
 from loopclosure.detector.export import RelativePose, relative_pose
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import DataSet
+from loopclosure.places.datasets import DataSet, load_folder, load_tum
 from loopclosure.places.frames import (
     ALL_FRAMES,
     VIDEO_SUFFIXES,
@@ -27,9 +26,10 @@ from loopclosure.places.frames import (
     video_frames,
     video_length,
 )
-from loopclosure.places.image_list import list_images
 from loopclosure.places.same_place import same_place
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Poses, associate, read_groundtruth
+from loopclosure.places.sequences import read_sequence
+from loopclosure.places.trajectory import Poses
+from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
@@ -42,6 +42,7 @@ class Recording:
     names   (N) of the frames
     stamps  (N,) seconds, None if not known
     poses   (N, 7) tx ty tz qx qy qz qw, NaN or None if not known
+    doubts  sentences about poses that look wrong
     """
 
     source: Path
@@ -50,6 +51,7 @@ class Recording:
     numbers: np.ndarray
     stamps: np.ndarray | None = None
     poses: np.ndarray | None = None
+    doubts: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -75,7 +77,7 @@ class Recording:
 
 
 def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Recording:
-    """Open a folder or list of images, a TUM RGB-D sequence (with its poses, if it has them) or a video file."""
+    """Open a folder or list of images, a sequence (TUM RGB-D, EuRoC, KITTI; with its poses) or a video file."""
     source = Path(source)
     if source.suffix.lower() in VIDEO_SUFFIXES:
         if not source.is_file():
@@ -85,20 +87,12 @@ def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Rec
             raise InputError("does not say how many frames it has; save its frames as images", source)
         numbers = selection.numbers(count)
         return Recording(source, [f"frame {number}" for number in numbers], None, numbers)
-    listed = list_images(source)
-    images = listed.paths
-    taken = selection.numbers(len(images))
-    stamps = poses = None
-    if listed.stamps is not None:
-        stamps = listed.stamps[taken]
-        if (source / "groundtruth.txt").is_file():
-            trajectory = read_groundtruth(source / "groundtruth.txt")
-            nearest = associate(stamps, trajectory, MAX_DIFFERENCE_S)
-            poses = np.hstack([trajectory.positions, trajectory.quaternions])[nearest]
-            poses[nearest < 0] = np.nan
-    images = [images[i] for i in taken]
-    root = source if source.is_dir() else source.parent
-    return Recording(source, [os.path.relpath(path, root) for path in images], images, taken, stamps, poses)
+    sequence = read_sequence(source)
+    taken = selection.numbers(len(sequence))
+    images = [sequence.images[i] for i in taken]
+    stamps, poses = (None if values is None else values[taken] for values in (sequence.stamps, sequence.poses))
+    names = [sequence.names[i] for i in taken]
+    return Recording(source, names, images, taken, stamps, poses, sequence.doubts)
 
 
 def run_detector(
@@ -125,6 +119,18 @@ def run_detector(
         else:
             results.append(detector.add_descriptor(rows[i], stamp, _pose(recording, i), image))
     return results
+
+
+def validation_set(
+    source: str | Path, truth: str | Path | None, settings: DetectorSettings, selection: Selection = ALL_FRAMES
+) -> DataSet:
+    """Load the frames that a threshold is chosen on: a TUM sequence, or a folder with the mask ``truth``.
+
+    Candidates near in time are excluded as by the detector's ``settings``.
+    """
+    if truth:
+        return load_folder(source, truth, None, selection, Exclusion(settings.exclude_recent))
+    return load_tum(source, selection, Exclusion(settings.exclude_recent, settings.exclude_seconds))
 
 
 def calibrate_on_data_set(

@@ -1,5 +1,7 @@
 """Whether two images show the same scene, by geometry: SIFT, the ratio test, RANSAC on the fundamental matrix.
 
+Where the camera is known, the essential matrix, which has fewer degrees of freedom, replaces the fundamental matrix.
+
 A flat scene, or a camera that only rotates, does not determine the fundamental matrix. Its inliers still count points
 that agree, so such pairs are accepted. A pair needs texture: two views of a bare wall fail.
 """
@@ -27,13 +29,16 @@ class LocalFeatures:
 
 @dataclass(frozen=True)
 class GeometricCheck:
-    """Decides by the number of point matches that agree with one fundamental matrix.
+    """Decides by the number of point matches that agree with one fundamental or essential matrix.
 
     max_features   how many of the strongest SIFT points are kept per image; 500 need 66 kB of memory per frame
     ratio          a match must be nearer than ``ratio`` times the second nearest (Lowe's test)
     max_error_px   distance of an inlier from its epipolar line, in pixels
     confidence     of RANSAC
     min_inliers    the least number of inliers of a loop
+    focal_px       focal length in pixels of the images as they are; 0: not known, a fundamental matrix is used
+    center_x_px    principal point, with focal_px
+    center_y_px
     """
 
     max_features: int = 500
@@ -41,6 +46,9 @@ class GeometricCheck:
     max_error_px: float = 2.0
     confidence: float = 0.985
     min_inliers: int = 20
+    focal_px: float = 0.0
+    center_x_px: float = 0.0
+    center_y_px: float = 0.0
 
     def describe(self, image: np.ndarray) -> LocalFeatures:
         """Find the points of an image (H, W) or (H, W, 3) uint8; there may be none."""
@@ -66,12 +74,16 @@ class GeometricCheck:
         return np.array(sorted((i, j) for j, i in point_of_a.items()), np.int64).reshape(-1, 2)
 
     def inliers(self, a: LocalFeatures, b: LocalFeatures) -> int:
-        """Count the matches that agree with one fundamental matrix; 0 if there are too few."""
+        """Count the matches that agree with one fundamental or essential matrix; 0 if there are too few."""
         matches = self.matches(a, b)
         if len(matches) < LEAST_MATCHES:
             return 0
         points = a.points[matches[:, 0]], b.points[matches[:, 1]]
-        _, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, self.max_error_px, self.confidence)
+        if self.focal_px:
+            camera = np.array([[self.focal_px, 0, self.center_x_px], [0, self.focal_px, self.center_y_px], [0, 0, 1]])
+            _, mask = cv2.findEssentialMat(*points, camera, cv2.RANSAC, self.confidence, self.max_error_px)
+        else:
+            _, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, self.max_error_px, self.confidence)
         return 0 if mask is None else int(np.count_nonzero(mask))
 
     def accepts(self, inliers: int) -> bool:
@@ -83,4 +95,10 @@ class GeometricCheck:
             raise InputError(
                 f"geometric check: {self.max_features} features, {self.min_inliers} inliers, ratio {self.ratio:g}; "
                 f"expected at least {LEAST_MATCHES} of both and a ratio in 0..1"
+            )
+        camera = (self.focal_px, self.center_x_px, self.center_y_px)
+        if min(camera) < 0 or (any(camera) and not all(camera)):
+            raise InputError(
+                "geometric check: a known camera needs focal_px, center_x_px and center_y_px, all above 0; "
+                f"got {', '.join(f'{value:g}' for value in camera)}"
             )

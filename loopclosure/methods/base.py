@@ -7,6 +7,7 @@ A method gets the images of the queries and of the references and returns one ma
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,16 +79,23 @@ class MethodContext:
     seed: int = 0
 
 
-# name -> "module:factory", a Factory. On the command line a method is written name, name:argument, or
-# name+inner[:argument], where inner is a method again, whose scores the first one refines:
-# seqslam+features:siamese.npz:cosine.
+# name -> "module:factory", a Factory. On the command line a method is written name[:argument], and one that refines the
+# scores of another name[:argument]+METHOD, where METHOD may refine a third one:
+# verified:k=20+seqslam+features:siamese.npz:cosine.
 METHODS: dict[str, str] = {
     "fabmap": "loopclosure.methods.baselines:fabmap",
     "bow": "loopclosure.methods.baselines:bag_of_words",
+    "vlad": "loopclosure.methods.references:vlad_method",
+    "hog": "loopclosure.methods.references:hog",
+    "cohog": "loopclosure.methods.references:cohog",
     "thumbnails": "loopclosure.methods.baselines:thumbnails",
     "seqslam": "loopclosure.methods.seqslam:seqslam",
     "features": "loopclosure.methods.features:features",
+    "describe": "loopclosure.methods.described:described",
+    "verified": "loopclosure.methods.verified:verified",
+    "detector": "loopclosure.methods.online:online",
 }
+REFINERS = ("seqslam", "verified")
 
 # The argument after the colon, the context, the inner method.
 Factory = Callable[[str, MethodContext, "Method | None"], Method]
@@ -96,16 +104,27 @@ Factory = Callable[[str, MethodContext, "Method | None"], Method]
 def make_method(spec: str, context: MethodContext | None = None) -> Method:
     """Build the method that a specification such as ``seqslam+features:siamese.npz`` names."""
     context = context or MethodContext()
-    head, _, argument = spec.partition(":")
-    name, plus, inner_name = head.partition("+")
+    name = re.split("[:+]", spec, maxsplit=1)[0]
     if name not in METHODS:
         raise InputError(f'unknown method "{name}" in "{spec}"; known: {", ".join(METHODS)}')
-    inner = make_method(spec[len(name) + 1 :], context) if plus else None
-    if inner_name:
-        argument = ""
+    argument, inner = spec[len(name) :], None
+    if name in REFINERS or argument.startswith("+"):
+        argument, plus, inner_spec = argument.partition("+")
+        inner = make_method(inner_spec, context) if plus else None
     module_name, _, factory_name = METHODS[name].partition(":")
     factory: Any = getattr(importlib.import_module(module_name), factory_name)
-    return factory(argument, context, inner)
+    return factory(argument.removeprefix(":"), context, inner)
+
+
+def earlier(frames: int, exclude: int) -> np.ndarray:
+    """Return which pairs (query, reference) of one sequence can be loops: reference < query - exclude, (n, n) bool."""
+    return np.tri(frames, frames, -1 - exclude, dtype=bool)
+
+
+def refuse_inner(method: str, inner: Method | None) -> None:
+    """Raise InputError if a method that works on images is given another method to refine."""
+    if inner is not None:
+        raise InputError(f"{method}+{inner.name}: {method} works on images, not on the scores of another method")
 
 
 def refuse_overlap(train_images: list[Path], test_images: list[Path], model: str | Path = "") -> None:

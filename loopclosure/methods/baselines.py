@@ -14,7 +14,7 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer, differences
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_overlap
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_inner, refuse_overlap
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
@@ -170,9 +170,3 @@ def thumbnails(argument: str, context: MethodContext, inner: Method | None) -> T
     refuse_inner("thumbnails", inner)
     method, thumbnailer = configure("thumbnails", argument, ThumbnailMethod(), Thumbnailer())
     return replace(method, thumbnailer=thumbnailer)
-
-
-def refuse_inner(method: str, inner: Method | None) -> None:
-    """Raise InputError if a method that works on images is given another method to refine."""
-    if inner is not None:
-        raise InputError(f"{method}+{inner.name}: {method} works on images, not on the scores of another method")

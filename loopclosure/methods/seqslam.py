@@ -14,7 +14,7 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, MethodResult
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
 from loopclosure.methods.baselines import ThumbnailMethod
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
@@ -22,6 +22,7 @@ from loopclosure.progress import Progress, timed
 DIRECTIONS = ("forward", "both")
 ANCHORS = ("center", "start")
 EDGES = ("shorten", "drop")
+STANDARDIZE = ("no", "yes", "traverses")
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,24 @@ def enhance_contrast(distances: np.ndarray, window: int = 10, valid: np.ndarray 
     return enhanced - np.nanmin(enhanced)
 
 
+def standardize(distances: np.ndarray) -> np.ndarray:
+    """Give each row, then each column of distances (Q, R) mean 0 and deviation 1 over what is not NaN.
+
+    A query that is unlike all references, and a reference that is like all queries, then count as any other: what
+    another season does to descriptors.
+    """
+    for axis in (1, 0):
+        known = np.isfinite(distances)
+        count = np.maximum(known.sum(axis=axis, keepdims=True), 1)
+        mean = np.where(known, distances, 0).sum(axis=axis, keepdims=True) / count
+        centered = np.where(known, distances - mean, 0)
+        deviation = np.sqrt(np.square(centered).sum(axis=axis, keepdims=True) / count)
+        differ = deviation > 1e-12 * np.abs(mean)  # rounding, see enhance_contrast
+        scaled = np.divide(centered, deviation, out=np.zeros_like(centered), where=differ)
+        distances = np.where(known, scaled, np.nan)
+    return distances
+
+
 def _neighbors(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
     """Return, for each shift up to ``reach``, the columns that have such a neighbor, and their neighbors."""
     shifts = range(-min(reach, size - 1), min(reach, size - 1) + 1)
@@ -161,11 +180,6 @@ def least_cost_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray,
     return np.where(np.isfinite(least), match, -1), ratio
 
 
-def earlier(frames: int, exclude: int) -> np.ndarray:
-    """Return which pairs (query, reference) of one sequence can be loops: reference < query - exclude, (n, n) bool."""
-    return np.tri(frames, frames, -1 - exclude, dtype=bool)
-
-
 @dataclass
 class SeqSlam:
     """SeqSLAM on the scores of another method, its own thumbnails by default.
@@ -173,6 +187,8 @@ class SeqSlam:
     scored          "cost": minus the cost of the best trajectory of each pair; "uniqueness": only each query's best
                     match gets a score, 1 - its ratio to the next best (see :func:`least_cost_matches`)
     match_window    of the uniqueness
+    standardize     rows and columns of the distances before sequences are searched: "no", "yes", or "traverses": only
+                    for two traverses, in which every query has a match. In one sequence most queries have none
     exclude_frames  in one sequence, references within this many frames of the query are not candidates
     """
 
@@ -180,12 +196,15 @@ class SeqSlam:
     settings: SequenceSettings = field(default_factory=SequenceSettings)
     scored: str = "cost"
     match_window: int = 10
+    standardize: str = "no"
     exclude_frames: int = 0
     name: str = "seqslam"
 
     def __post_init__(self) -> None:
         if self.scored not in ("cost", "uniqueness"):
             raise InputError(f'SeqSLAM\'s score is "cost" or "uniqueness", not "{self.scored}"')
+        if self.standardize not in STANDARDIZE:
+            raise InputError(f'standardize of SeqSLAM is "{self.standardize}"; expected {", ".join(STANDARDIZE)}')
 
     def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
@@ -196,13 +215,17 @@ class SeqSlam:
             if images.references is None:
                 valid &= earlier(len(images.queries), self.exclude_frames)
             distances = np.where(valid, -found.scores, np.nan)
+            scaled = self.standardize == "yes" or (self.standardize == "traverses" and images.references is not None)
+            if scaled:
+                distances = standardize(distances)
             if self.settings.contrast:
                 distances = enhance_contrast(distances, self.settings.contrast, valid)
             elif self.scored == "uniqueness":  # a ratio needs costs >= 0, and log-odds have no bound
                 distances -= distances.min(where=valid, initial=0.0)
             costs = np.where(valid, trajectory_costs(distances, self.settings), np.nan)
             scores = -costs if self.scored == "cost" else self._unique(costs)
-        notes = [*found.notes, f"SeqSLAM, score: {self.scored}; {self.settings}"]
+        scaling = "rows and columns of distances standardized; " if scaled else ""
+        notes = [*found.notes, f"SeqSLAM, score: {self.scored}; {scaling}{self.settings}"]
         return MethodResult(scores, seconds, notes, found.training_stages)
 
     def _unique(self, costs: np.ndarray) -> np.ndarray:
@@ -214,12 +237,17 @@ class SeqSlam:
 
 
 def seqslam(argument: str, context: MethodContext, inner: Method | None) -> SeqSlam:
-    """Build ``seqslam[:setting=value,...]`` on SeqSLAM's thumbnails, or ``seqslam+METHOD`` on another method's scores.
+    """Build ``seqslam[:setting=value,...]`` on SeqSLAM's thumbnails, or ``seqslam[:...]+METHOD`` on another method's.
 
-    The second is without contrast enhancement, which helps because differences of thumbnails mean little by themselves.
-    The scores of a descriptor are comparable from query to query, and it would undo that.
+    Local contrast is SeqSLAM's own for its differences of thumbnails. For another method's scores the default is to
+    standardize rows and columns, of two traverses, instead: better in another season on every sequence that it was
+    chosen on (methods.md), and no change in one sequence, where either takes from good descriptors more than it gives.
     """
     own = Thumbnailer(width=64, height=32, normalize="patch", patch=8)
+    if inner is not None:
+        refined = SeqSlam(inner, standardize="traverses", exclude_frames=context.exclude_frames)
+        method, settings = configure("seqslam", argument, refined, SequenceSettings(contrast=0))
+        return replace(method, settings=settings, name=f"seqslam+{inner.name}")
     method, settings, thumbnailer = configure(
         "seqslam",
         argument,
@@ -227,6 +255,4 @@ def seqslam(argument: str, context: MethodContext, inner: Method | None) -> SeqS
         SequenceSettings(),
         own,
     )
-    if inner is not None:
-        return replace(method, settings=replace(settings, contrast=0), inner=inner, name=f"seqslam+{inner.name}")
     return replace(method, settings=settings, inner=ThumbnailMethod(thumbnailer))

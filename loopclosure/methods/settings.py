@@ -10,8 +10,8 @@ from loopclosure.errors import InputError
 YES_NO = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 # Not settable: the name is the method's, the seed is that of the whole evaluation.
 FIXED = ("name", "seed")
-# British spellings of settings, still accepted.
-BRITISH = {"normalise": "normalize"}
+# Other names of settings: a British spelling, and a shorter word.
+ALIASES = {"normalise": "normalize", "inliers": "min_inliers"}
 
 
 def configure(method: str, argument: str, *parts: Any) -> list[Any]:
@@ -20,16 +20,15 @@ def configure(method: str, argument: str, *parts: Any) -> list[Any]:
     A setting goes to the first part that has a field of its name; the type of its default is the type of the value.
     Raises InputError for a setting that no part has, and for a value of another type.
     """
-    changed = list(parts)
+    changes: list[dict[str, Any]] = [{} for _ in parts]
     known = {f.name: i for i, part in reversed(list(enumerate(parts))) for f in fields(part) if _settable(part, f.name)}
     for item in filter(None, (text.strip() for text in argument.split(","))):
         key, equals, value = (text.strip() for text in item.partition("="))
-        key = BRITISH.get(key, key)
+        key = ALIASES.get(key, key)
         if not equals or key not in known:
             raise InputError(f'{method} has no setting "{item}"; write setting=value with {", ".join(sorted(known))}')
-        part = changed[known[key]]
-        changed[known[key]] = replace(part, **{key: _read(method, key, value, getattr(part, key))})
-    return changed
+        changes[known[key]][key] = _read(method, key, value, getattr(parts[known[key]], key))
+    return [replace(part, **changed) for part, changed in zip(parts, changes, strict=True)]
 
 
 def _settable(part: Any, name: str) -> bool:

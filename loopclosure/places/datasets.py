@@ -1,9 +1,9 @@
-"""Sets of frames with their truth: TUM RGB-D, FAB-MAP, a folder with a mask, two traverses, pairs of places."""
+"""Sets of frames with their truth: sequences with poses, FAB-MAP, a folder with a mask, traverses, pairs of places."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -12,9 +12,11 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.cameras import comparable, images_of_places, mask_of_places
 from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_bgr
-from loopclosure.places.masks import read_coordinates, read_place_pairs, read_truth_matrix
+from loopclosure.places.masks import read_coordinates, read_matches, read_place_pairs, read_truth_matrix
+from loopclosure.places.overlap import ViewOverlap, Views, overlap_matrix, views
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, read_tum_sequence
+from loopclosure.places.sequences import ImageSequence, posed, read_sequence
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
 from loopclosure.whole_file import whole_file
 
@@ -37,6 +39,8 @@ class DataSet:
     stamps               (Q,) seconds, if known
     positions            (Q, 3) meters or (Q, 2), if known: for the map
     quaternions          (Q, 4) xyzw, if known
+    overlap              (Q, R) bool: views that overlap as far as poses and depth tell; None without poses
+    overlap_rule         text: when they overlap
     notes                what a reader of the results should know: what was left out, what looks odd
     """
 
@@ -48,6 +52,8 @@ class DataSet:
     stamps: np.ndarray | None = None
     positions: np.ndarray | None = None
     quaternions: np.ndarray | None = None
+    overlap: np.ndarray | None = None
+    overlap_rule: str = ""
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -55,41 +61,117 @@ class DataSet:
         """Return the reference images: the queries themselves in one sequence."""
         return self.query_images if self.reference_images is None else self.reference_images
 
+    @property
+    def soft_truth(self) -> Truth | None:
+        """The truth by which a match of overlapping views is no mistake; None where the overlap is not known."""
+        if self.overlap is None:
+            return None
+        description = f"{self.truth.description}; no mistake where views overlap: {self.overlap_rule}"
+        return replace(self.truth, soft=self.truth.soft | self.overlap, description=description)
+
 
 def load_tum(
     folder: str | Path,
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion = TUM_EXCLUSION,
     *,
-    max_distance_m: float = MAX_DISTANCE_M,
-    max_angle_deg: float = MAX_ANGLE_DEG,
+    max_difference_s: float = MAX_DIFFERENCE_S,
+    references: str | Path | None = None,
+    view_overlap: ViewOverlap | None = None,
+    **limits: float | None,
+) -> DataSet:
+    """Load a TUM RGB-D sequence; ``limits`` and the others are those of :func:`load_sequence`."""
+    sequence = read_sequence(folder, "tum", max_difference_s)
+    others = None if references is None else read_sequence(references, "tum", max_difference_s)
+    return load_sequence(sequence, selection, exclusion, references=others, view_overlap=view_overlap, **limits)
+
+
+def load_sequence(
+    sequence: ImageSequence,
+    selection: Selection = ALL_FRAMES,
+    exclusion: Exclusion | None = None,
+    *,
+    max_distance_m: float | None = None,
+    max_angle_deg: float | None = None,
     soft_distance_m: float | None = None,
     soft_angle_deg: float | None = None,
-    max_difference_s: float = MAX_DIFFERENCE_S,
+    references: ImageSequence | None = None,
+    view_overlap: ViewOverlap | None = None,
 ) -> DataSet:
-    """Load a TUM RGB-D sequence; truth by the paper's rule from its poses, with wider limits for soft truth, if given.
+    """Make a data set of a sequence with poses; truth by the paper's rule, with wider limits for soft truth, if given.
 
-    Frames without a pose within ``max_difference_s`` are left out before ``selection`` counts.
+    Frames without a pose are left out before ``selection`` counts. Without an ``exclusion``, pairs less than 10 s apart
+    are excluded; 10 frames where the frames have no time.
+
+    references    another sequence, with poses in the same frame of reference: each query against all its frames;
+                  ``selection`` applies to the queries only, and no pair is excluded
+    view_overlap  which other views are no mistake in the soft zone
     """
-    sequence = read_tum_sequence(folder, max_difference_s)
-    taken = selection.numbers(len(sequence))
-    images = _existing([Path(folder) / sequence.frames[i].path for i in taken])
-    poses, stamps = sequence.poses[taken], sequence.stamps[taken]
-    hard = same_place_matrix(poses, poses, max_distance_m, max_angle_deg)
-    rule = f"same place: nearer than {max_distance_m:g} m and turned less than {max_angle_deg:g} degrees"
-    soft = None
+    hard_m = MAX_DISTANCE_M if max_distance_m is None else max_distance_m
+    hard_deg = MAX_ANGLE_DEG if max_angle_deg is None else max_angle_deg
+    rule = f"same place: nearer than {hard_m:g} m and turned less than {hard_deg:g} degrees"
+    wide = None
     if soft_distance_m is not None or soft_angle_deg is not None:
-        wide_m = max_distance_m if soft_distance_m is None else soft_distance_m
-        wide_deg = max_angle_deg if soft_angle_deg is None else soft_angle_deg
-        if wide_m < max_distance_m or wide_deg < max_angle_deg:
+        wide_m = hard_m if soft_distance_m is None else soft_distance_m
+        wide_deg = hard_deg if soft_angle_deg is None else soft_angle_deg
+        if wide_m < hard_m or wide_deg < hard_deg:
             raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({rule})")
-        soft = same_place_matrix(poses, poses, wide_m, wide_deg)
+        wide = (wide_m, wide_deg)
         rule += f" (soft: {wide_m:g} m, {wide_deg:g} degrees)"
-    notes = [f"frames without a pose, left out: {sequence.dropped}"] if sequence.dropped else []
-    truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
-    name = f"{sequence.name}{_selection_text(selection)}"
-    frames = _excluded_frames(exclusion, stamps)
-    return _checked(DataSet(name, images, None, truth, frames, stamps, poses.positions, poses.quaternions, notes), hard)
+    queries = _posed_images(sequence, selection)
+    others = queries if references is None else _posed_images(references, ALL_FRAMES)
+    poses, stamps = queries.views.poses, queries.stamps
+    hard = same_place_matrix(poses, others.views.poses, hard_m, hard_deg)
+    soft = None if wide is None else same_place_matrix(poses, others.views.poses, *wide)
+    overlap_rule = (view_overlap or ViewOverlap()).of_camera(sequence.camera)
+    height, width = read_bgr(queries.images[0]).shape[:2]
+    overlap = overlap_matrix(queries.views, others.views, overlap_rule, height / width)
+    measured = bool(queries.views.measured.any() or others.views.measured.any())
+    if references is None:
+        exclusion = exclusion or (FOLDER_EXCLUSION if stamps is None else TUM_EXCLUSION)
+        truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
+        frames = exclusion.frames if stamps is None else _excluded_frames(exclusion, stamps)
+    else:
+        truth = traverse_truth(hard, rule, soft=soft)
+        frames = 0
+    data = DataSet(
+        name=f"{queries.name}{_selection_text(selection)}{'' if references is None else f' in {others.name}'}",
+        query_images=queries.images,
+        reference_images=None if references is None else others.images,
+        truth=truth,
+        exclude_frames=frames,
+        stamps=stamps,
+        positions=poses.positions,
+        quaternions=poses.quaternions,
+        overlap=overlap,
+        overlap_rule=overlap_rule.describe(measured),
+        notes=[*queries.notes, *(() if references is None else (f"{others.name}: {note}" for note in others.notes))],
+    )
+    return _checked(data, hard)
+
+
+@dataclass(frozen=True)
+class _PosedImages:
+    """The selected frames of a sequence that have a pose: N paths, stamps (N,) or None, views, and notes."""
+
+    name: str
+    images: list[Path]
+    stamps: np.ndarray | None
+    views: Views
+    notes: list[str]
+
+
+def _posed_images(sequence: ImageSequence, selection: Selection) -> _PosedImages:
+    with_pose = posed(sequence)
+    taken = selection.numbers(len(with_pose))
+    images = _existing([sequence.folder / with_pose.frames[i].path for i in taken])
+    assert sequence.poses is not None, "posed refuses it"
+    numbers = np.flatnonzero(np.all(np.isfinite(sequence.poses), axis=1))[taken]
+    depths = [] if sequence.depths is None else [sequence.depths[i] for i in numbers]
+    stamps = None if sequence.stamps is None else with_pose.stamps[taken]
+    notes = [f"frames without a pose, left out: {with_pose.dropped}"] if with_pose.dropped else []
+    notes += with_pose.doubts
+    return _PosedImages(sequence.name, images, stamps, views(with_pose.poses[taken], depths), notes)
 
 
 def load_fabmap(
@@ -132,7 +214,7 @@ def load_fabmap(
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
     views = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
     name = f"{folder.resolve().name}, {views}{_selection_text(selection)}"
-    data = DataSet(name, query_images, None, truth, exclusion.frames, None, positions, None, notes)
+    data = DataSet(name, query_images, None, truth, exclusion.frames, positions=positions, notes=notes)
     return _checked(data, hard & judged)
 
 
@@ -148,21 +230,11 @@ def load_folder(
     With references, ``selection`` applies to the queries only, and no pair is excluded.
     """
     queries = image_paths(images)
+    if references is not None:
+        return load_traverses(images, references, selection=selection, truth_file=truth_file)
     hard, soft = read_truth_matrix(truth_file)
     name = f"{_folder_name(images)}{_selection_text(selection)}"
     rule = f"same place: as {Path(truth_file).name} says"
-    if references is not None:
-        reference_images = image_paths(references)
-        if hard.shape != (len(queries), len(reference_images)):
-            turned = hard.shape == (len(reference_images), len(queries))
-            raise InputError(
-                f"is {hard.shape[0]} x {hard.shape[1]}, but there are {len(queries)} queries and "
-                f"{len(reference_images)} references{'; transpose it' if turned else ''}",
-                truth_file,
-            )
-        taken = selection.numbers(len(queries))
-        truth = traverse_truth(hard[taken], rule, soft=soft[taken])
-        return _checked(DataSet(name, [queries[i] for i in taken], reference_images, truth), truth.hard)
     hard, soft, notes = _fold(Path(truth_file), hard, soft)
     if len(hard) != len(queries):
         raise InputError(f"is {len(hard)} x {len(hard)}, but there are {len(queries)} images in {images}", truth_file)
@@ -179,13 +251,24 @@ def load_traverses(
     tolerance: int = 0,
     soft_tolerance: int | None = None,
     selection: Selection = ALL_FRAMES,
+    truth_file: str | Path | None = None,
 ) -> DataSet:
-    """Load two traverses of one route whose frames of equal number show the same place, as in Nordland.
+    """Load two traverses of one route.
 
-    ``tolerance``: frames i and j are the same place if |i - j| <= tolerance (counted before ``selection``, which takes
-    the same frames of both); ``soft_tolerance`` is the wider one of soft truth.
+    Without a file of truth, frames of equal number show the same place, as in Nordland. ``tolerance``: frames i and j
+    are the same place if |i - j| <= tolerance (counted before ``selection``, which takes the same frames of both);
+    ``soft_tolerance`` is the wider one of soft truth. With a file (a mask, or the lists of VPR benchmarks: see
+    :func:`loopclosure.places.masks.read_matches`), ``selection`` takes queries.
     """
     query_images, reference_images = image_paths(queries), image_paths(references)
+    name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_text(selection)}"
+    if truth_file is not None:
+        if tolerance or soft_tolerance is not None:
+            raise InputError("a tolerance means nothing where a file says which frames show the same place", truth_file)
+        hard, soft = read_matches(truth_file, len(query_images), len(reference_images))
+        taken = selection.numbers(len(query_images))
+        truth = traverse_truth(hard[taken], f"same place: as {Path(truth_file).name} says", soft=soft[taken])
+        return _checked(DataSet(name, [query_images[i] for i in taken], reference_images, truth), truth.hard)
     if len(query_images) != len(reference_images):
         raise InputError(
             f"{len(query_images)} queries in {queries}, {len(reference_images)} references in {references}; "
@@ -198,7 +281,6 @@ def load_traverses(
     rule = f"same place: at most {tolerance} frames apart" if tolerance else "same place: the frame of the same number"
     soft = None if soft_tolerance is None else apart <= soft_tolerance
     truth = traverse_truth(apart <= tolerance, rule, soft=soft)
-    name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_text(selection)}"
     return DataSet(name, [query_images[i] for i in taken], [reference_images[i] for i in taken], truth)
 
 
@@ -275,7 +357,7 @@ def _folder_name(source: str | Path) -> str:
 def _existing(images: list[Path]) -> list[Path]:
     for path in images:
         if not path.is_file():
-            raise InputError("no such image, though rgb.txt lists it", path)
+            raise InputError("no such image, though the sequence lists it", path)
     return images
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from loopclosure.arrays import read_npy
+from loopclosure.arrays import read_lists, read_npy
 from loopclosure.errors import InputError
 from loopclosure.places.mat_file import read_mat
 
@@ -37,6 +37,42 @@ def read_truth_matrix(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             f"its largest entry is {largest:g}; expected 1 or 255 for the same place, 0 for another place", path
         )
     return values == largest, values > 0
+
+
+def read_matches(path: str | Path, queries: int, references: int) -> tuple[np.ndarray, np.ndarray]:
+    """Read which references (R) show each query (Q): (hard, soft), both (Q, R) bool.
+
+    A mask, as :func:`read_truth_matrix` reads it, or an .npy file as VPR benchmarks ship it: rows of a query's number
+    and the numbers of its references (VPR-Bench, ``ground_truth_new.npy``), or for each query such a list. Numbers
+    count from 0. Raises InputError for other files, and for numbers of images that are not there.
+    """
+    path = Path(path)
+    lists = read_lists(path) if path.suffix.lower() == ".npy" else None
+    if lists is None:
+        hard, soft = read_truth_matrix(path)
+        if hard.shape != (queries, references):
+            turned = hard.shape == (references, queries)
+            raise InputError(
+                f"is {hard.shape[0]} x {hard.shape[1]}, but there are {queries} queries and {references} references"
+                f"{'; transpose it' if turned else ''}",
+                path,
+            )
+        return hard, soft
+    numbered = lists and all(len(row) == 2 and isinstance(row[0], int) and not isinstance(row[1], int) for row in lists)
+    rows = [(row[0], row[1]) for row in lists] if numbered else list(enumerate(lists))
+    hard = np.zeros((queries, references), bool)
+    for query, found in rows:
+        for reference in [found] if isinstance(found, int) else found:
+            if not isinstance(reference, int):
+                raise InputError(f"query {query} has {reference!r:.40} for a reference; expected its number", path)
+            if not (0 <= query < queries and 0 <= reference < references):
+                raise InputError(
+                    f"names query {query} and reference {reference}; there are {queries} queries and {references} "
+                    "references, counted from 0",
+                    path,
+                )
+            hard[query, reference] = True
+    return hard, hard
 
 
 def read_coordinates(path: str | Path) -> np.ndarray:

@@ -86,7 +86,8 @@ class PosedSequence:
     """The N frames of a sequence that have a pose, in order of time.
 
     ``stamps`` (N,) in seconds are the frames' own; ``positions`` (N, 3) in meters and ``quaternions`` (N, 4) xyzw are
-    those of the nearest pose in time. ``dropped`` counts the frames left out because no pose is near enough.
+    those of the nearest pose in time. ``dropped`` counts the frames left out because no pose is near enough;
+    ``doubts`` are sentences about poses that look wrong.
     """
 
     name: str
@@ -95,6 +96,7 @@ class PosedSequence:
     positions: NDArray[np.float64]
     quaternions: NDArray[np.float64]
     dropped: int
+    doubts: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -108,16 +110,17 @@ class PosedSequence:
 def read_rgb_list(path: str | os.PathLike[str]) -> list[Frame]:
     """Read ``rgb.txt``: the frames in order of time. Raises InputError (file:line:column) for a broken line."""
     frames = []
-    for number, line in _content_lines(path, 'a list of images, "timestamp filename" per line (TUM RGB-D: rgb.txt)'):
+    expected = 'a list of images, "timestamp filename" per line (TUM RGB-D: rgb.txt)'
+    for line_number, line in content_lines(path, expected):
         fields = list(re.finditer(r"\S+", line))
         if len(fields) != 2:
             raise InputError(
                 f'expected "timestamp filename", found {len(fields)} field{"s"[len(fields) == 1 :]}: "{line.strip()}"',
                 path,
-                number,
+                line_number,
                 _column_of_count_fault(line, fields, 2),
             )
-        frames.append(Frame(_number(fields[0], "the timestamp in seconds", path, number), fields[1].group()))
+        frames.append(Frame(number(fields[0], "the timestamp in seconds", path, line_number), fields[1].group()))
     if not frames:
         raise InputError("lists no images", path)
     return sorted(frames, key=lambda frame: frame.stamp)
@@ -130,20 +133,20 @@ def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
     """
     names = "timestamp tx ty tz qx qy qz qw"
     rows = []
-    for number, line in _content_lines(path, f'a trajectory, "{names}" per line (TUM RGB-D: groundtruth.txt)'):
+    for line_number, line in content_lines(path, f'a trajectory, "{names}" per line (TUM RGB-D: groundtruth.txt)'):
         fields = list(re.finditer(r"\S+", line))
         if len(fields) != 8:
             raise InputError(
                 f'expected the eight numbers "{names}", found {len(fields)}: "{line.strip()}"',
                 path,
-                number,
+                line_number,
                 _column_of_count_fault(line, fields, 8),
             )
-        row = [_number(field, name, path, number) for field, name in zip(fields, names.split(), strict=True)]
+        row = [number(field, name, path, line_number) for field, name in zip(fields, names.split(), strict=True)]
         norm = math.hypot(*row[4:])
         if abs(norm - 1) > NORM_TOLERANCE:
             raise InputError(
-                f"qx qy qz qw have length {norm:.4g}, a rotation has length 1", path, number, fields[4].start() + 1
+                f"qx qy qz qw have length {norm:.4g}, a rotation has length 1", path, line_number, fields[4].start() + 1
             )
         rows.append(row)
     if not rows:
@@ -154,18 +157,23 @@ def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
     return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), quaternions)
 
 
-def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame]) -> None:
-    """Write ``rgb.txt`` with TUM's three comment lines; stamps with microseconds."""
-    lines = ["# color images", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
+def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame], what: str = "color images") -> None:
+    """Write ``rgb.txt`` or ``depth.txt`` with TUM's three comment lines; stamps with microseconds."""
+    lines = [f"# {what}", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
     lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
     with whole_file(Path(path)) as unfinished:
         unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write ``groundtruth.txt`` with TUM's three comment lines; meters and quaternions with six decimals."""
+    """Write ``groundtruth.txt`` as :func:`write_trajectory` does."""
+    write_trajectory(path, trajectory, "ground truth")
+
+
+def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what: str) -> None:
+    """Write poses in TUM's form with its three comment lines; meters and quaternions with six decimals."""
     lines = [
-        "# ground truth trajectory",
+        f"# {what} trajectory",
         f"# file: '{Path(path).parent.name}'",
         "# timestamp tx ty tz qx qy qz qw",
     ]
@@ -191,35 +199,6 @@ def associate(
     return np.where(np.abs(stamps[nearest] - frame_stamps) <= max_difference, nearest, -1)
 
 
-def read_tum_sequence(folder: str | os.PathLike[str], max_difference: float = MAX_DIFFERENCE_S) -> PosedSequence:
-    """Read a folder in TUM RGB-D layout; frames without a pose within ``max_difference`` s are counted and left out.
-
-    Raises InputError if a file is missing or broken, or if no frame has a pose.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError("no such folder; expected a TUM RGB-D sequence with rgb.txt and groundtruth.txt", folder)
-    frames = read_rgb_list(folder / "rgb.txt")
-    trajectory = read_groundtruth(folder / "groundtruth.txt")
-    stamps = np.array([frame.stamp for frame in frames])
-    nearest = associate(stamps, trajectory, max_difference)
-    posed = nearest >= 0
-    if not posed.any():
-        raise InputError(
-            f"none of its {len(frames)} images has a pose within {max_difference:g} s: images from {stamps[0]:.3f} to "
-            f"{stamps[-1]:.3f} s, poses from {trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s",
-            folder,
-        )
-    return PosedSequence(
-        name=folder.resolve().name,
-        frames=tuple(frame for frame, kept in zip(frames, posed, strict=True) if kept),
-        stamps=stamps[posed],
-        positions=trajectory.positions[nearest[posed]],
-        quaternions=trajectory.quaternions[nearest[posed]],
-        dropped=int((~posed).sum()),
-    )
-
-
 def rotation_matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Camera-to-world matrices (N, 3, 3) of unit quaternions (N, 4) xyzw; their columns are the camera's axes."""
     return Rotation.from_quat(quaternions).as_matrix()
@@ -230,7 +209,7 @@ def quaternions_from_matrices(matrices: NDArray[np.float64]) -> NDArray[np.float
     return Rotation.from_matrix(matrices).as_quat(canonical=True)
 
 
-def _content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple[int, str]]:
+def content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple[int, str]]:
     """Yield the lines that are not empty and not a comment, with their numbers from 1."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
@@ -243,7 +222,8 @@ def _content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tupl
             yield number, line
 
 
-def _number(field: re.Match[str], name: str, path: str | os.PathLike[str], line: int) -> float:
+def number(field: re.Match[str], name: str, path: str | os.PathLike[str], line: int) -> float:
+    """Return a matched field as a finite number; InputError (file:line:column), which calls it ``name``, otherwise."""
     try:
         value = float(field.group())
     except ValueError:

@@ -11,9 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
-from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, PrecisionRecall
+from loopclosure.evaluate import RECALL_AT, SOFT_ZONE, Evaluation, Outcome
+from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, BestMatches, PrecisionRecall
 from loopclosure.whole_file import whole_file
+
+# A curve in report.json has at most so many points; curve_*.csv has them all.
+POINTS = 400
+# What tables say of the soft zone.
+SOFT_MEASURES = ("average precision", "recall at 100 % precision")
 
 EXPLANATION = {
     ALL_PAIRS: "every judged pair of frames is a sample",
@@ -36,10 +41,11 @@ def write_files(evaluation: Evaluation, folder: Path, command: str = "") -> None
 
 def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
     """Return the whole evaluation as JSON values; an undefined measure is null."""
-    data, truth = evaluation.data, evaluation.data.truth
+    data, truth, soft = evaluation.data, evaluation.data.truth, evaluation.data.soft_truth
     return {
         "data_set": data.name,
         "truth_and_exclusion": truth.description,
+        "soft_zone": None if soft is None else soft.description,
         "queries": len(data.query_images),
         "references": len(data.references),
         "judged_pairs": int(np.count_nonzero(truth.judged)),
@@ -56,6 +62,7 @@ def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
                     convention: {name: _number(value) for name, value in values.items()}
                     for convention, values in outcome.measures.items()
                 },
+                "curves": {name: _points(curve) for name, curve in curves_of(outcome).items()},
                 "seconds": {stage: round(seconds, 6) for stage, seconds in outcome.seconds.items()},
                 "milliseconds_a_frame": {
                     stage: round(1e3 * seconds / evaluation.image_count, 6)
@@ -69,13 +76,31 @@ def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
     }
 
 
+def curves_of(outcome: Outcome) -> dict[str, PrecisionRecall]:
+    """Return the curves of a method: convention and zone -> curve."""
+    zones = [("", outcome.rule)] + ([] if outcome.soft is None else [(SOFT_ZONE, outcome.soft)])
+    return {curve.convention + zone: curve for zone, found in zones for curve in (found.pairs, found.best)}
+
+
+def _points(curve: PrecisionRecall) -> dict[str, list[float]]:
+    """Return at most POINTS points of a curve, among those at which recall increases, for drawing it."""
+    rises = _rises(curve)
+    kept = rises[np.unique(np.linspace(0, len(rises) - 1, min(len(rises), POINTS)).round().astype(int))]
+    return {name: [round(float(v), 6) for v in getattr(curve, name)[kept]] for name in ("recall", "precision")}
+
+
 def measures_text(evaluation: Evaluation) -> str:
     """Return the table of measures for a terminal, with the description of the truth."""
-    heads = ["method", "AP", "R@P=1", "F1", "AP", "R@P=1", "F1", *(f"R@{k}" for k in RECALL_AT), "ms/frame"]
+    soft = evaluation.data.soft_truth
+    heads = ["method", "AP", "R@P=1", "F1", "AP", "R@P=1", "F1", *(f"R@{k}" for k in RECALL_AT)]
+    heads += ["AP", "R@P=1"] if soft else []
+    heads.append("ms/frame")
     rows = []
     for outcome in evaluation.outcomes:
         values = outcome.measures
         cells = [share(v) for v in (*values[ALL_PAIRS].values(), *values[BEST_MATCH].values())]
+        if soft:
+            cells += [share(values[BEST_MATCH + SOFT_ZONE][name]) for name in SOFT_MEASURES]
         rows.append([outcome.name, *cells, f"{1e3 * outcome.seconds_on_frames / evaluation.image_count:.2f}"])
     widths = [max(len(row[i]) for row in [heads, *rows]) for i in range(len(heads))]
     lines = [
@@ -85,15 +110,20 @@ def measures_text(evaluation: Evaluation) -> str:
     pairs_width = sum(widths[1:4]) + 4
     over = f"{'':{widths[0]}}  {ALL_PAIRS:-^{pairs_width}}  {' ' + BEST_MATCH + ' ':-^{sum(widths[4:10]) + 10}}"
     data = evaluation.data
-    return "\n".join([f"{data.name}: {data.truth.description}", over, *lines])
+    said = [f"{data.name}: {data.truth.description}"]
+    if soft:
+        over += f"  {' soft zone ':-^{sum(widths[10:12]) + 2}}"
+        said.append(f"soft zone, best match of each query: a match is no mistake if {data.overlap_rule}")
+    return "\n".join([*said, over, *lines])
 
 
 def _write_measures_csv(evaluation: Evaluation, path: Path) -> None:
     rows = [["method", "convention", "figure", "value", "truth and exclusion"]]
     for outcome in evaluation.outcomes:
+        curves = curves_of(outcome)
         for convention, values in outcome.measures.items():
             for name, value in values.items():
-                rows.append([outcome.name, convention, name, f"{value:.6f}", evaluation.data.truth.description])
+                rows.append([outcome.name, convention, name, f"{value:.6f}", curves[convention].truth_description])
     _write_csv(path, rows)
 
 
@@ -109,10 +139,10 @@ def _write_times_csv(evaluation: Evaluation, path: Path) -> None:
 def _write_curves_csv(outcome: Outcome, path: Path) -> None:
     """Write the points at which recall increases: average precision is a sum over these."""
     rows = [["convention", "threshold", "precision", "recall", "truth and exclusion"]]
-    for curve in (outcome.pairs, outcome.best):
+    for convention, curve in curves_of(outcome).items():
         for i in _rises(curve):
             values = [f"{v[i]:.9g}" for v in (curve.thresholds, curve.precision, curve.recall)]
-            rows.append([curve.convention, *values, curve.truth_description])
+            rows.append([convention, *values, curve.truth_description])
     _write_csv(path, rows)
 
 
@@ -123,15 +153,30 @@ def _rises(curve: PrecisionRecall) -> np.ndarray:
 def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> None:
     data, matches = evaluation.data, outcome.matches
     loops = data.truth.queries_with_a_loop
-    heads = ["query", "reference", "score", "verdict", "query has a loop", "query image", "reference image"]
+    heads = [
+        "query",
+        "reference",
+        "score",
+        "verdict",
+        "soft zone",
+        "query has a loop",
+        "query image",
+        "reference image",
+    ]
     rows = [[*heads, "truth and exclusion"]]
     for query in np.flatnonzero(matches.reference >= 0):
         reference = int(matches.reference[query])
-        verdict = "right" if matches.right[query] else "ignored" if matches.ignored[query] else "wrong"
-        numbers = [str(query), str(reference), f"{matches.score[query]:.9g}", verdict, str(int(loops[query]))]
+        soft = "" if outcome.soft is None else verdict(outcome.soft.matches, query)
+        verdicts = [verdict(matches, query), soft]
+        numbers = [str(query), str(reference), f"{matches.score[query]:.9g}", *verdicts, str(int(loops[query]))]
         images = [str(data.query_images[query]), str(data.references[reference])]
         rows.append([*numbers, *images, data.truth.description])
     _write_csv(path, rows)
+
+
+def verdict(matches: BestMatches, query: int | np.intp) -> str:
+    """Say what the best match of a query is."""
+    return "right" if matches.right[query] else "ignored" if matches.ignored[query] else "wrong"
 
 
 def _write_csv(path: Path, rows: list[list[str]]) -> None:

@@ -19,9 +19,11 @@ from matplotlib.figure import Figure
 
 from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
 from loopclosure.places.frames import read_bgr
+from loopclosure.places.same_place import angles_deg, distances_m
+from loopclosure.places.trajectory import Poses
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import plots
-from loopclosure.report.files import EXPLANATION, share, write_files
+from loopclosure.report.files import EXPLANATION, SOFT_MEASURES, share, write_files
 from loopclosure.whole_file import whole_file
 
 PAIRS_SHOWN = 4
@@ -85,6 +87,8 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
         f"{loops} of {len(data.query_images)} queries have a loop",
         "training": evaluation.train,
     }
+    if data.soft_truth is not None:
+        facts["soft zone"] = f"beside the rule: a match is no mistake if {data.overlap_rule}"
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
     )
@@ -94,6 +98,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
         command=command,
         data=data,
         truth=truth.description,
+        soft=data.soft_truth is not None,
         frames=frames,
         facts=facts,
         images=evaluation.image_count,
@@ -111,7 +116,10 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
 
 def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, bool]]]]:
     """Return for each method its name and its measures, each with whether it is the best of several methods."""
-    rows = [[v for values in o.measures.values() for v in values.values()] for o in evaluation.outcomes]
+    rows = [[v for values in o.rule.measures().values() for v in values.values()] for o in evaluation.outcomes]
+    for row, outcome in zip(rows, evaluation.outcomes, strict=True):
+        if outcome.soft is not None:
+            row += [outcome.soft.measures()[BEST_MATCH][name] for name in SOFT_MEASURES]
     best = [max((row[i] for row in rows if not math.isnan(row[i])), default=None) for i in range(len(rows[0]))]
     return [
         (outcome.name, [(value, len(rows) > 1 and value == top) for value, top in zip(row, best, strict=True)])
@@ -139,14 +147,27 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:
     true_scores = np.nan_to_num(outcome.scores[loops, true], nan=-np.inf)
     right = right[np.argsort(-matches.score[right], kind="stable")]
     wrong = wrong[np.argsort(-matches.score[wrong], kind="stable")]
+    excused = plots.overlapping(outcome, wrong)
     lowest = np.argsort(true_scores, kind="stable")
 
     def pairs(queries: np.ndarray, references: np.ndarray) -> list[_Pair]:
         return [_pair(evaluation, outcome, queries[i], references[i]) for i in _spread(queries, evaluation)]
 
+    both = "" if outcome.soft is None else " in both zones"
     return [
         _Kind("found", "right, highest score", pairs(right, matches.reference[right])),
-        _Kind("false", "wrong, highest score", pairs(wrong, matches.reference[wrong])),
+        _Kind("false", f"wrong{both}, highest score", pairs(wrong[~excused], matches.reference[wrong[~excused]])),
+        *(
+            [
+                _Kind(
+                    "excused",
+                    "wrong by the rule, views overlap",
+                    pairs(wrong[excused], matches.reference[wrong[excused]]),
+                )
+            ]
+            if outcome.soft is not None
+            else []
+        ),
         _Kind("missed", "true, lowest score", pairs(loops[lowest], true[lowest])),
     ]
 
@@ -164,6 +185,7 @@ def _spread(queries: np.ndarray, evaluation: Evaluation) -> list[int]:
 def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) -> _Pair:
     score = outcome.scores[query, reference]
     caption = f"{query} and {reference}, {f'score {score:.4g}' if np.isfinite(score) else 'no score'}"
+    caption += _apart(evaluation, int(query), int(reference))
     images = [read_bgr(path) for path in (evaluation.data.query_images[query], evaluation.data.references[reference])]
     small = [
         cv2.resize(
@@ -176,6 +198,16 @@ def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) 
     gap = np.full((PICTURE_HEIGHT, 2, 3), 255, np.uint8)
     _, jpeg = cv2.imencode(".jpg", np.hstack([small[0], gap, small[1]]), [cv2.IMWRITE_JPEG_QUALITY, 85])
     return _Pair(base64.b64encode(jpeg.tobytes()).decode("ascii"), caption)
+
+
+def _apart(evaluation: Evaluation, query: int, reference: int) -> str:
+    """Say how far apart two views are, and whether they overlap, where the poses are known."""
+    data = evaluation.data
+    if data.positions is None or data.quaternions is None or data.overlap is None or data.reference_images is not None:
+        return ""
+    a, b = (Poses(data.positions[i], data.quaternions[i]) for i in (query, reference))
+    seen = "views overlap" if data.overlap[query, reference] else "views do not overlap"
+    return f"; {float(distances_m(a, b)):.2g} m and {float(angles_deg(a, b)):.0f} degrees apart, {seen}"
 
 
 def _save(figure: Figure, path: Path) -> str:

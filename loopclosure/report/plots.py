@@ -20,13 +20,13 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
-from loopclosure.evaluate import Evaluation, Outcome
+from loopclosure.evaluate import SOFT_ZONE, Evaluation, Outcome
 from loopclosure.places.truth import Truth
-from loopclosure.precision_recall import BEST_MATCH, PrecisionRecall
+from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 
 # Color-blind readers can distinguish these too (Okabe and Ito).
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
-FOUND, FALSE, MISSED = "#1a9641", "#d7191c", "#9e9e9e"
+FOUND, FALSE, MISSED, OVERLAPPING = "#1a9641", "#d7191c", "#9e9e9e", "#f4a582"
 LINES = ("-", "--", ":", "-.")  # a second round of the colors is dashed, and so on
 TITLE_WIDTH = 38  # characters that fit above a panel of a grid
 LABEL_WIDTH = 60  # characters of a legend's line that fit below a panel
@@ -55,7 +55,8 @@ def matrices(evaluation: Evaluation) -> Figure:
     panels = 1 + len(evaluation.outcomes)
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(panels, 1.0 if truth.hard.shape[0] == truth.hard.shape[1] else 0.9)
-        shown = np.where(truth.hard, 2.0, np.where(truth.soft, 1.0, 0.0))
+        soft = (evaluation.data.soft_truth or truth).soft
+        shown = np.where(truth.hard, 2.0, np.where(soft, 1.0, 0.0))
         _draw_matrix(
             axes[0], np.where(truth.judged, shown, np.nan), ListedColormap(["white", "#f4a582", "black"]), 0, 2
         )
@@ -75,28 +76,40 @@ def matrices(evaluation: Evaluation) -> Figure:
 
 
 def curves(evaluation: Evaluation) -> Figure:
-    """Draw the precision-recall curves of all methods, one panel for each convention."""
+    """Draw the precision-recall curves of all methods, one panel for each convention and zone.
+
+    Of the soft zone only the best match of each query is drawn: over all pairs it differs little from the rule zone.
+    """
+    panels = {
+        ALL_PAIRS: [outcome.pairs for outcome in evaluation.outcomes],
+        BEST_MATCH: [outcome.best for outcome in evaluation.outcomes],
+        BEST_MATCH + SOFT_ZONE: [outcome.soft.best for outcome in evaluation.outcomes if outcome.soft is not None],
+    }
+    panels = {title: found for title, found in panels.items() if found}
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(9.6, 4.2), layout="constrained")
-        axes = figure.subplots(1, 2)
-        for axis, kind in zip(axes, ("pairs", "best"), strict=True):
-            convention = ""
-            for number, outcome in enumerate(evaluation.outcomes):
-                curve: PrecisionRecall = getattr(outcome, kind)
-                convention = curve.convention
-                _draw_curve(axis, curve, outcome.name, number)
-            if kind == "pairs":
+        figure = Figure(figsize=(4.8 * len(panels), 4.2), layout="constrained")
+        axes = figure.subplots(1, len(panels))
+        for axis, (title, found) in zip(axes, panels.items(), strict=True):
+            for number, (outcome, curve) in enumerate(zip(evaluation.outcomes, found, strict=True)):
+                points = np.append(0.0, curve.recall), np.append(curve.precision[:1], curve.precision)
+                draw_curve(axis, *points, outcome.name, number, curve.average_precision)
+            if title == ALL_PAIRS:
                 curve = evaluation.outcomes[0].pairs
                 axis.axhline(curve.positives / max(curve.samples, 1), color="#888888", linewidth=0.7, linestyle=":")
-            axis.set_title(convention)
-            axis.set_xlabel("recall")
-            axis.set_ylabel("precision")
-            axis.set_xlim(-0.01, 1.01)
-            axis.set_ylim(0, 1.03)
-            axis.grid(color="#e6e6e6", linewidth=0.5)
-        _legends_below(figure, axes)
+            frame_curves(axis, title)
+        legends_below(figure, axes)
         _state_truth(figure, evaluation)
         return figure
+
+
+def frame_curves(axis: Axes, title: str) -> None:
+    """Set the title, the labels and the limits of a panel of precision-recall curves."""
+    axis.set_title(title)
+    axis.set_xlabel("recall")
+    axis.set_ylabel("precision")
+    axis.set_xlim(-0.01, 1.01)
+    axis.set_ylim(0, 1.03)
+    axis.grid(color="#e6e6e6", linewidth=0.5)
 
 
 def matches(evaluation: Evaluation) -> Figure:
@@ -107,7 +120,7 @@ def matches(evaluation: Evaluation) -> Figure:
             _draw_matches(axis, outcome, evaluation.data.truth)
             _name_panel(axis, outcome)
         _label_left(axes, "query")
-        _loop_legend(figure)
+        _loop_legend(figure, evaluation)
         _state_truth(figure, evaluation, BEST_MATCH)
         return figure
 
@@ -126,7 +139,7 @@ def maps(evaluation: Evaluation) -> Figure:
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_map(axis, outcome, evaluation.data.truth, positions)
             _name_panel(axis, outcome)
-        _loop_legend(figure)
+        _loop_legend(figure, evaluation)
         _state_truth(figure, evaluation, BEST_MATCH)
         return figure
 
@@ -141,6 +154,13 @@ def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, n
     false = accepted & ~outcome.matches.right & ~outcome.matches.ignored
     missed = truth.queries_with_a_loop & ~found
     return np.flatnonzero(found), np.flatnonzero(false), np.flatnonzero(missed)
+
+
+def overlapping(outcome: Outcome, queries: np.ndarray) -> np.ndarray:
+    """Return for each of these queries, whose match is wrong by the rule, whether the soft zone excuses it."""
+    if outcome.soft is None:
+        return np.zeros(len(queries), bool)
+    return outcome.soft.matches.right[queries] | outcome.soft.matches.ignored[queries]
 
 
 def best_true_references(outcome: Outcome, truth: Truth, queries: np.ndarray) -> np.ndarray:
@@ -176,20 +196,25 @@ def _greatest_of_blocks(values: np.ndarray, step: int) -> np.ndarray:
     return np.fmax.reduce(np.fmax.reduce(padded.reshape(rows // step, step, columns // step, step), axis=3), axis=1)
 
 
-def _draw_curve(axis: Axes, curve: PrecisionRecall, name: str, number: int) -> None:
-    """Draw the steps whose area is the average precision, and a dot where precision falls below 1."""
+def draw_curve(
+    axis: Axes, recall: np.ndarray, precision: np.ndarray, name: str, number: int, average_precision: float
+) -> None:
+    """Draw the steps whose area is the average precision, and a dot where precision falls below 1.
+
+    recall, precision  (n,), recall ascending from 0
+    number             of the curve, from 0: its color and line
+    """
     color = COLORS[number % len(COLORS)]
     line = LINES[number // len(COLORS) % len(LINES)]
-    recall, precision = np.append(0.0, curve.recall), np.append(curve.precision[:1], curve.precision)
     recall = recall[: len(precision)]  # a method without scores has no point
-    area = f"{curve.average_precision:.3f}"
-    label = textwrap.fill(f"{area}  {name}", LABEL_WIDTH, subsequent_indent=" " * 11)
+    label = textwrap.fill(f"{average_precision:.3f}  {name}", LABEL_WIDTH, subsequent_indent=" " * 11)
     axis.plot(recall, precision, line, color=color, linewidth=1.3, label=label, drawstyle="steps-pre")
-    if curve.recall_at_full_precision > 0:
-        axis.plot([curve.recall_at_full_precision], [1.0], "o", color=color, markersize=4, clip_on=False)
+    full = float(np.max(recall[precision >= 1.0], initial=0.0))
+    if full > 0:
+        axis.plot([full], [1.0], "o", color=color, markersize=4, clip_on=False)
 
 
-def _legends_below(figure: Figure, axes: Iterable[Axes]) -> None:
+def legends_below(figure: Figure, axes: Iterable[Axes]) -> None:
     """Put the legend of each panel below it, and make the figure higher by the height of the highest legend."""
     heights = []
     for axis in axes:
@@ -215,10 +240,11 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
     across, along = sorted(np.argsort(-spans, kind="stable")[:2])
     place = positions[:, [across, along]]
     axis.plot(place[:, 0], place[:, 1], color="#303030", linewidth=0.6, zorder=1)
-    found, false, missed = decisions(outcome, truth)
+    found, excused, false, missed = _drawn(outcome, truth)
     lines = [
         (missed, best_true_references(outcome, truth, missed), MISSED, 0.6),
         (found, outcome.matches.reference[found], FOUND, 0.9),
+        (excused, outcome.matches.reference[excused], OVERLAPPING, 0.9),
         (false, outcome.matches.reference[false], FALSE, 0.9),
     ]
     for order, (queries, references, color, width) in enumerate(lines, start=2):
@@ -231,14 +257,22 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
     axis.set_ylabel(f"{'xyz'[along]} [m]")
 
 
-def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
+def _drawn(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the queries found, false but excused in the soft zone, false, and missed."""
     found, false, missed = decisions(outcome, truth)
+    excused = overlapping(outcome, false)
+    return found, false[excused], false[~excused], missed
+
+
+def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
+    found, excused, false, missed = _drawn(outcome, truth)
     rows, columns = np.nonzero(truth.hard & truth.judged)
     axis.plot(columns, rows, ".", color="#d8d8d8", markersize=3, zorder=1)
     for order, (queries, references, color) in enumerate(
         [
             (missed, best_true_references(outcome, truth, missed), MISSED),
             (found, outcome.matches.reference[found], FOUND),
+            (excused, outcome.matches.reference[excused], OVERLAPPING),
             (false, outcome.matches.reference[false], FALSE),
         ],
         start=2,
@@ -249,10 +283,12 @@ def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
     axis.set_xlabel("reference")
 
 
-def _loop_legend(figure: Figure) -> None:
-    colors = ((FOUND, "found"), (FALSE, "false"), (MISSED, "missed"))
+def _loop_legend(figure: Figure, evaluation: Evaluation) -> None:
+    colors = [(FOUND, "found"), (FALSE, "false"), (MISSED, "missed")]
+    if evaluation.data.soft_truth is not None:
+        colors.insert(1, (OVERLAPPING, "false by the rule, views overlap"))
     lines = [Line2D([], [], color=color, linewidth=2, label=label) for color, label in colors]
-    figure.legend(handles=lines, loc="outside upper center", ncols=3)
+    figure.legend(handles=lines, loc="outside upper center", ncols=len(colors))
 
 
 def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -> None:

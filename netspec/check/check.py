@@ -14,8 +14,9 @@ from pathlib import Path
 import torch
 
 from netspec import log
+from netspec.check import net_rules, solver_rules  # noqa: F401, they register their rules
+from netspec.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
 from netspec.check.forks import gathered, unknown_types
-from netspec.check.lint import missing_data, net_advice, solver_advice
 from netspec.errors import ForkFault, SpecError
 from netspec.graph.filter import with_state, with_train_state
 from netspec.layers.base import Shape
@@ -43,7 +44,7 @@ class Checked:
     label: str
     net: Net | None
     faults: list[SpecError] = field(default_factory=list)
-    advice: list[str] = field(default_factory=list)
+    advice: list[Finding] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -138,8 +139,9 @@ def _check_net(
         faults.append(fault)
     if files := [path.strip() for paths in weights for path in paths.split(",")]:
         load_weights(built, files, manner.strict, report=faults.append)
-    advice = [*missing_data(net, built.param, source), *(() if faults else net_advice(built))]
-    return Checked(label, built, faults, advice)
+    advice = [*findings(TEXT, net, source), *findings(PLAN, net, source, built.plan)]
+    advice += [] if faults else findings(NET, built)
+    return Checked(label, built, faults, not_ignored(advice, source.file, source.layers))
 
 
 def _check_solver(
@@ -169,7 +171,7 @@ def _check_solver(
             net.share_weights_with(nets[0], part.faults.append)
     for net, part in zip(nets, parts, strict=True):
         part.faults += net.missing_inputs()
-    advice = []
+    advice = [] if faults else findings(SETTINGS, solver, node)
     if not faults and not any(part.faults for part in parts):
-        advice = list(solver_advice(solver, node, nets))
-    return [Checked(str(path), None, faults, advice), *parts]
+        advice += findings(SOLVER, solver, node, nets)
+    return [Checked(str(path), None, faults, not_ignored(advice, str(path))), *parts]

@@ -6,11 +6,25 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import caffe_tools, check, export, extract, measure, run_script, train
+from netspec.cli import (
+    caffe_tools,
+    check,
+    completion,
+    diff,
+    draw,
+    export,
+    extract,
+    fmt,
+    lint,
+    lsp,
+    measure,
+    run_script,
+    train,
+)
 from netspec.cli.run import Commands
 from netspec.command_line import run
 
-_FAMILIES = (train, measure, check, extract, export, run_script, caffe_tools)
+_FAMILIES = (train, measure, check, draw, diff, fmt, lint, lsp, extract, export, run_script, caffe_tools)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,4 +45,5 @@ def parser() -> argparse.ArgumentParser:
     commands = Commands(made)
     for family in _FAMILIES:
         family.add_to(commands)
+    completion.add_to(commands, parser)
     return made

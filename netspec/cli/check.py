@@ -24,13 +24,18 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--weights", help="weights that must fit the net, several separated by commas")
     p.add_argument("--plan", action="store_true", help="print how the net runs without gradients; needs its memory")
     add_passes(p)
-    p.add_argument("--json", action="store_true", help="print blobs, params, inputs and outputs as JSON")
+    p.add_argument(
+        "--json",
+        action="store_true",
+        help="print blobs, params, inputs, outputs as JSON; or the faults, if any",
+    )
     add_strict(p)
     add_python(p)
 
 
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.check.check import check_file
+    from netspec.check.findings import said_as_json
     from netspec.check.plan import plan_text
     from netspec.net.table import as_json, table
 
@@ -46,11 +51,14 @@ def _check(arguments: argparse.Namespace) -> int:
         allow_python=arguments.allow_python_layers,
         passes=arguments.passes if arguments.plan else None,
     )
-    for line in dict.fromkeys(line for part in checked for line in part.advice):
-        print(f"warning: {printable(line)}", file=sys.stderr)
-    faults = dict.fromkeys(str(fault) for part in checked for fault in part.faults)
+    advice = {str(found): found for part in checked for found in part.advice}
+    for line in advice:
+        print(f"warning: {line}", file=sys.stderr)
+    faults = {str(fault): fault for part in checked for fault in part.faults}
     if faults:
         print("\n".join(faults), file=sys.stderr)
+        if arguments.json:
+            print(json.dumps(said_as_json(faults.values(), advice.values())))
         return 1
     nets = [(part.label, part.net) for part in checked if part.net is not None]
     if arguments.json:

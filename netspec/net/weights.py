@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from netspec import log
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
 from netspec.graph import Report, raise_fault
-from netspec.hdf5_file import Hdf5Group, new_hdf5, open_hdf5
+from netspec.hdf5_file import layer_groups, new_hdf5, open_hdf5
 from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.proto.binary import read_net_binary
@@ -212,7 +212,7 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
         data = file.group("data")
         if data is None:
             raise SpecError("this is not a weights file: the HDF5 file has no group /data")
-        for name, arrays in _layer_groups(data):
+        for name, arrays in layer_groups(data):
             target = targets.get(name)
             if target is None:
                 _ignore(name)
@@ -232,18 +232,6 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
                     continue
                 copies.append((target, j, array[()].astype(np.float32)))
     return copies
-
-
-def _layer_groups(data: Hdf5Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
-    """Yield the layers, in Caffe's (alphabetical) order; a layer with a slash in its name is a group within a group."""
-    for name in data.names():
-        group = data.group(name)
-        if group is not None:
-            found = {key: group.dataset(key) for key in group.names()}
-            arrays = {key: dataset for key, dataset in found.items() if dataset is not None}
-            if arrays or not found:
-                yield prefix + name, arrays
-            yield from _layer_groups(group, f"{prefix}{name}/")
 
 
 # The net's side

@@ -42,7 +42,7 @@ def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> 
 
     ``report``, if given, gets a ForkFault for each unknown field, which then is left out.
     """
-    return parse_net_text(_text_of(path), str(path), upgrade, report)
+    return parse_net_text(text_of(path), str(path), upgrade, report)
 
 
 def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
@@ -58,7 +58,7 @@ def parse_solver(path: str | Path, upgrade: bool = True, report: Report = None) 
     The nets in it are upgraded too; ``SourceMap.of(node.fields["net_param"][0])`` is the map of one. For ``report``
     see :func:`parse_net`.
     """
-    return parse_solver_text(_text_of(path), str(path), upgrade, report)
+    return parse_solver_text(text_of(path), str(path), upgrade, report)
 
 
 def parse_solver_text(
@@ -73,7 +73,7 @@ def parse_solver_text(
     return solver, node
 
 
-def _text_of(path: str | Path) -> str:
+def text_of(path: str | Path) -> str:
     """Return a file's text without a byte-order mark; the lexer checks bytes that are not UTF-8."""
     try:
         data = Path(path).read_bytes()

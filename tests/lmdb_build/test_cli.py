@@ -10,6 +10,7 @@ import pytest
 from lmdb_build.cli import main
 from lmdb_build.pairs.list_file import read_pair_list, read_settings
 from paths import ROOT
+from places_layouts import path, tum_rows, write_benchmark, write_euroc, write_kitti, write_video
 
 
 @pytest.fixture(scope="module")
@@ -155,3 +156,51 @@ def test_python_m_lmdb_build() -> None:
     )
     assert done.returncode == 0
     assert "walk" in done.stdout
+
+
+def lists(out: Path, line: str) -> list[tuple[str, str, int]]:
+    counts = "--train 20 --val 0 --test 0 --at-most"
+    assert main(["pairs", *line.split(), *counts.split(), "--out", str(out)]) == 0
+    return [(pair.first, pair.second, pair.label) for pair in read_pair_list(out / "train.txt")]
+
+
+@pytest.mark.slow
+def test_pairs_takes_the_data_sets_that_people_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    poses = tmp_path / "poses.txt"
+    poses.write_text(tum_rows(path()))
+    euroc, kitti = write_euroc(tmp_path / "e"), write_kitti(tmp_path / "k")
+    video = write_video(tmp_path / "v.avi")
+    by_pose = [
+        f"{euroc}",
+        f"--euroc {euroc}",
+        f"--kitti {kitti}",
+        f"--video {video} --poses {poses}",
+        f"{kitti / 'image_0'} --poses {poses} --pose-form tum",
+    ]
+    for number, line in enumerate(by_pose):
+        chosen = lists(tmp_path / f"out{number}", f"{line} --min-gap 10")
+        assert {label for _, _, label in chosen} == {0, 1}
+        for first, second, label in chosen:
+            a, b = (int(Path(name).stem[:10]) for name in (first, second))  # EuRoC's names are nanoseconds
+            assert label == (abs(a - b) == 24)
+    assert "48 images with a pose, 0 without one left out" in capsys.readouterr().out
+
+
+def test_pairs_of_a_benchmark_are_a_query_and_a_reference(tmp_path: Path) -> None:
+    folder = write_benchmark(tmp_path / "b")
+    for line in (
+        f"--nordland {folder}",
+        f"--traverses {folder}/query {folder}/ref --mask {folder}/ground_truth_new.npy --root {folder}",
+    ):
+        chosen = lists(tmp_path / "out", line)
+        assert {label for _, _, label in chosen} == {0, 1}
+        for first, second, label in chosen:
+            ends = {Path(name).parent.name: int(Path(name).stem) for name in (first, second)}
+            assert label == (0 <= ends["ref"] - ends["query"] <= 2)
+
+
+def test_traverses_need_a_mask_and_poses_one_sequence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["pairs", "--traverses", "a", "b", "--out", "o"]) == 2
+    assert "--traverses needs --mask" in capsys.readouterr().err
+    assert main(["pairs", "a", "b", "--poses", "p.txt", "--out", "o"]) == 2
+    assert "--poses are those of one sequence" in capsys.readouterr().err

@@ -46,6 +46,22 @@ def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_evaluate_the_whole_system_on_another_recording(two_laps, two_laps_features, tmp_path, capsys):
+    features = f"features:{two_laps_features}"
+    line = f"evaluate --tum {two_laps} --start 20 --references {two_laps} --fov 50 --overlap 0.4 --out {tmp_path}"
+    line += f" --method verified:k=2,inliers=8+{features} --method verified+seqslam+{features}"
+    assert main(line.split()) == 0
+    assert "soft zone" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "report.json").read_text())
+    assert (summary["queries"], summary["references"]) == (20, 40)
+    assert "at least 40 % of each view" in summary["soft_zone"]
+    assert "horizontal field of view 50 degrees" in summary["soft_zone"]
+    for method in summary["methods"]:
+        assert {"best match of each query", "best match of each query; soft zone"} < set(method["figures"])
+        assert set(method["curves"]) == set(method["figures"])
+
+
+@pytest.mark.slow
 def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
     code = main(
         [
@@ -201,6 +217,11 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
     [
         ("evaluate --tum LAPS --camera left --method thumbnails --out OUT", "--camera means nothing to --tum"),
         ("evaluate --images LAPS --method thumbnails --out OUT", "--images needs --truth"),
+        ("evaluate --pairs LAPS --fov 60 --method thumbnails --out OUT", "--fov means nothing to --pairs"),
+        (
+            "evaluate --tum LAPS --references LAPS --exclude-seconds 3 --method thumbnails --out OUT",
+            "nothing is near in time",
+        ),
         ("detect LAPS --threshold 1 --with width --out OUT", "expected KEY=VALUE"),
         ("detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT", "--with belongs to --describe"),
         ("detect LAPS --resume OUT --metric cosine --out OUT", "leave out others"),

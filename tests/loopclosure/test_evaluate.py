@@ -1,15 +1,17 @@
 """Methods judged on a synthetic round trip, and how methods are named."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.evaluate import evaluate, named_method
+from loopclosure.evaluate import SOFT_ZONE, evaluate, named_method
 from loopclosure.methods.base import METHODS, MethodContext, MethodResult, make_method
 from loopclosure.methods.features import FeatureMethod
 from loopclosure.methods.seqslam import SeqSlam
+from loopclosure.methods.verified import Verified
 from loopclosure.places.datasets import load_tum
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 
@@ -85,6 +87,39 @@ def test_methods_that_refine_another():
     assert method.exclude_frames == 7
 
 
+def test_methods_that_refine_one_that_refines_another():
+    outer = make_method("verified:k=7,inliers=9,ratio=0.7+seqslam:length=6+features:a.npz", MethodContext(3))
+    assert isinstance(outer, Verified)
+    assert (outer.k, outer.check.min_inliers, outer.check.ratio, outer.exclude_frames) == (7, 9, 0.7, 3)
+    assert isinstance(outer.inner, SeqSlam)
+    assert outer.inner.settings.length == 6
+    assert outer.name == "verified+seqslam+a (euclidean)"
+    assert isinstance(make_method("seqslam+verified+thumbnails"), SeqSlam)
+
+
+def test_the_soft_zone_excuses_overlapping_views(two_laps):
+    data = load_tum(two_laps)
+    assert data.overlap is not None
+    neighbors = np.roll(data.truth.hard, 1, axis=1)
+    overlapping = replace(data, overlap=neighbors | data.truth.hard, overlap_rule="they are neighbors")
+    scores = np.where(neighbors, 2.0, np.where(data.truth.hard, 1.0, 0.0))
+    scores[39] = np.where(np.arange(40) == 3, 3.0, 0.0)  # the surest match is wrong in both zones
+    outcome, blameless = evaluate(overlapping, [("x", Says(scores)), ("y", Says(scores * (scores < 3)))]).outcomes
+    assert outcome.measures[BEST_MATCH]["recall at 100 % precision"] == 0
+    assert outcome.measures[BEST_MATCH + SOFT_ZONE]["recall at 100 % precision"] == 0
+    assert blameless.measures[BEST_MATCH]["recall at 100 % precision"] == 0
+    assert blameless.measures[BEST_MATCH + SOFT_ZONE]["recall at 100 % precision"] == pytest.approx(0.95)
+    assert "no mistake where views overlap: they are neighbors" in outcome.soft.best.truth_description
+    alone = evaluate(replace(data, overlap=None), [("x", Says(scores))]).outcomes[0]
+    assert alone.soft is None
+    assert BEST_MATCH + SOFT_ZONE not in alone.measures
+
+
+def test_a_method_that_accepts_nothing_scores_0(two_laps):
+    (outcome,) = evaluate(load_tum(two_laps), [("x", Says(np.full((40, 40), np.nan)))]).outcomes
+    assert {value for table in outcome.measures.values() for value in table.values()} == {0.0}
+
+
 @pytest.mark.parametrize("spec", ["magic", "magic:a=1", "seqslam+magic", ""])
 def test_unknown_methods_list_the_known(spec):
     with pytest.raises(InputError, match="known: fabmap, bow"):
@@ -93,5 +128,10 @@ def test_unknown_methods_list_the_known(spec):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_name_of_the_registry_is_there(name):
-    argument = ":a.npz" if name == "features" else ""
-    assert make_method(name + argument).name
+    needed = {
+        "features": ":a.npz",
+        "describe": ":a.py:function",
+        "verified": "+thumbnails",
+        "detector": ":a.npz:threshold=-1",
+    }
+    assert make_method(name + needed.get(name, "")).name

@@ -22,7 +22,7 @@ from netspec.data.images import read_image_list
 from netspec.data.prefetch import Feed
 from netspec.data.sources import Cursor, DatabaseSource, ImageListSource, Source, draw_skip
 from netspec.data.transformer import Transformer, contradictions
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError, UnknownShape, Where
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.proto.schema import PHASE_NAMES
@@ -105,7 +105,8 @@ class ReadingLayer(Layer):
     def shape_wanted(self, blob: str, example: str) -> SpecError:
         """Return the error that asks for the shape of a top."""
         advice = f"give --shape {blob}={example}, or --data"
-        return self.error(f'the shape of "{blob}" is known only from its data; {advice}', "top")
+        fault = self.error(f'the shape of "{blob}" is known only from its data; {advice}', "top")
+        return UnknownShape(fault.message, fault.where)
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:

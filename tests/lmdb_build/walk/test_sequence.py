@@ -10,10 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from lmdb_build.walk.house import House, Quad, Room, build_house
 from lmdb_build.walk.render import Camera, Light, Renderer
+from lmdb_build.walk.season import redecorate
 from lmdb_build.walk.sequence import Walk, write_walk
+from loopclosure.closing.measure import read_depth
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import same_place_matrix
-from loopclosure.places.trajectory import PosedSequence, read_groundtruth, read_tum_sequence, rotation_matrices
+from loopclosure.places.sequences import read_posed, read_sequence
+from loopclosure.places.trajectory import PosedSequence, read_groundtruth, rotation_matrices
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sequence(folder: Path) -> PosedSequence:
-    return read_tum_sequence(folder)
+    return read_posed(folder, "tum")
 
 
 def plain_light(rooms: int = 1) -> Light:
@@ -67,6 +70,28 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_house(folde
     # rgb.txt and groundtruth.txt say the sequence's own name in a comment.
     assert {file.name for file, equal in zip(files, same, strict=True) if not equal} == {"rgb.txt", "groundtruth.txt"}
     assert (tmp_path / "a/rgb/1000.000000.jpg").read_bytes() != (tmp_path / "c/rgb/1000.000000.jpg").read_bytes()
+
+
+def test_depth_is_written_in_the_form_of_tum_and_says_how_far_the_walls_are(tmp_path: Path) -> None:
+    """A pixel of one frame, taken to where its depth says, is the same surface in the next frame."""
+    walk = replace(SMALL, frames=100, laps=1, depth=True)
+    list(write_walk(tmp_path / "w", walk))
+    sequence = read_sequence(tmp_path / "w")
+    assert sequence.depths is not None
+    assert sequence.poses is not None
+    assert sequence.camera is not None
+    first, second = (read_depth(path, SMALL.width, SMALL.height) for path in sequence.depths[:2] if path)
+    assert 0 < first.min() < first.max() < 13.2
+    rows, columns = (part.ravel() for part in np.mgrid[4 : SMALL.height : 4, 4 : SMALL.width : 4])
+    rays = np.column_stack([sequence.camera.rays(np.column_stack([columns, rows])), np.ones(len(rows))])
+    turns = Rotation.from_quat(sequence.poses[:2, 3:])
+    world = turns[0].apply(rays * first[rows, columns, None]) + sequence.poses[0, :3]
+    seen = turns[1].inv().apply(world - sequence.poses[1, :3])
+    at = np.rint(seen[:, :2] / seen[:, 2:] * sequence.camera.fx + [sequence.camera.cx, sequence.camera.cy]).astype(int)
+    inside = (at >= 0).all(axis=1) & (at[:, 0] < SMALL.width) & (at[:, 1] < SMALL.height) & (seen[:, 2] > 0)
+    there = second[at[inside, 1], at[inside, 0]]
+    assert inside.sum() > 50
+    assert np.mean(np.abs(there - seen[inside, 2]) < 0.1) > 0.75  # the others are hidden by something nearer
 
 
 def test_places_are_seen_again_on_every_lap(sequence: PosedSequence) -> None:
@@ -178,6 +203,43 @@ def test_the_way_leads_through_every_room_and_never_into_furniture(rooms: int) -
                 assert np.linalg.norm(gap, axis=1).min() >= 0.5
 
 
+def thumbnails(folder: Path, sequence: PosedSequence) -> np.ndarray:
+    pictures = [cv2.imread(str(folder / frame.path), cv2.IMREAD_GRAYSCALE) for frame in sequence.frames]
+    small = (
+        np.array([cv2.resize(picture, (16, 12), interpolation=cv2.INTER_AREA).ravel() for picture in pictures]) / 1.0
+    )
+    small -= small.mean(axis=1, keepdims=True)
+    return small / small.std(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("season", [2, 3])
+def test_another_season_is_another_traverse_of_the_same_way(
+    folder: Path, sequence: PosedSequence, tmp_path: Path, season: int
+) -> None:
+    assert len(list(write_walk(tmp_path / "w", replace(SMALL, season=season)))) == SMALL.frames
+    other = read_posed(tmp_path / "w", "tum")
+    beside = np.linalg.norm(other.positions - sequence.positions, axis=1)
+    assert 0.05 < np.median(beside) < 1
+    assert same_place_matrix(other, sequence).any(axis=1).mean() > 0.95
+    same = same_place_matrix(other, sequence, 0.5, 6)
+    across = thumbnails(tmp_path / "w", other) @ thumbnails(folder, sequence).T / (16 * 12)
+    within = thumbnails(folder, sequence) @ thumbnails(folder, sequence).T / (16 * 12)
+    apart = np.abs(sequence.stamps[:, None] - sequence.stamps) > 10
+    again = same_place_matrix(sequence, sequence, 0.5, 6) & apart
+    assert 0.2 < np.median(across[same]) < np.median(within[again])  # harder than a lap later, not hopeless
+
+
+def test_another_season_moves_nothing() -> None:
+    house = build_house(3)
+    winter = redecorate(house, 3, 2)
+    assert redecorate(house, 3, 1) is house
+    pairs = list(zip(house.quads, winter.quads, strict=True))
+    assert all(np.array_equal(a.origin, b.origin) and a.texture.shape == b.texture.shape for a, b in pairs)
+    hung = [not np.array_equal(a.texture, b.texture) for a, b in pairs if a.draw]
+    assert len(hung) > 5
+    assert all(hung)
+
+
 def test_the_camera_is_carried_upright(sequence: PosedSequence) -> None:
     axes = rotation_matrices(sequence.quaternions)
     assert (axes[:, 2, 1] < -0.98).all()  # y points down
@@ -193,6 +255,7 @@ def test_the_camera_is_carried_upright(sequence: PosedSequence) -> None:
         ({"width": 8}, "width must be 32"),
         ({"laps": 0}, "laps must be 1"),
         ({"seed": -1}, "seed must be 0 or more"),
+        ({"season": 0}, "season must be 1"),
     ],
 )
 def test_numbers_that_make_no_walk_are_refused(tmp_path: Path, change: dict[str, int], words: str) -> None:

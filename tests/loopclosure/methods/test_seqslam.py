@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
+from loopclosure.methods.base import Images, MethodContext, MethodResult, earlier, make_method
 from loopclosure.methods.seqslam import (
     SeqSlam,
     SequenceSettings,
-    earlier,
     enhance_contrast,
     least_cost_matches,
+    standardize,
     trajectory_costs,
 )
 from loopclosure.progress import Progress, silent
@@ -212,10 +212,39 @@ def test_the_command_line_builds_it() -> None:
     assert isinstance(method, SeqSlam)
     assert (method.settings.length, method.settings.directions, method.exclude_frames) == (6, "both", 7)
     assert method.name == "seqslam"
-    on_words = make_method("seqslam+bow:words=50")
+    on_words = make_method("seqslam:length=4+bow:words=50")
     assert isinstance(on_words, SeqSlam)
     assert on_words.name == "seqslam+bow"
-    assert on_words.settings.contrast == 0
+    assert (on_words.settings.contrast, on_words.settings.length, on_words.standardize) == (0, 4, "traverses")
+
+
+def another_season() -> np.ndarray:
+    """Return scores (30, 30) of a route driven twice, in which references 8 to 15 resemble every query."""
+    rng = np.random.default_rng(4)
+    scores = rng.normal(0, 0.3, (30, 30)) + np.eye(30)
+    scores[:, 8:16] += 3.0
+    return scores + rng.normal(0, 2, (30, 1))
+
+
+def right(scores: np.ndarray) -> float:
+    return float(np.mean(np.argmax(np.nan_to_num(scores, nan=-np.inf), axis=1) == np.arange(len(scores))))
+
+
+def test_what_resembles_everything_says_nothing() -> None:
+    pictures = Images(frames(30), frames(30))
+    plain = SeqSlam(Fixed(another_season()), SequenceSettings(contrast=0))
+    scaled = SeqSlam(Fixed(another_season()), SequenceSettings(contrast=0), standardize="traverses")
+    assert right(plain.score(pictures, silent).scores) < 0.3 < 0.9 < right(scaled.score(pictures, silent).scores)
+    one_sequence = Images(frames(30))
+    np.testing.assert_array_equal(plain.score(one_sequence, silent).scores, scaled.score(one_sequence, silent).scores)
+
+
+def test_standardized_distances() -> None:
+    scaled = standardize(np.array([[1.0, 2.0, np.nan], [5.0, 5.0, 5.0], [0.0, 6.0, 3.0]]))
+    assert np.isnan(scaled[0, 2])
+    known = np.isfinite(scaled)
+    np.testing.assert_allclose([scaled[known[:, j], j].mean() for j in range(3)], 0, atol=1e-12)
+    np.testing.assert_allclose(scaled[:, 0].std(), 1)
 
 
 @pytest.mark.parametrize(
@@ -231,6 +260,11 @@ def test_the_command_line_builds_it() -> None:
 def test_settings_that_make_no_sense(settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         SequenceSettings(**settings)
+
+
+def test_an_unknown_way_to_standardize() -> None:
+    with pytest.raises(InputError, match='standardize of SeqSLAM is "rows"; expected no, yes, traverses'):
+        make_method("seqslam:standardize=rows+thumbnails")
 
 
 def test_an_unknown_score() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
+from loopclosure.places.sequences import read_posed
 from loopclosure.places.trajectory import (
     Frame,
     Trajectory,
@@ -13,7 +14,6 @@ from loopclosure.places.trajectory import (
     quaternions_from_matrices,
     read_groundtruth,
     read_rgb_list,
-    read_tum_sequence,
     rotation_matrices,
     write_groundtruth,
     write_rgb_list,
@@ -74,19 +74,19 @@ def test_a_broken_line_of_rgb_txt_is_named(tmp_path: Path) -> None:
 
 def test_missing_empty_and_binary_files_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
-        read_tum_sequence(tmp_path / "nowhere")
+        read_posed(tmp_path / "nowhere", "tum")
     with pytest.raises(InputError, match=r"rgb\.txt: cannot be read \(No such file"):
-        read_tum_sequence(tmp_path)
+        read_posed(tmp_path, "tum")
     write(tmp_path / "rgb.txt", "# nothing\n")
     with pytest.raises(InputError, match=r"rgb\.txt: lists no images"):
-        read_tum_sequence(tmp_path)
+        read_posed(tmp_path, "tum")
     write(tmp_path / "rgb.txt", "1.5 rgb/a.png\n")
     (tmp_path / "groundtruth.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match=r"groundtruth\.txt: is not a text file"):
-        read_tum_sequence(tmp_path)
+        read_posed(tmp_path, "tum")
     write(tmp_path / "groundtruth.txt", "")
     with pytest.raises(InputError, match=r"groundtruth\.txt: holds no pose"):
-        read_tum_sequence(tmp_path)
+        read_posed(tmp_path, "tum")
 
 
 def test_associate_takes_the_nearest_pose_within_the_limit() -> None:
@@ -99,7 +99,7 @@ def test_associate_takes_the_nearest_pose_within_the_limit() -> None:
 def test_frames_without_a_pose_are_counted_and_left_out(tmp_path: Path) -> None:
     write_rgb_list(tmp_path / "rgb.txt", [Frame(stamp, f"rgb/{stamp:g}.png") for stamp in (1.0, 1.01, 5.0, 2.0)])
     write_groundtruth(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
-    sequence = read_tum_sequence(tmp_path)
+    sequence = read_posed(tmp_path, "tum")
     assert sequence.name == tmp_path.name
     assert [frame.path for frame in sequence.frames] == ["rgb/1.png", "rgb/1.01.png", "rgb/2.png"]
     assert sequence.stamps.tolist() == [1.0, 1.01, 2.0]
@@ -111,7 +111,7 @@ def test_no_frame_with_a_pose_at_all_says_both_time_spans(tmp_path: Path) -> Non
     write_rgb_list(tmp_path / "rgb.txt", [Frame(100.0, "rgb/a.png")])
     write_groundtruth(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
     with pytest.raises(InputError, match=r"images from 100\.000 to 100\.000 s, poses from 1\.000 to 2\.000 s"):
-        read_tum_sequence(tmp_path)
+        read_posed(tmp_path, "tum")
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
@@ -136,6 +136,6 @@ def test_rotation_matrices_and_quaternions_agree() -> None:
 @pytest.mark.parametrize(("name", "posed", "listed"), [("xyz", 796, 798), ("rpy", 721, 723)])
 def test_tum_fr1_has_the_poses_its_readme_counts(name: str, posed: int, listed: int) -> None:
     folder = shared("data", "tum_fr1", f"rgbd_dataset_freiburg1_{name}")
-    sequence = read_tum_sequence(folder, max_difference=0.03)
+    sequence = read_posed(folder, "tum", 0.03)
     assert (len(sequence), len(sequence) + sequence.dropped) == (posed, listed)
     np.testing.assert_allclose(np.linalg.norm(sequence.quaternions, axis=1), 1, atol=1e-12)

@@ -114,7 +114,7 @@ def test_pairs_are_shown_for_each_method(folder):
     sections = page[page.index("<h2>Pairs</h2>") : page.index("<h2>Settings</h2>")].split("<h3>")[1:]
     net, noise, silent = sections
     assert net.count('class="pair found"') == 4
-    assert "wrong, highest score" in net
+    assert "wrong in both zones, highest score" in net
     assert noise.count('class="pair false"') == 4
     assert silent.count("right, highest score: none") == 1
     assert silent.count("no score") >= 4

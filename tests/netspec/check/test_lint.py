@@ -41,7 +41,7 @@ def advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., lis
         shapes = {"pair": (10, 2, 4, 4), "sim": (10,)} if "pair" in net and not open_data else {}
         checked = check_file(path, phase, shapes=shapes, open_data=open_data)
         assert not [fault for part in checked for fault in part.faults]
-        return [line for part in checked for line in part.advice]
+        return [f"{found.where}: {found.message}" for part in checked for found in part.advice]
 
     return check
 
@@ -60,14 +60,17 @@ def test_towers_that_share_only_some_of_their_parameters(advice: Callable[..., l
 def test_a_loss_that_nothing_reaches(advice: Callable[..., list[str]]) -> None:
     fixed = 'param { name: "w" lr_mult: 0 } param { name: "b" lr_mult: 0 }'
     assert advice(siamese((fixed, fixed))) == [
-        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): this loss depends on no learnable parameter'
+        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): this loss depends on no learnable parameter; '
+        "is an lr_mult 0?"
     ]
     assert advice(siamese((fixed, fixed)), phase=1) == []
 
 
 def test_a_blob_used_by_nothing(advice: Callable[..., list[str]]) -> None:
     spare = 'layer { name: "spare" type: "ReLU" bottom: "f1" top: "spare" }\n'
-    assert advice(siamese(extra=spare)) == ['net.prototxt:9:1: layer "spare" (ReLU): no layer uses blob "spare"']
+    assert advice(siamese(extra=spare)) == [
+        'net.prototxt:9:1: layer "spare" (ReLU): no layer uses blob "spare"; remove it, or add a Silence layer'
+    ]
     score = 'layer { name: "score" type: "Accuracy" bottom: "f1" bottom: "sim" top: "score" }\n'
     assert advice(siamese(extra=score)) == []
     silent = 'layer { name: "hush" type: "Silence" bottom: "spare" }\n'
@@ -92,7 +95,7 @@ def test_two_layers_of_one_name(advice: Callable[..., list[str]]) -> None:
     said = advice(siamese().replace('"ip2"', '"ip1"'))
     assert said == [
         'net.prototxt:6:1: layer "ip1" (InnerProduct): an earlier layer has the same name; loaded weights go to that '
-        "layer only"
+        "layer only; rename one"
     ]
 
 
@@ -103,8 +106,9 @@ def test_a_phase_without_its_data_layer(advice: Callable[..., list[str]], tmp_pa
     assert [str(fault) for fault in checked.faults] == [
         'net.prototxt:3:35: layer "cut" (Slice): unknown bottom blob "pair"; available: none'
     ]
-    assert checked.advice == [
-        'net.prototxt:1:1: layer "d" (Data): no data layer is left in this phase; add one with include { phase: ... }'
+    assert list(map(str, checked.advice)) == [
+        'net.prototxt:1:1: layer "d" (Data): no data layer is left in this phase; add one with include '
+        "{ phase: ... } [missing-data]"
     ]
 
 
@@ -118,10 +122,10 @@ def test_nothing_is_said_of_a_sound_solver(advice: Callable[..., list[str]]) -> 
 def test_no_snapshot_is_ever_taken(advice: Callable[..., list[str]]) -> None:
     without = SOLVER + "snapshot_after_train: false\n"
     assert advice(siamese(), without + "snapshot: 101") == [
-        "solver.prototxt:4:1: snapshot 101 is more than max_iter 100: no effect"
+        "solver.prototxt:4:1: snapshot 101 is more than max_iter 100: no effect; make it smaller"
     ]
     assert advice(siamese(), SOLVER + "snapshot: 101") == [
-        "solver.prototxt:3:1: snapshot 101 is more than max_iter 100: no effect"
+        "solver.prototxt:3:1: snapshot 101 is more than max_iter 100: no effect; make it smaller"
     ]
     assert advice(siamese(), without) == [
         "solver.prototxt: no snapshot is taken; set snapshot, or snapshot_after_train: true"
@@ -132,12 +136,12 @@ def test_no_snapshot_is_ever_taken(advice: Callable[..., list[str]]) -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ("gamma: 0.1", ["3:1: gamma has no effect with type SGD and lr_policy fixed"]),
-        ("stepvalue: 10 stepvalue: 20", ["3:1: stepvalue has no effect with type SGD and lr_policy fixed"]),
+        ("gamma: 0.1", ["3:1: gamma has no effect with type SGD and lr_policy fixed; remove it"]),
+        ("stepvalue: 10 stepvalue: 20", ["3:1: stepvalue has no effect with type SGD and lr_policy fixed; remove it"]),
         ('type: "Adam" momentum2: 0.9 delta: 1e-8', []),
         ('type: "adagrad" delta: 1e-8', []),
         ('type: "RMSProp" rms_decay: 0.9 momentum2: 0.9',
-         ["3:32: momentum2 has no effect with type RMSProp and lr_policy fixed"]),
+         ["3:32: momentum2 has no effect with type RMSProp and lr_policy fixed; remove it"]),
     ],
 )  # fmt: skip
 def test_settings_that_the_policy_and_the_rule_do_not_read(
@@ -162,6 +166,6 @@ def test_a_test_that_reads_far_more_or_less_than_there_is(
     source = str(GOLDEN / "pairs" / "test_lmdb")
     solver = SOLVER + f"test_interval: 10\ntest_iter: {iterations}"
     read = f"test_iter {iterations} x batch 10 = {10 * iterations}"
-    expected = [f'solver.prototxt:4:1: {read}, but layer "d" has 200 records'] if far else []
+    expected = [f'solver.prototxt:4:1: {read}, but layer "d" has 200 records; set test_iter: 20'] if far else []
     assert advice(siamese(source=source), solver, open_data=True) == expected
     assert advice(siamese(source=source), solver) == []

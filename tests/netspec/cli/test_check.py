@@ -42,7 +42,7 @@ def test_check_shows_caffes_log_when_asked(run: Run) -> None:
 
 
 def test_check_builds_all_nets_of_a_solver(run: Run, edited: Edit) -> None:
-    solver = edited(SOLVER, "snapshot_after_train: false", "")
+    solver = edited(SOLVER, "snapshot_after_train: false", "", "test_interval: 1000", "test_interval: 60")
     result = run("check", solver, *PAIR_SHAPE, "--json")
     assert (result.status, result.err) == (0, "")
     assert sorted(json.loads(result.out)) == ["test net #0", "train net"]
@@ -122,7 +122,10 @@ def test_check_reports_faults_of_a_solver_and_of_its_nets_at_once(run: Run, edit
 def test_check_warns_and_succeeds(run: Run) -> None:
     result = run("check", SOLVER, *PAIR_SHAPE)
     assert result.status == 0
-    assert result.err == f"warning: {SOLVER}: no snapshot is taken; set snapshot, or snapshot_after_train: true\n"
+    assert result.err.splitlines() == [
+        f"warning: {SOLVER}: no snapshot is taken; set snapshot, or snapshot_after_train: true [no-snapshot]",
+        f"warning: {SOLVER}:3:1: test_interval 1000 is more than max_iter 60; make it smaller [test-after-end]",
+    ]
 
 
 def test_a_warning_of_both_nets_of_a_solver_is_shown_once(run: Run, edited: Edit) -> None:

@@ -1,0 +1,75 @@
+"""``loopclosure close``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.cli.data_set import add_poses, add_topics, sequence
+from loopclosure.cli.run import Commands, WrongUsage, show_progress, warn
+from loopclosure.closing.close import close, summary, write_closed
+from loopclosure.closing.drift import drifted
+from loopclosure.closing.measure import measure, read_loops
+from loopclosure.errors import InputError
+from loopclosure.places import intrinsics
+from loopclosure.places.pose_files import pose_form, read_poses
+from loopclosure.places.sequences import ImageSequence
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add("close", _close, "correct a path by the loops that detect found")
+    p.add_argument(
+        "source", help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag"
+    )
+    p.add_argument("--loops", required=True, type=Path, metavar="CSV", help="the loops.csv that detect wrote")
+    path = p.add_mutually_exclusive_group(required=True)
+    path.add_argument("--odometry", type=Path, metavar="FILE", help="the path to correct: poses of TUM, KITTI or EuRoC")
+    path.add_argument(
+        "--drift", type=float, metavar="PERCENT", help="simulate odometry that drifts, from the true poses"
+    )
+    p.add_argument("--odometry-form", metavar="WORDS", help="how --odometry is written, as --pose-form")
+    p.add_argument("--seed", type=int, metavar="N", help="of --drift (default: 1)")
+    add_poses(p)
+    add_topics(p)
+    p.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source does not say")
+    p.add_argument("--out", required=True, metavar="FOLDER", help="where closed.g2o, closed.txt and paths.png go")
+
+
+def _close(a: argparse.Namespace) -> None:
+    if a.odometry_form and not a.odometry:
+        raise WrongUsage("--odometry-form means nothing without --odometry")
+    if a.seed is not None and a.drift is None:
+        raise WrongUsage("--seed means nothing without --drift")
+    frames = sequence(a, a.source, "")
+    camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
+    if camera is None:
+        raise InputError(f"does not say what its camera is; give --camera {intrinsics.FORM}", frames.source)
+    odometry = _odometry(a, frames)
+    loops = measure(frames, read_loops(a.loops, frames.names), camera, show_progress)
+    closed = close(odometry, loops, frames.poses)
+    out = Path(a.out)
+    write_closed(out, closed, frames.stamps, frames.names)
+    # Drawing takes seconds to import, which the other commands need not wait for.
+    from loopclosure.report.paths import draw_paths
+
+    draw_paths(out / "paths.png", closed)
+    print("\n".join(summary(closed)))
+    print(f"{out / 'closed.g2o'}, {out / 'closed.txt'}, {out / 'paths.png'}")
+
+
+def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
+    """Return the path (F, 7) to correct, NaN for frames without a pose."""
+    if a.odometry:
+        read = read_poses(a.odometry, pose_form(a.odometry_form or ""))
+        for doubt in read.doubts:
+            warn(f"{a.odometry}: {doubt}".replace("--pose-form", "--odometry-form"))
+        return read.of_images(len(frames), frames.stamps, a.odometry)
+    if frames.poses is None:
+        raise InputError("has no true poses to simulate drift on; give --odometry, or --poses", frames.source)
+    known = np.all(np.isfinite(frames.poses), axis=1)
+    path = frames.poses.copy()
+    path[known] = drifted(path[known], a.drift, 1 if a.seed is None else a.seed)
+    return path

@@ -1,0 +1,159 @@
+"""Odometry and loops -> a pose graph -> a mended path; its files."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loopclosure.closing.drift import ate_rmse_m, steps_between, turn_rmse_deg
+from loopclosure.closing.graph import Edge, solve
+from loopclosure.closing.measure import Loop
+from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Relative
+from loopclosure.detector.export import LOOP_SIGMAS, write_pose_graph
+from loopclosure.errors import InputError
+from loopclosure.places.trajectory import Trajectory, write_trajectory
+from loopclosure.whole_file import whole_file
+
+# The standard deviations of a step of odometry: a share of its length and of its turn, and this much at least.
+STEP_SHARE, STEP_M, TURN_SHARE, TURN_RAD = 0.02, 0.002, 0.02, 0.002
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A path before and after its loops were closed.
+
+    frames     (N,) numbers of the frames that have odometry: node i of the graph is frame frames[i]
+    odometry   (N, 7) poses before;  poses  (N, 7) after
+    steps      the edges of the odometry;  edges  those of the L loops in it
+    loops      (L) loops between nodes;  accepted  (L,) bool: the loop agrees with the rest
+    not_measured  loops whose images do not tell a pose
+    truth      (N, 7), NaN where not known, or None
+    """
+
+    frames: np.ndarray
+    odometry: np.ndarray
+    poses: np.ndarray
+    steps: list[Edge]
+    edges: list[Edge]
+    loops: list[Loop]
+    accepted: np.ndarray
+    not_measured: int
+    truth: np.ndarray | None = None
+
+    def count(self, kind: str) -> int:
+        """Return how many loops were measured in this way."""
+        return sum(loop.relative is not None and loop.relative.kind == kind for loop in self.loops)
+
+    def errors(self) -> dict[str, tuple[float, float]] | None:
+        """Return the errors before and after, by name and unit; None without at least three true poses."""
+        if self.truth is None:
+            return None
+        known = np.all(np.isfinite(self.truth), axis=1)
+        if np.count_nonzero(known) < 3:
+            return None
+        paths = self.odometry[known], self.poses[known]
+        return {
+            "position, ATE RMSE [m]": (
+                ate_rmse_m(paths[0], self.truth[known]),
+                ate_rmse_m(paths[1], self.truth[known]),
+            ),
+            "rotation, RMSE [deg]": (
+                turn_rmse_deg(paths[0], self.truth[known]),
+                turn_rmse_deg(paths[1], self.truth[known]),
+            ),
+        }
+
+
+def close(odometry: np.ndarray, loops: Sequence[Loop], truth: np.ndarray | None = None) -> Closed:
+    """Close measured loops of a sequence of frames with odometry (F, 7), NaN for frames without; truth likewise.
+
+    Loops whose frames have no odometry, or that were not measured, are left out.
+    """
+    frames = np.flatnonzero(np.all(np.isfinite(odometry), axis=1))
+    if len(frames) < 2:
+        raise InputError(f"{len(frames)} of {len(odometry)} frames have a pose of the odometry; two are needed")
+    path = odometry[frames]
+    node = {int(frame): number for number, frame in enumerate(frames)}
+    taken = [loop for loop in loops if loop.relative is not None and {loop.query, loop.match} <= set(node)]
+    steps = [
+        Edge(number, number + 1, step, _information_of_step(step)) for number, step in enumerate(steps_between(path))
+    ]
+    edges = []
+    for loop in taken:
+        assert loop.relative is not None
+        edges.append(Edge(node[loop.match], node[loop.query], *_constraint(loop.relative)))
+    solution = solve(path, steps, edges)
+    left_out = len(loops) - len(taken)
+    known = None if truth is None else truth[frames]
+    return Closed(frames, path, solution.poses, steps, edges, taken, solution.accepted, left_out, known)
+
+
+def _information_of_step(step: np.ndarray) -> np.ndarray:
+    length, turn = float(np.linalg.norm(step[:3])), float(Rotation.from_quat(step[3:]).magnitude())
+    sigmas = [STEP_SHARE * length + STEP_M] * 3 + [TURN_SHARE * turn + TURN_RAD] * 3
+    return np.diag(np.array(sigmas) ** -2.0)
+
+
+def _constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose (7,) and the information (6, 6) of a loop's edge.
+
+    Where the length of the translation is not known, the edge says nothing along its direction; where only the
+    rotation is known, nothing of the translation. So any program that reads g2o can use them.
+    """
+    information = LOOP_SIGMAS.information()
+    pose = relative.pose.copy()
+    if relative.kind == ROTATION_ONLY:
+        information[:3, :3] = 0
+    elif relative.kind == UP_TO_SCALE:
+        along = Rotation.from_quat(pose[3:]).inv().apply(pose[:3])  # g2o compares in the frame of the query
+        information[:3, :3] -= np.outer(along, along) * LOOP_SIGMAS.translation_m**-2.0
+        pose[:3] = 0
+    return pose, information
+
+
+def write_closed(out: Path, closed: Closed, stamps: np.ndarray | None, names: Sequence[str]) -> None:
+    """Write closed.g2o, closed.txt and odometry.txt (TUM), and loops.csv with what became of each loop.
+
+    Frames without a stamp have their numbers for seconds.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    times = closed.frames.astype(float) if stamps is None else stamps[closed.frames]
+    for name, poses in (("closed", closed.poses), ("odometry", closed.odometry)):
+        write_trajectory(out / f"{name}.txt", Trajectory(times, poses[:, :3], poses[:, 3:]), name)
+    numbers = closed.frames.tolist()
+    kept = [edge for edge, accepted in zip(closed.edges, closed.accepted, strict=True) if accepted]
+    edges = [(numbers[e.first], numbers[e.second], e.pose, e.information) for e in [*closed.steps, *kept]]
+    write_pose_graph(out / "closed.g2o", dict(zip(numbers, closed.poses, strict=True)), edges)
+    with whole_file(out / "loops.csv") as unfinished, unfinished.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["query_id", "match_id", "query_name", "match_name", "measured", "inliers", "used"])
+        for loop, accepted in zip(closed.loops, closed.accepted, strict=True):
+            assert loop.relative is not None
+            ends = (loop.query, loop.match)
+            row = [*ends, *(names[i] for i in ends), loop.relative.kind, loop.relative.inliers]
+            writer.writerow([*row, "yes" if accepted else "no"])
+
+
+def summary(closed: Closed) -> list[str]:
+    """Return what there is to say about a closed path, a sentence each."""
+    used = int(np.count_nonzero(closed.accepted))
+    lines = [f"{used} of {len(closed.loops)} loops used, {len(closed.loops) - used} contradict the others"]
+    if closed.not_measured:
+        lines.append(f"{closed.not_measured} more left out: fewer than 20 points agree with one relative pose")
+    said = {
+        METRIC: "measured in meters, from depth",
+        UP_TO_SCALE: "measured from color alone: a rotation, and the direction of the translation (up to scale)",
+        ROTATION_ONLY: "give a rotation only: the camera turned and hardly moved, so the translation is undetermined",
+    }
+    lines += [f"{count} loops {words}" for kind, words in said.items() if (count := closed.count(kind))]
+    errors = closed.errors()
+    if errors is None:
+        lines.append("error: not known without true poses")
+    else:
+        lines += [f"{what}: {before:.4g} before, {after:.4g} after" for what, (before, after) in errors.items()]
+    return lines

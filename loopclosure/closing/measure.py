@@ -1,0 +1,105 @@
+"""From the table of accepted loops to measured ones: which frames they join, and the pose of one in the other."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from loopclosure.closing.relative import LEAST_INLIERS, Relative, View, relative_view
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.errors import InputError
+from loopclosure.places.frames import read_bgr
+from loopclosure.places.intrinsics import Intrinsics
+from loopclosure.places.sequences import ImageSequence
+from loopclosure.progress import Progress, silent
+
+CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS)
+DEPTH_PER_M = 5000  # TUM RGB-D: 16-bit values per meter, 0 = not known
+KEPT_VIEWS = 500  # their features, in memory
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Frame ``query`` shows the place of the earlier frame ``match``; ``relative`` is None if it was not measured."""
+
+    query: int
+    match: int
+    relative: Relative | None = None
+
+
+def read_loops(path: Path, names: Sequence[str]) -> list[Loop]:
+    """Read the loops.csv of ``loopclosure detect``: loops between the frames with these names (N).
+
+    Frames are found by their names, or by their numbers where the table has no names. Raises InputError (file:line)
+    for a frame that is not there.
+    """
+    numbers = {name: number for number, name in enumerate(names)}
+    loops = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream, restval="")
+            missing = {"query_id", "match_id"} - set(reader.fieldnames or ())
+            if missing:
+                raise InputError("is no table of loops; expected the loops.csv that loopclosure detect writes", path)
+            for row in reader:
+                query, match = (_frame(row, end, numbers, path, reader.line_num) for end in ("query", "match"))
+                if query == match:
+                    raise InputError(f"joins frame {query} with itself", path, reader.line_num, 1)
+                loops.append(Loop(query, match))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError("cannot be read; expected the loops.csv that loopclosure detect writes", path) from error
+    return loops
+
+
+def measure(
+    sequence: ImageSequence, loops: Sequence[Loop], camera: Intrinsics, progress: Progress = silent
+) -> list[Loop]:
+    """Measure the pose of each loop's query in the frame of its match, from depth where there is some."""
+
+    @lru_cache(KEPT_VIEWS)
+    def view(frame: int) -> View:
+        image = read_bgr(sequence.images[frame])
+        height, width = image.shape[:2]
+        depths = sequence.depths
+        file = None if depths is None else depths[frame]
+        depth = None if file is None else read_depth(file, width, height)
+        return View(CHECK.describe(image), camera.of_size(width, height), depth)
+
+    measured = []
+    for loop in progress(loops, "measuring loops", len(loops)):
+        match, query = view(loop.match), view(loop.query)
+        matches = CHECK.matches(match.local, query.local)
+        measured.append(Loop(loop.query, loop.match, relative_view(match, query, matches)))
+    return measured
+
+
+def read_depth(path: Path, width: int, height: int) -> np.ndarray:
+    """Read a depth image of TUM's form as meters (height, width), 0 where not known, at the size of its color image."""
+    if not path.is_file():
+        raise InputError("no such image, though depth.txt lists it", path)
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 2 or image.dtype != np.uint16:
+        raise InputError("is no depth image; expected one channel of 16 bits, 5000 per meter, as of TUM RGB-D", path)
+    if image.shape != (height, width):
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST)
+    return image.astype(np.float32) / DEPTH_PER_M
+
+
+def _frame(row: dict[str, str], end: str, numbers: dict[str, int], path: Path, line: int) -> int:
+    name, number = row.get(f"{end}_name", ""), row[f"{end}_id"]
+    if name in numbers:
+        return numbers[name]
+    of_video = re.fullmatch(r"frame (\d+)", name)
+    if name and not of_video:
+        raise InputError(f'no image of the sequence has the name "{name}"', path, line, 1)
+    digits = of_video[1] if of_video else number
+    if not digits.isdigit() or int(digits) >= len(numbers):
+        raise InputError(f'no frame has the number "{digits}"; there are {len(numbers)}', path, line, 1)
+    return int(digits)

@@ -1,0 +1,142 @@
+"""The pose of one image relative to another that shows the same place: from depth, or from color alone.
+
+With depth the pose is in meters: points of one image with depth, seen by the other (PnP). From color alone the
+essential matrix gives the rotation, and the direction of the translation without its length. Where the camera only
+turned, all points fit a rotation, and the direction is noise: then only the rotation counts.
+
+Hartley and Zisserman, Multiple View Geometry, chapters 9 and 11.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loopclosure.detector.verification import LocalFeatures
+from loopclosure.places.intrinsics import Intrinsics
+
+METRIC, UP_TO_SCALE, ROTATION_ONLY = "metric", "up to scale", "rotation only"
+LEAST_INLIERS = 20
+MAX_ERROR_PX = 2.0
+CONFIDENCE = 0.999
+# Points of SIFT are good to about a pixel. Where a rotation leaves less than this, the rest says nothing.
+LEAST_PARALLAX_PX = 2.0
+SEED = 1
+# Depths of neighboring pixels within this factor are of one surface.
+ONE_SURFACE = 1.05
+
+
+@dataclass(frozen=True)
+class View:
+    """An image: its ``local`` features, its ``camera``, and its depth (H, W) in meters, 0 = not known, or None."""
+
+    local: LocalFeatures
+    camera: Intrinsics
+    depth: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Relative:
+    """The pose of a query in the frame of its match.
+
+    pose     (7,) tx ty tz qx qy qz qw; "up to scale": the translation has length 1; "rotation only": it is 0
+    kind     "metric", "up to scale" or "rotation only"
+    inliers  matches that agree with it
+    """
+
+    pose: np.ndarray
+    kind: str
+    inliers: int
+
+
+def relative_view(match: View, query: View, matches: np.ndarray) -> Relative | None:
+    """Return the pose of ``query`` in the frame of ``match`` from matches (M, 2) of their points, or None.
+
+    None: fewer than 20 matches agree with one pose. Random draws are the same each time.
+    """
+    if len(matches) < LEAST_INLIERS:
+        return None
+    pixels = match.local.points[matches[:, 0]], query.local.points[matches[:, 1]]
+    in_match, in_query = match.camera.rays(pixels[0]), query.camera.rays(pixels[1])
+    focal = np.sqrt(query.camera.fx * query.camera.fy)
+    sides = ((match, pixels[0], in_match, in_query), (query, pixels[1], in_query, in_match))
+    for view, points, rays, other in sides:
+        if view.depth is None:
+            continue
+        depths = _depth_at(view.depth, points)
+        known = depths > 0
+        found = _from_depth(rays[known], depths[known], other[known], focal)
+        if found is not None:
+            rotation, translation, inliers = found  # from this view to the other
+            return Relative(_pose(rotation, translation, inverse=view is match), METRIC, inliers)
+    return _from_color(in_match, in_query, focal)
+
+
+def _depth_at(depth: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the depth (N,) at pixels (N, 2), 0 where it is not known; between two surfaces it is not known."""
+    height, width = depth.shape
+    at = np.rint(points).astype(np.intp)
+    at = at[:, 1].clip(0, height - 1), at[:, 0].clip(0, width - 1)
+    around = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(depth, around)[at], cv2.dilate(depth, around)[at]
+    return np.where((low > 0) & (high < ONE_SURFACE * low), depth[at], 0)
+
+
+def _from_depth(
+    rays: np.ndarray, depths: np.ndarray, seen: np.ndarray, focal: float
+) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Return rotation and translation that take the points rays * depths (N,) to where they are ``seen`` (N, 2)."""
+    if len(rays) < LEAST_INLIERS:
+        return None
+    points = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
+    cv2.setRNGSeed(SEED)
+    error = MAX_ERROR_PX / focal
+    there, turn, step, inliers = cv2.solvePnPRansac(
+        points, seen, np.eye(3), None, iterationsCount=500, reprojectionError=error, confidence=CONFIDENCE
+    )
+    if not there or inliers is None or len(inliers) < LEAST_INLIERS:
+        return None
+    kept = inliers[:, 0].astype(np.intp)
+    turn, step = cv2.solvePnPRefineLM(points[kept], seen[kept], np.eye(3), None, turn, step)
+    return cv2.Rodrigues(turn)[0], step[:, 0], len(kept)
+
+
+def _from_color(in_match: np.ndarray, in_query: np.ndarray, focal: float) -> Relative | None:
+    cv2.setRNGSeed(SEED)
+    essential, mask = cv2.findEssentialMat(in_match, in_query, np.eye(3), cv2.RANSAC, CONFIDENCE, MAX_ERROR_PX / focal)
+    if essential is None or essential.shape != (3, 3):
+        return None
+    inliers = mask[:, 0] > 0
+    if np.count_nonzero(inliers) < LEAST_INLIERS:
+        return None
+    turned, parallax = _turned(in_match[inliers], in_query[inliers])
+    if parallax * focal < LEAST_PARALLAX_PX:
+        return Relative(_pose(turned, np.zeros(3), inverse=True), ROTATION_ONLY, int(np.count_nonzero(inliers)))
+    count, rotation, step, _ = cv2.recoverPose(essential, in_match, in_query, np.eye(3), mask=mask.copy())
+    if count < LEAST_INLIERS:
+        return None
+    return Relative(_pose(rotation, step[:, 0], inverse=True), UP_TO_SCALE, int(count))
+
+
+def _turned(in_match: np.ndarray, in_query: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the rotation (3, 3) that brings the rays (N, 2) nearest, and the median of what is left, at depth 1."""
+    a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (in_match, in_query))
+    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
+    weights, left = np.ones(len(a)), np.zeros(len(a))
+    turn = Rotation.identity()
+    for _ in range(5):  # outliers lose their weight
+        turn = Rotation.align_vectors(b, a, weights=weights)[0]
+        left = np.linalg.norm(b - turn.apply(a), axis=1)
+        weights = 1 / (1 + (left / max(2 * float(np.median(left)), 1e-9)) ** 2) ** 2
+    return turn.as_matrix(), float(np.median(left))
+
+
+def _pose(rotation: np.ndarray, translation: np.ndarray, inverse: bool) -> np.ndarray:
+    """Return x -> rotation x + translation, or its inverse, as a pose (7,) with w >= 0."""
+    turn = Rotation.from_matrix(rotation)
+    if inverse:
+        turn, translation = turn.inv(), -turn.inv().apply(translation)
+    return np.concatenate([translation, turn.as_quat(canonical=True)])

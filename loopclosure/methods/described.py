@@ -1,0 +1,55 @@
+"""Descriptors by a function of the user's, a pre-trained net for example: ``describe`` on the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopclosure.descriptors.similarity import METRICS, similarity_matrix
+from loopclosure.detector.run import load_describe, views_of
+from loopclosure.errors import InputError
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_inner
+from loopclosure.places.frames import read_bgr
+from loopclosure.progress import Progress, timed
+
+
+@dataclass
+class DescribedMethod:
+    """The descriptors of ``MODULE|FILE.py:FUNCTION``, an image (H, W, 3) BGR -> (D,), compared by one metric."""
+
+    function: str
+    metric: str = METRICS[0]
+
+    @property
+    def name(self) -> str:
+        """The function, and the metric."""
+        return f"{self.function} ({self.metric})"
+
+    def score(self, images: Images, progress: Progress) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says."""
+        seconds: dict[str, float] = {}
+        with timed(seconds, "loading"):
+            describe = load_describe(self.function, {})
+        rows: list[np.ndarray] = []
+        for path in progress(images.tested, "descriptors", len(images.tested)):
+            with timed(seconds, "descriptors"):
+                rows.append(np.asarray(describe(read_bgr(path)), np.float32).reshape(-1))
+            if len(rows[-1]) != len(rows[0]):
+                raise InputError(f"{self.function} gave {len(rows[-1])} numbers, and {len(rows[0])} before", path)
+        with timed(seconds, "similarity"):
+            queries, references = np.split(np.array(rows), [len(images.queries)])
+            others = None if images.references is None else references
+            scores = similarity_matrix(queries, others, self.metric, views_of(describe, None))
+        return MethodResult(scores, seconds, [f"{len(rows[0])} dimensions, {self.metric}"], ("loading",))
+
+
+def described(argument: str, context: MethodContext, inner: Method | None) -> DescribedMethod:
+    """Build ``describe:MODULE|FILE.py:FUNCTION[:euclidean|cosine]``."""
+    refuse_inner("describe", inner)
+    function, _, metric = argument.rpartition(":")
+    if metric not in METRICS:
+        function, metric = argument, METRICS[0]
+    if ":" not in function:
+        raise InputError(f'"describe:{argument}": expected describe:FILE.py:FUNCTION or describe:MODULE:FUNCTION')
+    return DescribedMethod(function, metric)

@@ -1,0 +1,103 @@
+"""The online detector as it runs, as a method: ``detector`` on the command line.
+
+It sees the frames in order, and decides with exclusion, threshold, consistency and geometric verification. Only the
+pairs that it accepts get a score.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.descriptors.feature_file import read_features
+from loopclosure.detector.detector import DetectorSettings, LoopDetector
+from loopclosure.detector.run import Recording, calibrate_on_data_set, run_detector, validation_set
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.errors import InputError
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_inner
+from loopclosure.methods.settings import configure
+from loopclosure.progress import Progress, timed
+
+# Where the settings of detector:FILE.npz:SETTINGS begin.
+SETTINGS_BEGIN = re.compile(r":(?=\w+=)")
+
+
+@dataclass
+class OnlineMethod:
+    """A :class:`LoopDetector` on descriptors from a file.
+
+    features            the file, of ``netspec extract --images``
+    threshold           least score of a loop; or it is chosen on the sequence ``calibrate`` with ``calibrate_truth``, a
+                        mask, if it is not a TUM sequence, and ``calibrate_features``, for at least ``precision``
+    verify              verify candidates by ``check``
+    """
+
+    features: Path
+    settings: DetectorSettings = field(default_factory=DetectorSettings)
+    check: GeometricCheck = field(default_factory=GeometricCheck)
+    threshold: float = float("nan")
+    calibrate: str = ""
+    calibrate_truth: str = ""
+    calibrate_features: str = ""
+    precision: float = 0.99
+    verify: bool = False
+
+    @property
+    def name(self) -> str:
+        """The file's name, and whether candidates are verified."""
+        return f"detector, {self.features.stem}{', verified' if self.verify else ''}"
+
+    def score(self, images: Images, progress: Progress) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says: the score of each accepted pair, else NaN."""
+        if images.references is not None:
+            raise InputError("the detector finds loops in one sequence, and these are queries and references")
+        described = read_features(self.features)
+        threshold = None if self.calibrate else self.threshold
+        settings = replace(self.settings, threshold=threshold, views=described.views)
+        detector = LoopDetector(settings=settings, check=self.check if self.verify else None)
+        seconds: dict[str, float] = {}
+        notes = []
+        if self.calibrate:
+            with timed(seconds, "calibration"):
+                data = validation_set(self.calibrate, self.calibrate_truth, detector.settings)
+                validation = read_features(self.calibrate_features)
+                notes.append(calibrate_on_data_set(detector, data, self.precision, validation, progress))
+        if np.isfinite(described.seconds_per_image):
+            seconds["features"] = described.seconds_per_image * len(images.queries)
+        recording = Recording(
+            self.features, [p.name for p in images.queries], images.queries, np.arange(len(images.queries))
+        )
+        with timed(seconds, "detection"):
+            results = run_detector(detector, recording, described, progress)
+        scores = np.full((len(results), len(results)), np.nan)
+        for result in results:
+            if result.accepted is not None:
+                scores[result.query_id, result.accepted] = result.score
+        verdicts = [result.verdict for result in results]
+        counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
+        notes += [f"frames: {counts}", f"{detector.settings}", f"{detector.check or 'no geometric verification'}"]
+        return MethodResult(scores, seconds, notes, ("calibration",))
+
+
+def online(argument: str, context: MethodContext, inner: Method | None) -> OnlineMethod:
+    """Build ``detector:FILE.npz:threshold=T[,setting=value,...]``; or with ``calibrate=SEQUENCE`` for the threshold."""
+    refuse_inner("detector", inner)
+    path, *settings = SETTINGS_BEGIN.split(argument, maxsplit=1)
+    if not path.endswith(".npz"):
+        raise InputError(f'"detector:{argument}": expected detector:FILE.npz:threshold=T, or calibrate=SEQUENCE')
+    method, detector, check = configure(
+        "detector",
+        "".join(settings),
+        OnlineMethod(Path(path)),
+        DetectorSettings(exclude_recent=context.exclude_frames),
+        GeometricCheck(),
+    )
+    if np.isnan(method.threshold) == (not method.calibrate):
+        raise InputError("the detector needs either threshold=T or calibrate=SEQUENCE")
+    if bool(method.calibrate) != bool(method.calibrate_features):
+        raise InputError("calibrate=SEQUENCE needs calibrate_features=FILE.npz, the same net's")
+    method.settings, method.check = detector, check
+    return method

@@ -1,0 +1,122 @@
+"""Geometric verification of another method's best matches: ``verified+METHOD`` on the command line.
+
+The best k references of each query are compared by local features and a fundamental matrix (an essential matrix, where
+the camera is known). What has too few inliers is rejected: it gets no score, so that a method that accepts nothing
+finds nothing. On top of SeqSLAM a sequence is verified, not a single image: a pair is accepted if any pair on one of
+its trajectories is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.errors import InputError
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
+from loopclosure.methods.seqslam import SeqSlam
+from loopclosure.methods.settings import configure
+from loopclosure.places.frames import read_gray
+from loopclosure.progress import Progress, timed
+
+# The least of what published systems ask for, 12 to 22.
+MIN_INLIERS = 12
+ORDERS = ("score", "inliers")
+
+
+@dataclass
+class Verified:
+    """The best ``k`` references of each query by another method, verified by their geometry.
+
+    inner           the method whose candidates are verified
+    check           how, with how many inliers
+    k               candidates per query
+    order           of what is accepted: by the inner method's "score", or by the "inliers" of each pair. Inliers tell
+                    whether two views show the same things, but not from how near
+    exclude_frames  in one sequence, references within this many frames of the query are not candidates
+    """
+
+    inner: Method
+    check: GeometricCheck = field(default_factory=lambda: GeometricCheck(min_inliers=MIN_INLIERS))
+    k: int = 20
+    order: str = "score"
+    exclude_frames: int = 0
+
+    def __post_init__(self) -> None:
+        if self.k < 1:
+            raise InputError(f"verified examines the best k of each query, k = {self.k}; expected 1 or more")
+        if self.order not in ORDERS:
+            raise InputError(f'order of verified is "{self.order}"; expected {" or ".join(ORDERS)}')
+
+    @property
+    def name(self) -> str:
+        """The inner method's name after ``verified+``."""
+        return f"verified+{self.inner.name}"
+
+    def score(self, images: Images, progress: Progress) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says; NaN for what is not accepted."""
+        found = self.inner.score(images, progress)
+        seconds = dict(found.seconds)
+        candidates = np.where(np.isnan(found.scores), -np.inf, found.scores)
+        if images.references is None:
+            candidates[~earlier(len(images.queries), self.exclude_frames)] = -np.inf
+        inliers = self._inliers(candidates, images, progress, seconds)
+        accepted = inliers >= self.check.min_inliers
+        notes = [
+            *found.notes,
+            f"{np.count_nonzero(accepted)} of {np.count_nonzero(inliers >= 0)} pairs, the best {self.k} of each query, "
+            f"have {self.check.min_inliers} inliers; {self.check}",
+        ]
+        if self.order == "inliers":
+            return MethodResult(np.where(accepted, inliers, np.nan), seconds, notes, found.training_stages)
+        if isinstance(self.inner, SeqSlam):
+            accepted = on_trajectories(accepted, self.inner.settings.offsets())
+            notes.append("a pair is accepted if any pair on one of its trajectories is")
+        scores = np.where(accepted & ~np.isneginf(candidates), found.scores, np.nan)
+        return MethodResult(scores, seconds, notes, found.training_stages)
+
+    def _inliers(
+        self, candidates: np.ndarray, images: Images, progress: Progress, seconds: dict[str, float]
+    ) -> np.ndarray:
+        """Return the inliers of the best k candidates of each query, -1 for other pairs: (Q, R)."""
+        local = []
+        for path in progress(images.tested, "local features", len(images.tested)):
+            with timed(seconds, "local features"):
+                local.append(self.check.describe(read_gray(path)))
+        references = local if images.references is None else local[len(images.queries) :]
+        inliers = np.full(candidates.shape, -1, np.int64)
+        for query in progress(range(len(candidates)), "verification", len(candidates)):
+            with timed(seconds, "verification"):
+                best = np.argsort(-candidates[query], kind="stable")[: self.k]
+                for reference in best[~np.isneginf(candidates[query, best])]:
+                    inliers[query, reference] = self.check.inliers(local[query], references[reference])
+        return inliers
+
+
+def on_trajectories(accepted: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Return the pairs (Q, R) that have an accepted one on a trajectory through them.
+
+    offsets  (T, steps) the reference of each trajectory at each step, relative to that of the pair, which is at step
+             (steps - 1) // 2
+    """
+    queries, references = accepted.shape
+    steps = offsets.shape[1]
+    half = (steps - 1) // 2
+    reach = int(np.abs(offsets).max())
+    padded = np.pad(accepted, ((half, steps - 1 - half), (reach, reach)))
+    supported = np.zeros_like(accepted)
+    for step in range(steps):
+        for offset in np.unique(offsets[:, step]):
+            supported |= padded[step : step + queries, reach + offset : reach + offset + references]
+    return supported
+
+
+def verified(argument: str, context: MethodContext, inner: Method | None) -> Verified:
+    """Build ``verified[:setting=value,...]+METHOD``."""
+    if inner is None:
+        raise InputError("verified needs a method whose best matches it verifies; write verified+METHOD")
+    plain = Verified(inner, exclude_frames=context.exclude_frames)
+    method, check = configure("verified", argument, plain, plain.check)
+    method.check = check
+    return method

@@ -1,0 +1,182 @@
+"""Images, poses and calibration from ROS 1 and ROS 2 bags, through the library ``rosbags`` (an extra)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loopclosure.errors import InputError
+from loopclosure.places.intrinsics import Intrinsics
+
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+POSES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+CAMERA_INFO, TREE = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
+BAYER = {
+    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
+    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
+    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
+}
+TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR, "bgra8": cv2.COLOR_BGRA2BGR, **BAYER}
+CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, **dict.fromkeys(BAYER, 1)}
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path looks like a bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml."""
+    return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+
+
+class Bag:
+    """An open bag, with its topic of images, and its topic of poses if it has one."""
+
+    def __init__(self, reader: Any, path: Path, topic: str, pose_topic: str) -> None:
+        self._reader, self.path = reader, path
+        images = {c.topic: c for c in reader.connections if c.msgtype in IMAGES}
+        color = [name for name in images if "depth" not in name]
+        self.topic = self._chosen(topic, list(images), color or list(images), "images", "--topic", needed=True)
+        poses = [c.topic for c in reader.connections if c.msgtype in POSES]
+        self.pose_topic = self._chosen(pose_topic, poses, poses, "poses", "--pose-topic", needed=False)
+        self.frame = ""  # of the images: known when they have been read
+        self.count = images[self.topic].msgcount
+
+    def images(self) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield (stamp in seconds, image (H, W, 3) uint8 BGR)."""
+        for message in self._messages(self.topic):
+            self.frame = message.header.frame_id
+            yield _seconds(message.header.stamp), self._image(message)
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray, str]:
+        """Return stamps (N,), poses (N, 7) of the camera, and a sentence about how they came to be the camera's.
+
+        A static transform from the frame of the poses to that of the images is applied, where the bag has one.
+        """
+        stamps, rows, child = [], [], ""
+        for message in self._messages(self.pose_topic):
+            child = getattr(message, "child_frame_id", "")
+            inner = getattr(message, "transform", None) or message.pose
+            inner = getattr(inner, "pose", inner)  # with covariance
+            place = getattr(inner, "translation", None) or inner.position
+            turn = getattr(inner, "rotation", None) or inner.orientation
+            stamps.append(_seconds(message.header.stamp))
+            rows.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
+        poses = np.array(rows).reshape(-1, 7)
+        mount = self._mount(child) if child and self.frame else None
+        if mount is None:
+            return np.array(stamps), poses, f"poses of {self.pose_topic} are taken as the camera's"
+        turns = Rotation.from_quat(poses[:, 3:])
+        poses[:, :3] += turns.apply(mount[:3, 3])
+        poses[:, 3:] = (turns * Rotation.from_matrix(mount[:3, :3])).as_quat()
+        return np.array(stamps), poses, f"poses of {self.pose_topic}, moved from {child} to {self.frame}"
+
+    def camera(self) -> Intrinsics | None:
+        """Return the camera that a CameraInfo beside the images says, None without one."""
+        beside = self.topic.rsplit("/", 2 if self.topic.endswith("/compressed") else 1)[0]
+        for connection in self._reader.connections:
+            if connection.msgtype == CAMERA_INFO and connection.topic == f"{beside}/camera_info":
+                for message in self._messages(connection.topic):
+                    k, d = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 1, 2
+                    pinhole = message.distortion_model in ("plumb_bob", "") and len(d) in (0, 4, 5)
+                    if not (k[0] > 0 and pinhole):
+                        return None
+                    bent = tuple(float(value) for value in d) if np.any(d) else ()
+                    size = (int(message.width), int(message.height))
+                    return Intrinsics(float(k[0]), float(k[4]), float(k[2]), float(k[5]), bent, size)
+        return None
+
+    def _messages(self, topic: str) -> Iterator[Any]:
+        connections = [c for c in self._reader.connections if c.topic == topic]
+        for connection, _, raw in self._reader.messages(connections=connections):
+            yield self._reader.deserialize(raw, connection.msgtype)
+
+    def _chosen(self, wanted: str, known: list[str], likely: list[str], what: str, option: str, needed: bool) -> str:
+        if wanted and wanted not in known:
+            raise InputError(f'has no topic "{wanted}" with {what}; there are: {", ".join(known) or "none"}', self.path)
+        if wanted or len(likely) == 1:
+            return wanted or likely[0]
+        if likely:
+            several = ", ".join(likely)
+            raise InputError(f"has several topics with {what}: {several}; choose one with {option}", self.path)
+        if needed:
+            topics = ", ".join(f"{c.topic} ({c.msgtype})" for c in self._reader.connections)
+            raise InputError(f"has no topic with {what}; there are: {topics or 'none'}", self.path)
+        return ""
+
+    def _image(self, message: Any) -> np.ndarray:
+        if not hasattr(message, "encoding"):
+            image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
+            if image is None:
+                raise InputError(f"{self.topic} has a compressed image that cannot be read", self.path)
+            return image
+        channels = CHANNELS.get(message.encoding)
+        if channels is None:
+            known = ", ".join(CHANNELS)
+            raise InputError(f'{self.topic} has images in "{message.encoding}"; known: {known}', self.path)
+        rows = np.asarray(message.data, np.uint8)[: message.height * message.step].reshape(message.height, message.step)
+        image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
+        if message.encoding in TO_BGR:
+            return cv2.cvtColor(image, TO_BGR[message.encoding])
+        return np.repeat(image, 3, axis=2) if channels == 1 else image
+
+    def _mount(self, body: str) -> np.ndarray | None:
+        """Return the pose (4, 4) of the images' frame in the frame ``body`` by the static transforms, None without."""
+        near: dict[str, list[tuple[str, np.ndarray]]] = {}
+        for connection in self._reader.connections:
+            if connection.msgtype != TREE or not connection.topic.endswith("tf_static"):
+                continue
+            for message in self._messages(connection.topic):
+                for link in message.transforms:
+                    place, turn = link.transform.translation, link.transform.rotation
+                    step = np.eye(4)
+                    step[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+                    step[:3, 3] = place.x, place.y, place.z
+                    parent, child = link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/")
+                    near.setdefault(parent, []).append((child, step))
+                    near.setdefault(child, []).append((parent, np.linalg.inv(step)))
+        reached = {body.lstrip("/"): np.eye(4)}
+        waiting = list(reached)
+        while waiting:
+            frame = waiting.pop()
+            for other, step in near.get(frame, []):
+                if other not in reached:
+                    reached[other] = reached[frame] @ step
+                    waiting.append(other)
+        return reached.get(self.frame.lstrip("/"))
+
+
+@contextmanager
+def open_bag(path: Path, topic: str = "", pose_topic: str = "") -> Iterator[Bag]:
+    """Open a bag for a ``with`` statement. Raises InputError if it cannot be read, or has no such topic."""
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise InputError(
+            "is a ROS bag, which the library rosbags reads: pip install 'netspec-caffe[bag]'", path
+        ) from None
+    if not path.exists():
+        raise InputError("no such bag", path)
+    if path.suffix == ".db3" and (path.parent / "metadata.yaml").is_file():
+        path = path.parent
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            yield Bag(reader, path, topic, pose_topic)
+    except InputError:
+        raise
+    except (AnyReaderError, AssertionError, ValueError, KeyError, OSError) as fault:
+        reason = " ".join(str(fault).split()) or type(fault).__name__
+        raise InputError(f"cannot be read as a ROS bag ({reason})", path) from None
+
+
+def _seconds(stamp: Any) -> float:
+    return stamp.sec + 1e-9 * stamp.nanosec

@@ -1,0 +1,127 @@
+"""The camera's inner geometry: from ``calibration.txt``, EuRoC's ``sensor.yaml``, KITTI's ``calib.txt``, or numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from loopclosure.errors import InputError
+
+FORM = "FX,FY,CX,CY or FX,FY,CX,CY,K1,K2,P1,P2 or FX,FY,CX,CY,K1,K2,P1,P2,K3"
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera: focal lengths and principal point in pixels, OpenCV's distortion (k1 k2 p1 p2 [k3]).
+
+    ``size`` is (width, height) in pixels of the images that the numbers are for, None if not known.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    size: tuple[int, int] | None = None
+
+    def of_size(self, width: int, height: int) -> Intrinsics:
+        """Return the camera of images that were scaled to this size; the center of a pixel has whole coordinates."""
+        if self.size is None or self.size == (width, height):
+            return self
+        x, y = width / self.size[0], height / self.size[1]
+        cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
+        return replace(self, fx=self.fx * x, fy=self.fy * y, cx=cx, cy=cy, size=(width, height))
+
+    def rays(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (N, 2) as points (N, 2) of the plane at depth 1, without distortion."""
+        matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+        pixels = np.asarray(points, np.float64).reshape(-1, 1, 2)
+        return cv2.undistortPoints(pixels, matrix, np.array(self.distortion or (0.0,) * 4)).reshape(-1, 2)
+
+
+def from_text(text: str) -> Intrinsics:
+    """Read the numbers that a command's ``--camera`` gives. Raises InputError for other texts."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (4, 8, 9):
+        raise InputError(f'expected {FORM} in pixels, found "{text}"')
+    return _checked(numbers[:4], numbers[4:], None, "")
+
+
+def write_calibration(path: Path, camera: Intrinsics) -> None:
+    """Write ``calibration.txt``, which :func:`read_intrinsics` reads."""
+    size = camera.size or (0, 0)
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *size, *camera.distortion]
+    head = "# fx fy cx cy width height" + (" k1 k2 p1 p2 k3"[: 3 * len(camera.distortion)])
+    path.write_text(f"{head}\n{' '.join(f'{number:.9g}' for number in numbers)}\n", encoding="utf-8")
+
+
+def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:
+    """Read a file of the three forms: ``sensor.yaml``, ``calib.txt`` (of its ``camera``, P0 to P3), or one row.
+
+    The row is that of ``calibration.txt``: fx fy cx cy width height, and k1 k2 p1 p2 [k3] where there is distortion.
+    Raises InputError for other files.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError):
+        raise InputError("cannot be read as text; expected the camera's calibration", path) from None
+    if path.suffix == ".yaml":
+        model = re.search(r"^distortion_model\s*:\s*(\S+)", text, re.MULTILINE)
+        if model and model[1] not in ("radial-tangential", "radtan", "plumb_bob"):
+            raise InputError(f"distortion model {model[1]} is not supported; expected radial-tangential", path)
+        size = yaml_numbers(text, "resolution", 2, path)
+        inner = yaml_numbers(text, "intrinsics", 4, path)
+        return _checked(inner, yaml_numbers(text, "distortion_coefficients", 4, path), size, path)
+    if camera:
+        matrix = kitti_projection(text, camera, path)
+        return _checked([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], [], None, path)
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    try:
+        numbers = [float(field) for field in rows[0]] if len(rows) == 1 else []
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (6, 10, 11):
+        raise InputError("expected one row: fx fy cx cy width height, and k1 k2 p1 p2 [k3] with distortion", path)
+    return _checked(numbers[:4], numbers[6:], numbers[4:6], path)
+
+
+def yaml_numbers(text: str, key: str, count: int, path: Path) -> list[float]:
+    """Return the ``count`` numbers in brackets behind ``key:`` of a YAML text, over several lines or one."""
+    found = re.search(rf"^\s*{key}\s*:\s*\[([^\]]*)\]", text, re.MULTILINE)
+    try:
+        numbers = [float(part) for part in found[1].split(",")] if found else []
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise InputError(f'expected "{key}: [...]" with {count} numbers, as in the sensor.yaml of EuRoC', path)
+    return numbers
+
+
+def kitti_projection(text: str, camera: str, path: Path) -> np.ndarray:
+    """Return the projection (3, 4) of a ``camera``, P0 to P3, from the text of KITTI's ``calib.txt``."""
+    found = re.search(rf"^{camera}\s*:(.*)$", text, re.MULTILINE)
+    try:
+        numbers = [float(part) for part in found[1].split()] if found else []
+    except ValueError:
+        numbers = []
+    if len(numbers) != 12 or not numbers[0] > 0:
+        raise InputError(f'expected "{camera}:" and the twelve numbers of a projection, as in KITTI\'s calib.txt', path)
+    return np.array(numbers).reshape(3, 4)
+
+
+def _checked(
+    inner: Sequence[float], distortion: Sequence[float], size: Sequence[float] | None, path: str | Path
+) -> Intrinsics:
+    values = [*inner, *distortion, *(size or ())]
+    if not np.all(np.isfinite(values)) or min(inner[:2]) <= 0:
+        raise InputError(f"a camera has focal lengths above 0, not {inner[0]:g} and {inner[1]:g}", path)
+    known = (int(size[0]), int(size[1])) if size is not None and min(size) > 0 else None
+    return Intrinsics(inner[0], inner[1], inner[2], inner[3], tuple(distortion), known)

@@ -1,0 +1,252 @@
+"""Files of poses in the forms of TUM, KITTI and EuRoC, and what makes a path look wrong.
+
+TUM    ``timestamp tx ty tz qx qy qz qw``: seconds, meters, w last
+KITTI  twelve numbers, the upper three rows of a 4 x 4 matrix; no time: one row per image
+EuRoC  ``timestamp,px,py,pz,qw,qx,qy,qz,...``: nanoseconds, meters, w first; more columns are not read
+
+All of them say where the camera (EuRoC: the body) is in the world, unless a form says ``world-to-camera``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loopclosure.errors import InputError
+from loopclosure.places.trajectory import (
+    MAX_DIFFERENCE_S,
+    NORM_TOLERANCE,
+    Trajectory,
+    associate,
+    content_lines,
+    number,
+    quaternions_from_matrices,
+    read_groundtruth,
+)
+
+FORMS = ("tum", "kitti", "euroc")
+ORDERS = ("w-first", "w-last")
+DIRECTIONS = ("camera-to-world", "world-to-camera")
+EXPECTED = (
+    "a file of poses: TUM (timestamp tx ty tz qx qy qz qw), KITTI (twelve numbers of a matrix), or EuRoC "
+    "(timestamp,px,py,pz,qw,qx,qy,qz)"
+)
+# A rotation matrix in text has at least four decimals.
+MATRIX_TOLERANCE = 0.02
+# A step is a jump if it is this many times as fast as all but one step of a hundred, and longer than this.
+JUMP_FACTOR, JUMP_M = 10.0, 0.5
+# A car or a robot moves one way in its own frame. Where another reading of the poses says so, and this one does not,
+# the other is likely. Of a camera in a hand nothing is said.
+ONE_WAY, ALL_WAYS, SHORTER = 0.9, 0.7, 0.5
+
+
+@dataclass(frozen=True)
+class PoseForm:
+    """How a file of poses is to be read; an empty field is found out or is the form's own.
+
+    form       "tum", "kitti" or "euroc": by the number of columns and the commas
+    order      "w-first" or "w-last" of the quaternion: EuRoC's is first, TUM's last
+    direction  "camera-to-world" or "world-to-camera"
+    """
+
+    form: str = ""
+    order: str = ""
+    direction: str = ""
+
+
+@dataclass(frozen=True)
+class PoseFile:
+    """N poses, camera-to-world: ``poses`` (N, 7) tx ty tz qx qy qz qw, and ``stamps`` (N,) in s, None for KITTI.
+
+    ``doubts`` are sentences about what looks wrong; empty if nothing does.
+    """
+
+    poses: np.ndarray
+    stamps: np.ndarray | None
+    form: PoseForm
+    doubts: tuple[str, ...] = field(default=())
+
+    def of_images(
+        self,
+        images: int,
+        stamps: np.ndarray | None,
+        path: str | os.PathLike[str],
+        max_difference: float = MAX_DIFFERENCE_S,
+    ) -> np.ndarray:
+        """Return the poses (images, 7) of images with these stamps, NaN where none is within ``max_difference`` [s].
+
+        Without stamps on one side, pose i is that of image i. Raises InputError if their numbers differ then, or if no
+        image has a pose.
+        """
+        if self.stamps is None or stamps is None:
+            if len(self.poses) != images:
+                missing = "the poses have no time" if self.stamps is None else "the images have no time"
+                raise InputError(
+                    f"has {len(self.poses)} poses, but there are {images} images; {missing}, so pose i must be "
+                    "that of image i",
+                    path,
+                )
+            return self.poses
+        nearest = associate(stamps, Trajectory(self.stamps, self.poses[:, :3], self.poses[:, 3:]), max_difference)
+        if nearest.max() < 0:
+            raise InputError(
+                f"none of {images} images has a pose within {max_difference:g} s: images from {stamps[0]:.3f} to "
+                f"{stamps[-1]:.3f} s, poses from {self.stamps[0]:.3f} to {self.stamps[-1]:.3f} s",
+                path,
+            )
+        return np.where(nearest[:, None] < 0, np.nan, self.poses[nearest])
+
+
+def pose_form(text: str) -> PoseForm:
+    """Read words such as ``tum,w-first,world-to-camera``; InputError for others."""
+    chosen = {}
+    for word in filter(None, text.split(",")):
+        for name, known in (("form", FORMS), ("order", ORDERS), ("direction", DIRECTIONS)):
+            if word in known:
+                chosen[name] = word
+                break
+        else:
+            known_words = ", ".join((*FORMS, *ORDERS, *DIRECTIONS))
+            raise InputError(f'"{word}" says nothing of how poses are written; known: {known_words}')
+    return PoseForm(**chosen)
+
+
+def read_poses(path: str | os.PathLike[str], form: PoseForm = PoseForm()) -> PoseFile:
+    """Read a file of poses, in the order of time where it has one.
+
+    Raises InputError (file:line:column) for a line of another form, and for a rotation that is none.
+    """
+    kind = form.form or _form_of(path)
+    order = form.order or ("w-first" if kind == "euroc" else "w-last")
+    if kind == "tum":
+        trajectory = read_groundtruth(path)
+        stamps, positions, quaternions = trajectory.stamps, trajectory.positions, trajectory.quaternions
+    elif kind == "euroc":
+        table = _rows(path, kind, 8)
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        stamps, positions, quaternions = table[:, 0] * 1e-9, table[:, 1:4], table[:, 4:8]
+    else:
+        matrices = _rows(path, kind, 12).reshape(-1, 3, 4)
+        stamps, positions, quaternions = None, matrices[:, :, 3], quaternions_from_matrices(matrices[:, :, :3])
+    if kind != "kitti" and order == "w-first":
+        quaternions = np.roll(quaternions, -1, axis=1)
+    poses = np.hstack([positions, quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)])
+    if form.direction == "world-to-camera":
+        poses = inverse(poses)
+    read = PoseForm(kind, "" if kind == "kitti" else order, form.direction or DIRECTIONS[0])
+    return PoseFile(poses, stamps, read, tuple(doubts(poses, stamps, read)))
+
+
+def inverse(poses: np.ndarray) -> np.ndarray:
+    """Return the inverse (N, 7) of each pose (7,)."""
+    turns = Rotation.from_quat(poses[:, 3:]).inv()
+    return np.hstack([-turns.apply(poses[:, :3]), turns.as_quat(canonical=True)])
+
+
+def moved(poses: np.ndarray, mount: np.ndarray) -> np.ndarray:
+    """Return the poses (N, 7) of a sensor, whose pose in a body is the matrix ``mount`` (4, 4), from the body's."""
+    turns = Rotation.from_quat(poses[:, 3:])
+    positions = poses[:, :3] + turns.apply(mount[:3, 3])
+    return np.hstack([positions, (turns * Rotation.from_matrix(mount[:3, :3])).as_quat(canonical=True)])
+
+
+def doubts(poses: np.ndarray, stamps: np.ndarray | None, form: PoseForm = PoseForm()) -> list[str]:
+    """Return sentences about poses (N, 7) that look wrong: jumps, the world first, the order of the quaternion."""
+    found = []
+    steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+    if len(steps) < 10:
+        return found
+    times = np.ones(len(steps)) if stamps is None else np.maximum(np.diff(stamps), 1e-6)
+    speeds = steps / times
+    usual = float(np.percentile(speeds, 99 if len(steps) > 200 else 90))
+    jumps = np.flatnonzero((speeds > JUMP_FACTOR * usual) & (steps > JUMP_M))
+    if len(jumps):
+        at = int(jumps[np.argmax(steps[jumps])])
+        found.append(
+            f"the path jumps {len(jumps)} time{'s'[: len(jumps) > 1]}: by {steps[at]:.3g} m from pose {at + 1} to "
+            f"{at + 2}, where steps are mostly below {float(np.percentile(steps, 90)):.2g} m"
+        )
+    direction = DIRECTIONS[form.direction != DIRECTIONS[1]]
+    back = inverse(poses)
+    shorter = np.linalg.norm(np.diff(back[:, :3], axis=0), axis=1).sum() < SHORTER * steps.sum()
+    if shorter and _one_way(back) > ONE_WAY:
+        found.append(
+            f"read as {direction}, the path is less than half as long, and the camera always moves one way: if that is "
+            f"right, say so with --pose-form {direction}"
+        )
+    if form.form != "kitti" and _one_way(poses) < ALL_WAYS:
+        order = ORDERS[form.order != ORDERS[1]]
+        if _one_way(np.hstack([poses[:, :3], _other_order(poses[:, 3:], form.order)])) > ONE_WAY:
+            found.append(
+                "the camera would move now forward, now sideways or back as it turns; with the quaternion read "
+                f"{order} it always moves one way: if that is right, say so with --pose-form {order}"
+            )
+    return found
+
+
+def _other_order(quaternions: np.ndarray, order: str) -> np.ndarray:
+    """Return quaternions xyzw that were read in one order as the other one reads them."""
+    return np.roll(quaternions, 1, axis=1) if order == "w-first" else np.roll(quaternions, -1, axis=1)
+
+
+def _one_way(poses: np.ndarray) -> float:
+    """Return how much the camera moves in one direction of its own: 0 in all, 1 always in the same."""
+    every = max(1, len(poses) // 200)  # longer steps: the direction of a short one is noise
+    poses = poses[::every]
+    steps = np.diff(poses[:, :3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    long = lengths > 0.2 * np.median(lengths)
+    if not lengths[long].any():
+        return 0.0
+    own = Rotation.from_quat(poses[:-1, 3:][long]).inv().apply(steps[long] / lengths[long, None])
+    return float(np.linalg.norm(own.mean(axis=0)))
+
+
+def _form_of(path: str | os.PathLike[str]) -> str:
+    """Return the form of a file of poses, by its first row."""
+    for line_number, line in content_lines(path, EXPECTED):
+        count = len(re.findall(r"[^\s,]+", line))
+        if "," in line and count >= 8:
+            return "euroc"
+        if count == 12:
+            return "kitti"
+        if count == 8:
+            return "tum"
+        raise InputError(f"has {count} numbers in a row; expected {EXPECTED}", path, line_number, 1)
+    raise InputError("holds no pose", path)
+
+
+def _rows(path: str | os.PathLike[str], kind: str, count: int) -> np.ndarray:
+    """Return the first ``count`` numbers of each row (N, count)."""
+    rows = []
+    for line_number, line in content_lines(path, EXPECTED):
+        fields = list(re.finditer(r"[^\s,]+", line))
+        if len(fields) < count or (kind == "kitti" and len(fields) > count):
+            fault = f"has {len(fields)} numbers, a row of {kind.upper()}'s form has {count}"
+            raise InputError(fault, path, line_number, 1)
+        row = [number(fields[i], f"column {i + 1}", path, line_number) for i in range(count)]
+        if fault := _rotation_fault(row, kind):
+            raise InputError(fault, path, line_number, fields[0 if kind == "kitti" else 4].start() + 1)
+        rows.append(row)
+    if not rows:
+        raise InputError("holds no pose", path)
+    return np.array(rows)
+
+
+def _rotation_fault(row: Sequence[float], kind: str) -> str:
+    """Say why the rotation of a row is none; empty if it is one."""
+    if kind == "euroc":
+        length = float(np.linalg.norm(row[4:8]))
+        wrong = abs(length - 1) > NORM_TOLERANCE
+        return f"qw qx qy qz have length {length:.4g}, a rotation has length 1" if wrong else ""
+    matrix = np.array(row).reshape(3, 4)[:, :3]
+    apart = float(np.abs(matrix.T @ matrix - np.eye(3)).max())
+    if apart > MATRIX_TOLERANCE:
+        return f"its first three columns are no rotation: M^T M differs from the identity by {apart:.3g}"
+    reflected = np.linalg.det(matrix) < 0
+    return "its first three columns are a reflection (determinant -1), not a rotation" if reflected else ""

@@ -1,0 +1,300 @@
+"""Sequences of images in the layouts that people have: TUM RGB-D, EuRoC, KITTI odometry, folders and lists.
+
+All of them become one :class:`ImageSequence`, from which evaluation, detection, closing and pairs are made.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.errors import InputError
+from loopclosure.places.image_list import list_images
+from loopclosure.places.intrinsics import Intrinsics, kitti_projection, read_intrinsics, yaml_numbers
+from loopclosure.places.pose_files import PoseForm, moved, read_poses
+from loopclosure.places.trajectory import (
+    MAX_DIFFERENCE_S,
+    Frame,
+    PosedSequence,
+    content_lines,
+    number,
+    read_rgb_list,
+)
+
+QUERIES = ("query", "queries", "Query", "Queries")
+REFERENCES = ("ref", "refs", "reference", "references", "database", "Ref", "Reference", "Database")
+KITTI_CAMERAS = ("image_0", "image_2", "image_1", "image_3")
+EUROC_POSES = ("state_groundtruth_estimate0", "mocap0", "vicon0")
+
+
+@dataclass(frozen=True)
+class ImageSequence:
+    """N images in order.
+
+    images   their paths;  names  the same, relative to ``source``
+    stamps   (N,) seconds, None if not known
+    poses    (N, 7) of the camera in the world, tx ty tz qx qy qz qw, NaN where not known; None without a file of poses
+    camera   None if not known
+    depths   N files of depth in TUM's form (16 bits, 5000 per meter), None for an image without; None if there are none
+    doubts   sentences about poses that look wrong
+    """
+
+    source: Path
+    images: tuple[Path, ...]
+    names: tuple[str, ...]
+    stamps: np.ndarray | None = None
+    poses: np.ndarray | None = None
+    camera: Intrinsics | None = None
+    depths: tuple[Path | None, ...] | None = None
+    doubts: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def name(self) -> str:
+        """The name of the source."""
+        return self.source.resolve().name
+
+    @property
+    def folder(self) -> Path:
+        """What the names are relative to."""
+        return self.source if self.source.is_dir() else self.source.parent
+
+
+@dataclass(frozen=True)
+class PoseChoice:
+    """A file of poses instead of the sequence's own: ``path``, and its ``form``."""
+
+    path: Path
+    form: PoseForm = field(default_factory=PoseForm)
+
+
+def read_sequence(
+    source: str | Path,
+    layout: str = "",
+    max_difference: float = MAX_DIFFERENCE_S,
+    poses: PoseChoice | None = None,
+) -> ImageSequence:
+    """Read a sequence; without a ``layout`` ("tum", "euroc", "kitti" or "images") it is found out.
+
+    Frames without a pose within ``max_difference`` seconds keep no pose. Raises InputError for files that are missing
+    or broken.
+    """
+    source = Path(source)
+    sequence = _READERS[layout or layout_of(source)](source, max_difference, poses is None)
+    if poses is None:
+        return sequence
+    read = read_poses(poses.path, poses.form)
+    found = read.of_images(len(sequence), sequence.stamps, poses.path, max_difference)
+    return replace(sequence, poses=found, doubts=_named(read.doubts, poses.path))
+
+
+def layout_of(source: Path, otherwise: str = "images") -> str:
+    """Return the layout of a source by the folders in it; ``otherwise`` where they tell nothing."""
+    if (source / "mav0").is_dir() or (source / "cam0" / "data.csv").is_file():
+        return "euroc"
+    if any((source / name).is_dir() for name in KITTI_CAMERAS):
+        return "kitti"
+    return otherwise
+
+
+def benchmark_parts(folder: Path) -> tuple[Path, Path, Path]:
+    """Return the queries, the references and the truth of a folder as VPR benchmarks ship it.
+
+    VPR-Bench (Zaffar et al., IJCV 2021): ``query/``, ``ref/``, ``ground_truth_new.npy`` or another ground_truth*.npy.
+    Raises InputError if one of them is missing.
+    """
+    parts = []
+    for names, what in ((QUERIES, "queries"), (REFERENCES, "references")):
+        found = [folder / name for name in names if (folder / name).is_dir()]
+        if not found:
+            raise InputError(f"has no folder {' or '.join(names[:3])} with the {what}", folder)
+        parts.append(found[0])
+    truths = sorted(folder.glob("ground_truth*.npy"))
+    newest = [path for path in truths if path.stem.endswith("_new")] or truths
+    if len(newest) != 1:
+        names = ", ".join(path.name for path in truths) or "none"
+        raise InputError(
+            f"expected one ground_truth*.npy, found {names}; name the parts with --traverses, and the truth", folder
+        )
+    return parts[0], parts[1], newest[0]
+
+
+def read_posed(
+    source: str | Path,
+    layout: str = "",
+    max_difference: float = MAX_DIFFERENCE_S,
+    poses: PoseChoice | None = None,
+) -> PosedSequence:
+    """Read a sequence with poses; frames without one are counted and left out.
+
+    Frames without a time have their numbers for stamps. Raises InputError where no frame has a pose.
+    """
+    return posed(read_sequence(source, layout, max_difference, poses))
+
+
+def posed(sequence: ImageSequence) -> PosedSequence:
+    """Return the frames of a sequence that have a pose. Raises InputError if none has."""
+    poses = sequence.poses
+    if poses is None:
+        raise InputError("has no poses; expected groundtruth.txt, or the name of a file of poses", sequence.source)
+    known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))
+    if not len(known):
+        raise InputError(f"none of its {len(sequence)} images has a pose", sequence.source)
+    stamps = np.arange(len(sequence), dtype=np.float64) if sequence.stamps is None else sequence.stamps
+    return PosedSequence(
+        name=sequence.name,
+        frames=tuple(Frame(float(stamps[i]), sequence.names[i]) for i in known),
+        stamps=stamps[known],
+        positions=poses[known, :3],
+        quaternions=poses[known, 3:],
+        dropped=len(sequence) - len(known),
+        doubts=sequence.doubts,
+    )
+
+
+def _tum(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
+    if not folder.is_dir():
+        raise InputError("no such folder; expected a TUM RGB-D sequence with rgb.txt and groundtruth.txt", folder)
+    frames = read_rgb_list(folder / "rgb.txt")
+    stamps = np.array([frame.stamp for frame in frames])
+    names = tuple(frame.path for frame in frames)
+    sequence = ImageSequence(folder, tuple(folder / name for name in names), names, stamps)
+    return _with_tum_files(sequence, max_difference, own_poses)
+
+
+def _with_tum_files(sequence: ImageSequence, max_difference: float, own_poses: bool) -> ImageSequence:
+    """Add what a TUM sequence has beside its images: poses, depth, calibration."""
+    folder, stamps = sequence.source, sequence.stamps
+    assert stamps is not None
+    if own_poses:
+        path = folder / "groundtruth.txt"
+        read = read_poses(path, PoseForm("tum"))
+        poses = read.of_images(len(sequence), stamps, path, max_difference)
+        sequence = replace(sequence, poses=poses, doubts=_named(read.doubts, path))
+    if (folder / "depth.txt").is_file():
+        depths = read_rgb_list(folder / "depth.txt")
+        taken = np.array([depth.stamp for depth in depths])
+        nearest = np.abs(stamps[:, None] - taken).argmin(axis=1)
+        near = np.abs(stamps - taken[nearest]) <= max_difference
+        files = tuple(
+            folder / depths[number].path if there else None for number, there in zip(nearest, near, strict=True)
+        )
+        sequence = replace(sequence, depths=files)
+    if (folder / "calibration.txt").is_file():
+        sequence = replace(sequence, camera=read_intrinsics(folder / "calibration.txt"))
+    return sequence
+
+
+def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:
+    listed = list_images(source)
+    sequence = ImageSequence(source, listed.paths, (), listed.stamps)
+    sequence = replace(sequence, names=tuple(os.path.relpath(path, sequence.folder) for path in listed.paths))
+    if listed.stamps is None or not source.is_dir():
+        return sequence
+    return _with_tum_files(sequence, max_difference, own_poses and (source / "groundtruth.txt").is_file())
+
+
+def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
+    """EuRoC MAV and TUM-VI (Burri et al., IJRR 2016): the left camera, its poses those of the body and its mount."""
+    base = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    listing = base / "cam0" / "data.csv"
+    if not listing.is_file():
+        raise InputError("no such file; expected an EuRoC sequence, a folder with mav0/cam0/data.csv", listing)
+    stamps, images = [], []
+    for line_number, line in content_lines(listing, 'a list of images, "timestamp [ns],filename" per line'):
+        row = next(csv.reader([line]))
+        if len(row) < 2 or not row[0].strip().isdigit():
+            found = line.strip()[:60]
+            raise InputError(f'expected "timestamp [ns],filename", found "{found}"', listing, line_number, 1)
+        stamps.append(int(row[0]) * 1e-9)
+        images.append(_existing(listing.parent / "data" / row[1].strip(), listing, line_number))
+    if not images:
+        raise InputError("lists no images", listing)
+    order = np.argsort(stamps, kind="stable")
+    images = tuple(images[i] for i in order)
+    times = np.array(stamps)[order]
+    sensor = listing.parent / "sensor.yaml"
+    camera, mount = None, np.eye(4)
+    if sensor.is_file():
+        camera = read_intrinsics(sensor)
+        mount = np.array(yaml_numbers(sensor.read_text(encoding="utf-8-sig"), "data", 16, sensor)).reshape(4, 4)
+    sequence = ImageSequence(folder, images, _names(images, folder), times, camera=camera)
+    if not own_poses:
+        return sequence
+    for name in EUROC_POSES:
+        path = base / name / "data.csv"
+        if path.is_file():
+            body = read_poses(path, PoseForm("euroc"))
+            found = body.of_images(len(sequence), times, path, max_difference)
+            known = np.isfinite(found[:, 0])
+            found[known] = moved(found[known], mount)
+            return replace(sequence, poses=found, doubts=_named(body.doubts, path))
+    return sequence
+
+
+def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
+    """KITTI odometry (Geiger et al., CVPR 2012): ``sequences/00`` with image_0 to image_3, and ``poses/00.txt``.
+
+    The poses are those of camera 0; another camera is beside it by what ``calib.txt`` says.
+    """
+    cameras = [name for name in KITTI_CAMERAS if (folder / name).is_dir()]
+    if not cameras:
+        raise InputError(f"has none of {', '.join(KITTI_CAMERAS)}; expected a folder such as sequences/00", folder)
+    images = list_images(folder / cameras[0]).paths
+    times = None
+    if (folder / "times.txt").is_file():
+        rows = content_lines(folder / "times.txt", "one time in seconds per image")
+        times = np.array([_time(line, folder / "times.txt", line_number) for line_number, line in rows])
+        if len(times) != len(images):
+            raise InputError(f"has {len(times)} times, but there are {len(images)} images", folder / "times.txt")
+    camera, beside = None, np.eye(4)
+    if (folder / "calib.txt").is_file():
+        path, projection = folder / "calib.txt", f"P{cameras[0][-1]}"
+        camera = read_intrinsics(path, projection)
+        matrix = kitti_projection(path.read_text(encoding="utf-8-sig"), projection, path)
+        beside[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    sequence = ImageSequence(folder, images, _names(images, folder), times, camera=camera)
+    if not own_poses:
+        return sequence
+    for path in (folder / "poses.txt", folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"):
+        if path.is_file():
+            read = read_poses(path, PoseForm("kitti"))
+            found = moved(read.of_images(len(sequence), times, path, max_difference), beside)
+            return replace(sequence, poses=found, doubts=_named(read.doubts, path))
+    return sequence
+
+
+_READERS: dict[str, Callable[[Path, float, bool], ImageSequence]] = {
+    "tum": _tum,
+    "euroc": _euroc,
+    "kitti": _kitti,
+    "images": _images,
+}
+
+
+def _time(line: str, path: Path, line_number: int) -> float:
+    found = re.search(r"\S+", line)
+    assert found is not None, "a line with content"
+    return number(found, "the time in seconds", path, line_number)
+
+
+def _names(images: tuple[Path, ...], folder: Path) -> tuple[str, ...]:
+    return tuple(image.relative_to(folder).as_posix() for image in images)
+
+
+def _existing(image: Path, listing: Path, line_number: int) -> Path:
+    if not image.is_file():
+        raise InputError(f'no such image "{image.name}" in {image.parent}', listing, line_number, 1)
+    return image
+
+
+def _named(doubts: tuple[str, ...], path: Path) -> tuple[str, ...]:
+    return tuple(f"{path}: {doubt}" for doubt in doubts)

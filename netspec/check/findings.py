@@ -1,0 +1,140 @@
+"""What rules find in a file: legal, but likely a mistake. Rules have names, so that a comment can silence them.
+
+``# lint: ignore=NAME`` (several separated by commas) holds for its line; alone on a line, for the next one. On the line
+where a layer begins it holds for the whole layer, on the first line of a file for what concerns the file as a whole.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from netspec.errors import SpecError, Where, did_you_mean, printable
+from netspec.proto.source_map import Place
+
+# What a rule looks at, see Rule.
+TEXT, PLAN, NET, SETTINGS, SOLVER = "text", "plan", "net", "settings", "solver"
+UNKNOWN_RULE = "unknown-rule"
+
+_COMMENT = re.compile(r"#\s*lint:\s*ignore\s*=\s*([\w-]+(?:\s*,\s*[\w-]+)*)")
+
+Said = Iterator[tuple[Where, str]]  # where, and what was found with what to do
+F = TypeVar("F", bound=Callable[..., Said])
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of advice: the rule, the place, what was found and what to do."""
+
+    rule: str
+    where: Where
+    message: str
+
+    def __str__(self) -> str:
+        return printable(f"{self.where}: {self.message} [{self.rule}]")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule: its name, why it is there, and how it looks.
+
+    ``looks_at`` is TEXT (the whole net, all phases), PLAN (the net of one phase, shapes unknown), NET (that net,
+    built), SETTINGS (a solver alone) or SOLVER (a solver with its built nets, the training net first).
+    """
+
+    name: str
+    reason: str
+    looks_at: str
+    find: Callable[..., Said]
+
+
+RULES: dict[str, Rule] = {}
+
+
+def rule(name: str, looks_at: str) -> Callable[[F], F]:
+    """Decorator: make a generator of findings a rule; its docstring says why the rule is there."""
+
+    def add(find: F) -> F:
+        assert name not in RULES, f"two rules are called {name}"
+        RULES[name] = Rule(name, " ".join((find.__doc__ or "").split()), looks_at, find)
+        return find
+
+    return add
+
+
+def findings(looks_at: str, *subject: object) -> list[Finding]:
+    """Return what all rules of one kind find."""
+    return [
+        Finding(each.name, where, message)
+        for each in RULES.values()
+        if each.looks_at == looks_at
+        for where, message in each.find(*subject)
+    ]
+
+
+def said_as_json(faults: Iterable[SpecError], found: Iterable[Finding]) -> dict[str, list[dict[str, Any]]]:
+    """Return ``faults`` and ``warnings``, each a list of file, line, column, layer, type, message; and the rule.
+
+    Lines and columns begin at 1; 0 is a place that is not known.
+    """
+    return {
+        "faults": [{**_place(fault.where or Where("")), "message": fault.message} for fault in faults],
+        "warnings": [{**_place(each.where), "message": each.message, "rule": each.rule} for each in found],
+    }
+
+
+def _place(where: Where) -> dict[str, Any]:
+    return {"file": where.file, "line": where.line, "column": where.column, "layer": where.layer, "type": where.type}
+
+
+def not_ignored(found: Iterable[Finding], file: str, layers: Sequence[Place] = ()) -> list[Finding]:
+    """Return the findings without those that a comment of the file silences, and those about such comments.
+
+    ``layers`` are the places of the net's layers.
+    """
+    ignored = _ignored(file)
+    starts = sorted(place.where.line for place in layers)
+    kept = []
+    for each in found:
+        lines = {each.where.line or _first_line(file)}
+        if each.where.layer and starts:
+            lines.add(starts[max(0, bisect_right(starts, each.where.line) - 1)])
+        if each.where.file != file or not any(each.rule in ignored.get(line, {}) for line in lines):
+            kept.append(each)
+    for names in ignored.values():
+        for name, where in names.items():
+            if name not in RULES:
+                hint = did_you_mean(name, list(RULES)) or "; `netspec lint --rules` lists them"
+                kept.append(Finding(UNKNOWN_RULE, where, f'there is no rule "{name}" to ignore{hint}'))
+    return kept
+
+
+def _ignored(file: str) -> dict[int, dict[str, Where]]:
+    """Return the names of rules that are ignored by line, each with the place of its comment."""
+    ignored: dict[int, dict[str, Where]] = {}
+    waiting: dict[str, Where] = {}
+    for number, line in enumerate(_lines(file), 1):
+        text = line.partition("#")[0]
+        found = _COMMENT.search(line)
+        if found:
+            where = Where(file, number, found.start() + 1)
+            waiting.update({name.strip(): where for name in found[1].split(",")})
+        if text.strip() and waiting:
+            ignored[number], waiting = waiting, {}
+    return ignored
+
+
+def _first_line(file: str) -> int:
+    lines = (number for number, line in enumerate(_lines(file), 1) if line.partition("#")[0].strip())
+    return next(lines, 0)
+
+
+def _lines(file: str) -> list[str]:
+    try:
+        return Path(file).read_text(errors="replace").splitlines()
+    except OSError:
+        return []  # the text did not come from a file

@@ -1,0 +1,33 @@
+"""``netspec diff``."""
+
+from __future__ import annotations
+
+import argparse
+
+from netspec.cli.run import Commands
+from netspec.command_line import DONE, SOMETHING, UNREADABLE
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add("diff", _diff, "tell what differs in meaning: nets, solvers or weights", quiet=True)
+    p.add_argument("first", metavar="A", help="a prototxt, a .caffemodel or a .caffemodel.h5")
+    p.add_argument("second", metavar="B", help="another of the same kind")
+    p.add_argument(
+        "--tolerance",
+        type=float,
+        default=0.0,
+        metavar="X",
+        help="weights no further apart are equal (default: 0)",
+    )
+    p.set_defaults(fault_status=UNREADABLE)
+
+
+def _diff(arguments: argparse.Namespace) -> int:
+    from netspec.compare.files import compare_files
+
+    status = DONE
+    for each in compare_files(arguments.first, arguments.second, arguments.tolerance):
+        print(each)
+        status = SOMETHING
+    return status

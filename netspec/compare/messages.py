@@ -1,0 +1,129 @@
+"""Two messages of one kind, field by field: an absent field counts as its default."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import Any
+
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
+
+from netspec.compare.difference import Difference, Differences
+from netspec.errors import Where
+from netspec.proto.schema import Field, fields_of
+from netspec.proto.source_map import Place
+
+#: Fields whose absence means something else than their default.
+TOLD_BY_PRESENCE = {
+    ("caffe.BatchNormParameter", "use_global_stats"),
+    ("caffe.LossParameter", "ignore_label"),
+    ("caffe.LossParameter", "normalization"),
+    ("caffe.LossParameter", "normalize"),
+    ("caffe.ArgMaxParameter", "axis"),
+    ("caffe.PReLUParameter", "filler"),
+    ("caffe.ScaleParameter", "filler"),
+}
+#: Fields of windows, the two fields that say the same by side, and the default.
+WINDOWS = {
+    "kernel_size": ("kernel_h", "kernel_w", 0),
+    "stride": ("stride_h", "stride_w", 1),
+    "pad": ("pad_h", "pad_w", 0),
+    "dilation": (None, None, 1),
+}
+OLD_NAMES = {"concat_dim": "axis", "slice_dim": "axis"}
+ABSENT = "absent"
+
+
+def differences(first: Any, second: Any, here: Place, there: Place, ignored: Collection[str] = ()) -> Differences:
+    """Yield what ``second`` has otherwise than ``first``; ``here`` is the place of ``second``, ``there`` of ``first``.
+
+    The fields ``ignored`` are those of the outermost message. Spellings that mean the same are equal: ``kernel_h`` and
+    ``kernel_w`` for ``kernel_size``, one number for several equal ones, ``concat_dim`` for ``axis``.
+    """
+    done = set(ignored)
+    fields = fields_of(first.DESCRIPTOR)
+    if "kernel_size" in fields:
+        for name, (high, wide, default) in WINDOWS.items():
+            sides = [side for side in (high, wide) if side]
+            if name in fields:
+                done.update((name, *sides))
+                one, other = (_window(message, fields, name, sides, default) for message in (first, second))
+                if one != other:
+                    given = [n for n in (name, *sides) if here.fields.get(n)] or [name]
+                    yield Difference(
+                        here.find(given[0]), f"{name} is {_times(other)}, was {_times(one)}", there.find(name)
+                    )
+    for old, name in OLD_NAMES.items():
+        if old in fields:
+            done.update((old, name))
+            one, other = (fields[old if fields[old].present(m) else name].get(m) for m in (first, second))
+            if one != other:
+                yield Difference(here.find(name), f"{name} is {other}, was {one}", there.find(name))
+    for name, field in fields.items():
+        if name not in done:
+            yield from _in_field(first, second, here, there, field)
+
+
+def _in_field(first: Any, second: Any, here: Place, there: Place, field: Field) -> Differences:
+    name = field.name
+    places = here.find(name), there.find(name)
+    one, other = field.get(first), field.get(second)
+    by_presence = (first.DESCRIPTOR.full_name, name) in TOLD_BY_PRESENCE
+    if by_presence and field.present(first) != field.present(second):
+        told = [_told(field, m) if field.present(m) else ABSENT for m in (first, second)]
+        yield Difference(places[0], f"{name} is {told[1]}, was {told[0]}", places[1])
+    elif field.type == Declared.TYPE_MESSAGE and field.repeated:
+        if len(one) != len(other):
+            yield Difference(places[0], f"{len(other)} {name} {{ }}, were {len(one)}", places[1])
+        for k, (a, b) in enumerate(zip(one, other, strict=False)):
+            yield from differences(a, b, child(here, name, k), child(there, name, k))
+    elif field.type == Declared.TYPE_MESSAGE:
+        if field.present(first) or field.present(second):
+            yield from differences(one, other, child(here, name), child(there, name))
+    elif list(one) != list(other) if field.repeated else one != other and not (one != one and other != other):
+        yield Difference(places[0], f"{name} is {_told(field, second)}, was {_told(field, first)}", places[1])
+
+
+def child(place: Place, name: str, index: int = 0) -> Place:
+    """Return the place of a message in a field, or that of the message around it where it is not there."""
+    children = place.fields.get(name, ())
+    return children[index] if index < len(children) else Place(place.where)
+
+
+def _window(message: Any, fields: dict[str, Field], name: str, sides: list[str], default: int) -> tuple[int, ...]:
+    if any(fields[side].present(message) for side in sides):
+        return tuple(fields[side].get(message) for side in sides)
+    values = fields[name].get(message)
+    given = tuple(values) if fields[name].repeated else (values,)
+    given = given or (default,)
+    return given[:1] * 2 if len(set(given)) == 1 else given
+
+
+def _times(sizes: tuple[int, ...]) -> str:
+    return "x".join(map(str, sizes))
+
+
+def _told(field: Field, message: Any) -> str:
+    value = field.get(message)
+    if field.type == Declared.TYPE_MESSAGE:
+        return "given"
+    return " ".join(_words(field, value if field.repeated else [value])) or ABSENT
+
+
+def _words(field: Field, values: Collection[Any]) -> Iterator[str]:
+    for value in values:
+        if field.type == Declared.TYPE_ENUM:
+            yield field.descriptor.enum_type.values_by_number[value].name
+        elif field.type == Declared.TYPE_BOOL:
+            yield "true" if value else "false"
+        elif field.type in (Declared.TYPE_FLOAT, Declared.TYPE_DOUBLE):
+            yield f"{value:.7g}"
+        elif field.type == Declared.TYPE_STRING:
+            yield f'"{value}"'
+        else:
+            yield str(value)
+
+
+def labeled(difference: Difference, layer: Any) -> Difference:
+    """Return a difference whose place names the layer it belongs to."""
+    where = Where(difference.where.file, difference.where.line, difference.where.column, layer.name, layer.type)
+    return Difference(where, difference.message, difference.other)

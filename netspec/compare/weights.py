@@ -1,0 +1,100 @@
+"""Two files of weights: which layers' numbers differ, and by how much."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from netspec.compare.difference import Difference, Differences
+from netspec.data import blobs
+from netspec.errors import SpecError, Where
+from netspec.hdf5_file import layer_groups, open_hdf5
+from netspec.proto.binary import read_net_binary
+
+Weights = dict[str, list[np.ndarray]]
+
+
+def compare_weights(first: str | Path, second: str | Path, tolerance: float = 0.0) -> Differences:
+    """Yield the blobs whose values differ by more than ``tolerance``, and what only one file has.
+
+    Layers belong together by name. Shapes that differ only in axes of size 1 in front are equal. Raises SpecError for
+    a file that is neither a .caffemodel nor a .caffemodel.h5.
+    """
+    old, new = read_weights(first), read_weights(second)
+    here, there = Where(str(second)), Where(str(first))
+    for name in old:
+        if name not in new:
+            yield Difference(there, f'layer "{name}" is only here, not in the second file')
+    for name, arrays in new.items():
+        if name not in old:
+            yield Difference(here, f'layer "{name}" is only here, not in the first file')
+            continue
+        if len(arrays) != len(old[name]):
+            yield Difference(here, f'layer "{name}" has {len(arrays)} blobs, had {len(old[name])}')
+        for k, (was, now) in enumerate(zip(old[name], arrays, strict=False)):
+            if said := _difference(was, now, tolerance):
+                yield Difference(here, f'layer "{name}", blob {k}: {said}')
+
+
+def read_weights(path: str | Path) -> Weights:
+    """Return the blobs of each layer that has any, in the file's order."""
+    if not Path(path).is_file():
+        raise SpecError("is not a file", Where(str(path)))
+    read = dict(_from_hdf5(path) if h5py.is_hdf5(path) else _from_message(path))
+    if not read:
+        raise SpecError("holds no weights", Where(str(path)))
+    return read
+
+
+def _from_message(path: str | Path) -> Iterator[tuple[str, list[np.ndarray]]]:
+    for layer in read_net_binary(path).layer:
+        try:
+            arrays = [blobs.to_array(blob) for blob in layer.blobs]
+        except ValueError as fault:
+            raise SpecError(f'layer "{layer.name}": {fault}', Where(str(path))) from None
+        if arrays:
+            yield layer.name, arrays
+
+
+def _from_hdf5(path: str | Path) -> Iterator[tuple[str, list[np.ndarray]]]:
+    with open_hdf5(path) as file:
+        data = file.group("data")
+        for name, arrays in layer_groups(data) if data else ():
+            if arrays:
+                yield name, [np.asarray(arrays[key][()], np.float32) for key in sorted(arrays, key=_number)]
+
+
+def _number(key: str) -> tuple[int, str]:
+    return (int(key), "") if key.isdigit() else (1 << 31, key)
+
+
+def _difference(was: np.ndarray, now: np.ndarray, tolerance: float) -> str:
+    if _bare(was) != _bare(now):
+        return f"shape is {_times(now)}, was {_times(was)}"
+    a, b = was.reshape(-1).astype(np.float64), now.reshape(-1).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(a - b)
+        apart = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.where(np.isnan(apart), np.inf, apart))
+    count = int((apart > tolerance).sum())
+    if not count:
+        return ""
+    largest = np.abs(a[np.isfinite(a)]).max(initial=0.0)
+    changed = apart[apart > tolerance]
+    return (
+        f"{count} of {a.size} values differ, by {changed.mean():.3g} in the mean and {changed.max():.3g} at most; "
+        f"the largest was {largest:.3g}"
+    )
+
+
+def _bare(array: np.ndarray) -> tuple[int, ...]:
+    shape = array.shape
+    while shape and shape[0] == 1:
+        shape = shape[1:]
+    return shape
+
+
+def _times(array: np.ndarray) -> str:
+    return "x".join(map(str, array.shape)) or "scalar"

@@ -1,0 +1,63 @@
+"""From a prototxt to a file with its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from netspec.data.blobs import Shape
+from netspec.draw.diagram import diagram_of
+from netspec.draw.html import html_of
+from netspec.draw.picture import picture_of
+from netspec.draw.svg import svg_of
+from netspec.errors import SpecError
+from netspec.proto.schema import NetParameter, PhaseValue
+from netspec.proto.source_map import SourceMap
+from netspec.proto.text import parse_net, parse_solver
+from netspec.solver.nets import solver_nets
+from netspec.whole_file import whole_file
+
+
+def write_picture(
+    path: str | Path,
+    out: Path,
+    phases: Sequence[PhaseValue],
+    level: int = 0,
+    stages: Sequence[str] = (),
+    shapes: Mapping[str, Shape] | None = None,
+    open_data: bool = False,
+    unfolded: bool = False,
+    allow_python: bool = False,
+) -> tuple[SpecError, ...]:
+    """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
+
+    Returns the faults that keep parts of the net from being built: the picture has no shapes there. Raises SpecError
+    for a file that cannot be read.
+    """
+    diagram = diagram_of(*_net_of(path), phases, level, stages, shapes, open_data, allow_python)
+    picture = picture_of(diagram)
+    if out.suffix == ".png":
+        from netspec.draw.png import png_of
+
+        content = png_of(picture, unfolded)
+    elif out.suffix == ".html":
+        content = html_of(diagram, picture).encode()
+    else:
+        content = svg_of(picture, unfolded).encode()
+    with whole_file(out) as unfinished:
+        unfinished.write_bytes(content)
+    return diagram.faults
+
+
+def _net_of(path: str | Path) -> tuple[NetParameter, SourceMap]:
+    try:
+        return parse_net(path)
+    except SpecError:
+        try:
+            solver, node = parse_solver(path)
+        except SpecError:
+            solver = None
+        if solver is None:
+            raise
+    described = solver_nets(solver, node)
+    return described[0].net, described[0].source

@@ -1,0 +1,169 @@
+"""``loopclosure close`` on the synthetic walk, which knows truth and depth; and one false loop put in by hand."""
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmdb_build.walk.sequence import Walk, write_walk
+from loopclosure.cli import main
+from loopclosure.detector.export import relative_pose
+from loopclosure.places.pose_files import read_poses
+from loopclosure.places.same_place import same_place_matrix
+from loopclosure.places.sequences import read_posed
+from paths import shared
+
+pytestmark = pytest.mark.slow
+
+FRAMES = 90
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two laps of a house, with depth, and a table of some of its true loops."""
+    folder = tmp_path_factory.mktemp("close") / "walk"
+    for _ in write_walk(folder, Walk(frames=FRAMES, width=240, height=180, laps=2, seed=11, depth=True)):
+        pass
+    sequence = read_posed(folder)
+    same = np.tril(same_place_matrix(sequence, sequence, 0.4, 12), -20)
+    rows = [f"{i},{int(np.argmax(same[i]))}" for i in np.flatnonzero(same.any(axis=1))]
+    assert len(rows) > 12
+    (folder.parent / "loops.csv").write_text("query_id,match_id\n" + "\n".join(rows) + "\n")
+    return folder
+
+
+def close(walk: Path, out: Path, capsys: pytest.CaptureFixture[str], *more: str, loops: Path | None = None) -> str:
+    table = loops or walk.parent / "loops.csv"
+    line = ["close", str(walk), "--loops", str(table), "--drift", "2", "--seed", "3", *more, "--out", str(out)]
+    assert main(line) == 0, capsys.readouterr().err
+    return capsys.readouterr().out
+
+
+def errors(said: str) -> tuple[float, float]:
+    found = re.search(r"ATE RMSE \[m\]: (\S+) before, (\S+) after", said)
+    assert found is not None
+    return float(found[1]), float(found[2])
+
+
+def test_depth_mends_the_path(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = close(walk, tmp_path, capsys)
+    before, after = errors(said)
+    assert before > 0.1
+    assert after < 0.4 * before
+    assert "loops measured in meters, from depth" in said
+    assert (tmp_path / "paths.png").stat().st_size > 10_000
+    assert len(read_poses(tmp_path / "closed.txt").poses) == FRAMES
+
+
+def test_color_alone_mends_it_too_and_says_what_it_does_not_know(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for name in ("rgb", "rgb.txt", "groundtruth.txt", "calibration.txt"):
+        (bare / name).symlink_to(walk / name)
+    said = close(bare, tmp_path / "out", capsys, loops=walk.parent / "loops.csv")
+    before, after = errors(said)
+    assert after < 0.6 * before
+    assert "direction of the translation (up to scale)" in said
+    assert "give a rotation only" in said
+    assert "from depth" not in said
+
+
+def test_one_false_loop_is_survived(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Frame 40 is said to show the place of frame 5, and its picture is put there, so that the images agree."""
+    lying = tmp_path / "lying"
+    lying.mkdir()
+    names = [line.split()[1] for line in (walk / "rgb.txt").read_text().splitlines()[3:]]
+    (lying / "rgb").mkdir()
+    for number, name in enumerate(names):
+        (lying / name).symlink_to(walk / names[5 if number == 40 else number])
+    for name in ("depth", "depth.txt", "rgb.txt", "groundtruth.txt", "calibration.txt"):
+        (lying / name).symlink_to(walk / name)
+    table = tmp_path / "loops.csv"
+    table.write_text((walk.parent / "loops.csv").read_text() + "40,5\n")
+    _, clean = errors(close(walk, tmp_path / "clean", capsys))
+    said = close(lying, tmp_path / "out", capsys, loops=table)
+    _, after = errors(said)
+    assert after < 1.2 * clean + 0.005
+    with (tmp_path / "out" / "loops.csv").open() as stream:
+        used = {(row["query_id"], row["match_id"]): row["used"] for row in csv.DictReader(stream)}
+    assert used[("40", "5")] == "no"
+
+
+def test_the_graph_says_what_was_measured(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    close(walk, tmp_path, capsys)
+    lines = [line.split() for line in (tmp_path / "closed.g2o").read_text().splitlines()]
+    vertices = {int(words[1]): np.array(words[2:], float) for words in lines if words[0] == "VERTEX_SE3:QUAT"}
+    edges = [
+        (int(words[1]), int(words[2]), np.array(words[3:10], float)) for words in lines if words[0] != "VERTEX_SE3:QUAT"
+    ]
+    assert sorted(vertices) == list(range(FRAMES))
+    assert all(len(words) == 31 for words in lines if words[0] == "EDGE_SE3:QUAT")
+    odometry = read_poses(tmp_path / "odometry.txt").poses
+    for i, j, step in edges[: FRAMES - 1]:
+        assert j == i + 1
+        np.testing.assert_allclose(step, relative_pose(odometry[i], odometry[j]), atol=1e-4)
+    sequence = read_posed(walk)
+    truth = np.hstack([sequence.positions, sequence.quaternions])
+    off = [np.linalg.norm(step[:3] - relative_pose(truth[i], truth[j])[:3]) for i, j, step in edges[FRAMES - 1 :]]
+    assert np.median(off) < 0.06
+
+
+def test_odometry_from_a_file(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = close(walk, tmp_path / "a", capsys)
+    odometry = tmp_path / "a" / "odometry.txt"
+    line = ["close", str(walk), "--loops", str(walk.parent / "loops.csv"), "--odometry", str(odometry)]
+    assert main([*line, "--out", str(tmp_path / "b")]) == 0
+    again = capsys.readouterr().out
+    assert errors(again) == pytest.approx(errors(said), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "words"),
+    [
+        ("--drift 2 --loops NONE", 1, "cannot be read; expected the loops.csv"),
+        ("--drift 2 --loops WALK/rgb.txt", 1, "is no table of loops"),
+        ("--drift 2 --loops FAR", 1, 'far.csv:2:1: no frame has the number "900"; there are 90'),
+        ("--drift 2 --loops NAMED", 1, 'named.csv:2:1: no image of the sequence has the name "x.jpg"'),
+        ("--drift 200 --loops LOOPS", 1, "a drift of 200 %; expected"),
+        ("--drift 2 --loops LOOPS --camera 1,2,3", 1, "expected FX,FY,CX,CY"),
+        ("--drift 2 --loops LOOPS --odometry-form tum", 2, "--odometry-form means nothing without --odometry"),
+        ("--odometry FAR --seed 4 --loops LOOPS", 2, "--seed means nothing without --drift"),
+        ("--loops LOOPS", 2, "one of the arguments --odometry --drift is required"),
+    ],
+)
+def test_faults_are_one_line(
+    line: str, status: int, words: str, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "far.csv").write_text("query_id,match_id\n900,1\n")
+    (tmp_path / "named.csv").write_text("query_id,match_id,query_name,match_name\n9,1,x.jpg,y.jpg\n")
+    files = {
+        "WALK": walk,
+        "LOOPS": walk.parent / "loops.csv",
+        "FAR": tmp_path / "far.csv",
+        "NAMED": tmp_path / "named.csv",
+    }
+    for name, path in files.items():
+        line = line.replace(name, str(path))
+    assert main(["close", str(walk), *line.split(), "--out", str(tmp_path / "out")]) == status
+    assert words in capsys.readouterr().err
+
+
+def test_without_a_camera_the_numbers_are_asked_for(two_laps: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "loops.csv").write_text("query_id,match_id\n25,5\n")
+    line = f"close {two_laps} --loops {tmp_path / 'loops.csv'} --drift 1 --out {tmp_path / 'out'}"
+    assert main(line.split()) == 1
+    assert "does not say what its camera is; give --camera FX,FY,CX,CY" in capsys.readouterr().err
+
+
+def test_fr1_rpy_where_the_camera_turns_gets_rotations_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From color alone; the camera's numbers are those of TUM, for images of half the size."""
+    folder = shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy")
+    (tmp_path / "loops.csv").write_text("query_id,match_id\n" + "".join(f"{i},{i - 90}\n" for i in range(120, 720, 40)))
+    camera = "258.65,258.25,159.05,127.4,0.2624,-0.9531,-0.0054,0.0026,1.1633"
+    line = f"close {folder} --loops {tmp_path / 'loops.csv'} --drift 2 --camera {camera} --out {tmp_path / 'out'}"
+    assert main(line.split()) == 0
+    assert re.search(r"\d+ loops give a rotation only", capsys.readouterr().out)

@@ -1,0 +1,99 @@
+"""The pose graph: right derivatives, loops that mend drift, and false loops that do no harm."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from loopclosure.closing.drift import aligned, ate_rmse_m, drifted, path_of, steps_between, turn_rmse_deg
+from loopclosure.closing.graph import Edge, _Graph, solve
+from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
+from loopclosure.errors import InputError
+
+LAPS, PER_LAP = 3, 40
+NOTHING = np.array([0, 0, 0, 0, 0, 0, 1.0])
+
+
+def laps() -> np.ndarray:
+    """Poses (120, 7) of three rounds of 8 x 5 m."""
+    turn = np.arange(LAPS * PER_LAP) * 2 * np.pi / PER_LAP
+    places = np.stack([8 * np.cos(turn), 5 * np.sin(turn), 0.2 * np.sin(3 * turn)], axis=1)
+    angles = np.stack([turn, 0.1 * np.sin(5 * turn)], axis=1)
+    return np.hstack([places, Rotation.from_euler("zx", angles).as_quat()])
+
+
+def odometry_edges(path: np.ndarray) -> list[Edge]:
+    sigmas = np.array([0.02] * 3 + [0.005] * 3)
+    return [Edge(i, i + 1, step, np.diag(sigmas**-2.0)) for i, step in enumerate(steps_between(path))]
+
+
+def loop_edges(truth: np.ndarray, every: int = 5) -> list[Edge]:
+    pairs = [(i, i + PER_LAP + 1) for i in range(0, len(truth) - PER_LAP - 1, every)]
+    return [Edge(i, j, relative_pose(truth[i], truth[j]), LOOP_SIGMAS.information()) for i, j in pairs]
+
+
+def test_derivatives_are_those_of_the_errors() -> None:
+    rng = np.random.default_rng(0)
+    poses = np.hstack([rng.normal(size=(5, 3)), Rotation.random(5, rng).as_quat()])
+    measured = np.hstack([rng.normal(size=(3, 3)), Rotation.random(3, rng).as_quat()])
+    information = [np.eye(6), np.diag([1, 2, 0, 3, 4, 5.0]), np.diag(rng.uniform(1, 9, 6))]
+    edges = [Edge(*ends, measured[k], information[k]) for k, ends in enumerate([(0, 1), (3, 2), (4, 0)])]
+    graph = _Graph(poses, edges)
+    x = rng.normal(0, 0.3, 24)
+    steps = 1e-6 * np.eye(24)
+    numeric = np.stack([(graph.errors(x + step) - graph.errors(x - step)) / 2e-6 for step in steps], axis=1)
+    np.testing.assert_allclose(graph.derivatives(x).toarray(), numeric, atol=1e-7)
+
+
+def test_loops_mend_the_drift() -> None:
+    truth = laps()
+    path = drifted(truth, 2, seed=1)
+    solution = solve(path, odometry_edges(path), loop_edges(truth))
+    assert ate_rmse_m(path, truth) > 0.3
+    assert ate_rmse_m(solution.poses, truth) < 0.3 * ate_rmse_m(path, truth)
+    assert solution.accepted.all()
+    np.testing.assert_allclose(solution.poses[0], path[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("false", [1, 8])
+def test_false_loops_do_no_harm(false: int) -> None:
+    truth = laps()
+    path = drifted(truth, 2, seed=1)
+    right = loop_edges(truth)
+    wrong = [Edge(3 * k, 3 * k + 55, NOTHING, LOOP_SIGMAS.information()) for k in range(false)]  # the other side
+    clean = solve(path, odometry_edges(path), right)
+    solution = solve(path, odometry_edges(path), [*wrong, *right])
+    assert solution.accepted.tolist() == [False] * false + [True] * len(right)
+    np.testing.assert_allclose(solution.poses[:, :3], clean.poses[:, :3], atol=0.01)
+
+
+def test_without_loops_the_path_stays() -> None:
+    path = drifted(laps(), 2, seed=1)
+    solution = solve(path, odometry_edges(path), [])
+    np.testing.assert_allclose(solution.poses[:, :3], path[:, :3], atol=1e-12)
+    assert solution.accepted.shape == (0,)
+
+
+def test_drift_follows_from_its_seed_and_grows_with_its_size() -> None:
+    truth = laps()
+    np.testing.assert_array_equal(drifted(truth, 2, seed=5), drifted(truth, 2, seed=5))
+    assert not np.array_equal(drifted(truth, 2, seed=5), drifted(truth, 2, seed=6))
+    errors = [ate_rmse_m(drifted(truth, percent, seed=5), truth) for percent in (0.5, 1, 2)]
+    assert errors[0] < errors[1] < errors[2]
+    with pytest.raises(InputError, match="a drift of 0 %; expected a number above 0"):
+        drifted(truth, 0, seed=5)
+
+
+def test_steps_and_errors_of_a_path() -> None:
+    truth = laps()
+    np.testing.assert_allclose(path_of(truth[0], steps_between(truth))[:, :3], truth[:, :3], atol=1e-9)
+    turn = Rotation.from_euler("xyz", [0.3, -0.5, 2.0])
+    elsewhere = np.hstack([turn.apply(truth[:, :3]), (turn * Rotation.from_quat(truth[:, 3:])).as_quat()])
+    elsewhere[:, :3] += np.array([5, 6, 7])
+    assert ate_rmse_m(elsewhere, truth) == pytest.approx(0, abs=1e-9)
+    assert turn_rmse_deg(elsewhere, truth) == pytest.approx(0, abs=1e-5)
+    known = np.arange(len(truth)) % 2 == 0
+    np.testing.assert_allclose(aligned(elsewhere, truth, known)[:, :3], truth[:, :3], atol=1e-9)
+    wide = truth.copy()
+    wide[:, :3] *= 1.1
+    size = np.sqrt(np.mean(np.sum((truth[:, :3] - truth[:, :3].mean(axis=0)) ** 2, axis=1)))
+    assert ate_rmse_m(wide, truth) == pytest.approx(0.1 * size)

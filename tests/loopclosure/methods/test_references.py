@@ -1,0 +1,101 @@
+"""HOG, CoHOG-like regions and VLAD."""
+
+import cv2
+import numpy as np
+import pytest
+
+from loopclosure.descriptors.hog import Hog
+from loopclosure.errors import InputError
+from loopclosure.evaluate import evaluate, named_method
+from loopclosure.methods.base import Images, MethodContext, make_method
+from loopclosure.places.datasets import load_tum
+from loopclosure.progress import silent
+from loopclosure.words.vlad import vlad
+from loopclosure.words.vocabulary import Extractor, Vocabulary
+from tests.loopclosure.conftest import blots
+
+
+def stripes(turn_deg: float) -> np.ndarray:
+    """Stripes whose gradient has this direction, (128, 128)."""
+    y, x = np.mgrid[:128, :128]
+    along = x * np.cos(np.radians(turn_deg)) + y * np.sin(np.radians(turn_deg))
+    return (127 + 100 * np.sin(along / 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("turn_deg", "bin_"), [(10, 0), (90, 4), (170, 8)])
+def test_gradients_fall_into_the_bin_of_their_direction(turn_deg, bin_):
+    blocks = Hog(side=128).blocks(stripes(turn_deg))
+    assert blocks.shape == (7, 7, 36)
+    assert np.argmax(blocks.reshape(49, 4, 9).sum(axis=(0, 1))) == bin_
+    np.testing.assert_allclose(np.linalg.norm(blocks, axis=2), 1, rtol=1e-5)
+
+
+def test_blocks_do_not_depend_on_brightness_and_contrast():
+    image = blots(0)
+    darker = (image * 0.5 + 20).astype(np.uint8)
+    a, b, other = (Hog().blocks(picture) for picture in (image, darker, blots(1)))
+    assert np.sum(a * b) > 0.97 * np.sum(a * a)
+    assert np.sum(a * other) < 0.8 * np.sum(a * a)
+
+
+def test_entropy_is_that_of_the_gray_values():
+    image = np.zeros((256, 256), np.uint8)
+    image[:, 128:] = np.random.default_rng(0).integers(0, 256, (256, 128), np.uint8)
+    entropies = Hog().entropies(image)
+    assert entropies.shape == (15, 15)
+    assert entropies[:, :6].max() == 0
+    assert entropies[:, 9:].min() > 0.98
+    assert not Hog().blocks(np.zeros((50, 50), np.uint8)).any()
+
+
+def test_vlad_sums_differences_to_the_nearest_word():
+    words = Vocabulary(np.array([[0, 0], [10, 10], [-10, 0]], np.float32), Extractor())
+    found = vlad(np.array([[1, 0], [2, 0], [10, 13]], np.float32), words).reshape(3, 2)
+    np.testing.assert_allclose(found, np.array([[1, 0], [0, 1], [0, 0]]) / np.sqrt(2), atol=1e-6)
+    assert not vlad(np.zeros((0, 2), np.float32), words).any()
+
+
+@pytest.mark.parametrize("spec", ["hog", "cohog:side=128", "vlad:words=8"])
+def test_they_find_the_second_lap(spec, two_laps, tmp_path):
+    data = load_tum(two_laps)
+    train = []
+    for i in range(10):
+        train.append(tmp_path / f"{i}.png")
+        cv2.imwrite(str(train[-1]), blots(100 + i))
+    (outcome,) = evaluate(data, [named_method(spec, MethodContext())], train).outcomes
+    assert outcome.recall_at[1] == 1.0
+    assert outcome.name == spec.partition(":")[0]
+
+
+def test_vlad_of_orb_words(tmp_path):
+    paths = []
+    for i in range(10):
+        paths.append(tmp_path / f"{i}.png")
+        cv2.imwrite(str(paths[-1]), cv2.resize(blots(i % 5), (320, 240)))
+    train, laps = paths[:5], [path.rename(tmp_path / f"lap_{path.name}") for path in paths[5:]]
+    images = Images(laps, laps, train)
+    scores = make_method("vlad:words=4,kind=orb").score(images, silent).scores
+    np.testing.assert_array_equal(np.argmax(scores, axis=1), np.arange(5))
+    np.testing.assert_allclose(scores.diagonal(), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("spec", ["hog", "cohog:side=128"])
+def test_two_traverses_are_compared_in_full(spec, two_laps):
+    images = load_tum(two_laps).query_images
+    scores = make_method(spec).score(Images(images[20:], images[:20]), silent).scores
+    assert scores.shape == (20, 20)
+    np.testing.assert_array_equal(np.argmax(scores, axis=1), np.arange(20))
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("hog:side=100", "expected at least 2 x 2 whole cells"),
+        ("cohog:least_entropy=2", "expected 0..1"),
+        ("vlad:kind=surf", "unknown kind of features"),
+        ("hog+thumbnails", "works on images"),
+    ],
+)
+def test_settings_that_make_no_sense(spec, message):
+    with pytest.raises(InputError, match=message):
+        make_method(spec)

@@ -1,0 +1,122 @@
+"""Verification of another method's best matches, on walls seen from two sides."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from loopclosure.errors import InputError
+from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
+from loopclosure.methods.seqslam import SeqSlam, SequenceSettings
+from loopclosure.methods.verified import Verified, on_trajectories
+from loopclosure.progress import silent
+from tests.loopclosure.conftest import blots
+
+WALLS = 6
+
+
+class Fixed:
+    """A method that always says the same."""
+
+    name = "fixed"
+
+    def __init__(self, scores):
+        self.scores = scores
+
+    def score(self, images, progress):
+        return MethodResult(self.scores, {"fixed": 1.0}, ["as given"], ("training",))
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory) -> list[Path]:
+    """Six walls, and then the same six from a little beside."""
+    folder = tmp_path_factory.mktemp("walls")
+    corners = np.array([[0, 0], [320, 0], [320, 240], [0, 240]], np.float32)
+    moved = np.array([[12, 6], [300, 18], [312, 228], [4, 236]], np.float32)
+    paths = []
+    for i in range(2 * WALLS):
+        image = cv2.resize(blots(i % WALLS, 60, 80), (320, 240), interpolation=cv2.INTER_CUBIC)
+        image = cv2.add(image, np.random.default_rng(i % WALLS).integers(0, 60, image.shape, np.uint8))
+        if i >= WALLS:
+            image = cv2.warpPerspective(image, cv2.getPerspectiveTransform(corners, moved), (320, 240))
+        paths.append(folder / f"{i:02d}.png")
+        cv2.imwrite(str(paths[-1]), cv2.GaussianBlur(image, (0, 0), 1.0))
+    return paths
+
+
+def accepted(scores):
+    return [tuple(pair) for pair in np.argwhere(np.isfinite(scores)).tolist()]
+
+
+def test_only_the_same_walls_are_accepted(walls):
+    rng = np.random.default_rng(0)
+    given = rng.normal(size=(12, 12))
+    result = Verified(Fixed(given), k=12).score(Images(walls), silent)
+    loops = [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]
+    assert accepted(result.scores) == loops
+    assert all(result.scores[pair] == given[pair] for pair in loops)
+    by_inliers = Verified(Fixed(given), k=12, order="inliers").score(Images(walls), silent).scores
+    assert accepted(by_inliers) == loops
+    assert np.nanmin(by_inliers) >= 12
+    assert list(result.seconds) == ["fixed", "local features", "verification"]
+    assert result.training_stages == ("training",)
+    assert result.notes[0] == "as given"
+    assert result.notes[1].startswith("6 of 66 pairs, the best 12 of each query, have 12 inliers")
+
+
+def test_only_the_best_k_of_each_query_are_examined(walls):
+    scores = np.zeros((WALLS, WALLS))
+    scores[range(WALLS), range(WALLS)] = np.array([-1, 1, 1, 1, 1, np.nan])
+    result = Verified(Fixed(scores), k=1).score(Images(walls[WALLS:], walls[:WALLS]), silent)
+    assert accepted(result.scores) == [(i, i) for i in range(1, 5)]
+
+
+def test_on_top_of_seqslam_a_sequence_is_verified(walls):
+    given = np.where(np.subtract.outer(np.arange(12), np.arange(12)) == WALLS, 1.0, -1.0)
+    blank = walls[0].parent / "blank.png"
+    cv2.imwrite(str(blank), np.full((240, 320, 3), 90, np.uint8))
+    partly = [*walls[:8], blank, *walls[9:]]  # what the third frame of the second lap shows has no features
+    alone = Verified(Fixed(given), k=1).score(Images(partly), silent)
+    assert (8, 2) not in accepted(alone.scores)
+    sequences = Verified(SeqSlam(Fixed(given), SequenceSettings(length=4, contrast=0)), k=1)
+    together = accepted(sequences.score(Images(partly), silent).scores)
+    assert {(i, i - WALLS) for i in range(WALLS, 2 * WALLS)} <= set(together)
+    assert (11, 1) not in together
+
+
+def test_trajectories_support_what_is_on_them():
+    seen = np.zeros((9, 9), bool)
+    seen[4, 3] = True
+    offsets = SequenceSettings(length=4, slowest=1.0, fastest=1.0).offsets()
+    assert accepted(np.where(on_trajectories(seen, offsets), 1, np.nan)) == [(2, 1), (3, 2), (4, 3), (5, 4), (6, 5)]
+    both = SequenceSettings(length=2, slowest=1.0, fastest=1.0, directions="both").offsets()
+    assert accepted(np.where(on_trajectories(seen, both), 1, np.nan)) == [(3, 2), (3, 4), (4, 3), (5, 2), (5, 4)]
+
+
+def test_excluded_frames_are_no_candidates(walls):
+    method = Verified(Fixed(np.zeros((12, 12))), exclude_frames=WALLS)
+    assert accepted(method.score(Images(walls), silent).scores) == []
+
+
+def test_a_known_camera(walls):
+    camera = "focal_px=260,center_x_px=160,center_y_px=120"
+    method = make_method(f"verified:{camera},k=12,inliers=25+thumbnails", MethodContext())
+    found = accepted(method.score(Images(walls), silent).scores)
+    assert found == [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("verified", "write verified\\+METHOD"),
+        ("verified:k=0+thumbnails", "k = 0; expected 1 or more"),
+        ("verified:inliers=3+thumbnails", "expected at least 8"),
+        ("verified:focal_px=300+thumbnails", "needs focal_px, center_x_px and center_y_px"),
+        ("verified:order=size+thumbnails", 'order of verified is "size"; expected score or inliers'),
+        ("verified:depth=3+thumbnails", 'verified has no setting "depth=3"'),
+    ],
+)
+def test_settings_that_make_no_sense(spec, message):
+    with pytest.raises(InputError, match=message):
+        make_method(spec)

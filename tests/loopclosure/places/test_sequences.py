@@ -1,0 +1,196 @@
+"""EuRoC, KITTI, VPR benchmarks and videos: the same path from each, and one clear line for what is missing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopclosure.cli import main
+from loopclosure.errors import InputError
+from loopclosure.places.datasets import load_sequence, load_traverses
+from loopclosure.places.extraction import extract
+from loopclosure.places.masks import read_matches
+from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, posed, read_posed, read_sequence
+from places_layouts import (
+    kitti_rows,
+    path,
+    quaternions,
+    tum_rows,
+    write_benchmark,
+    write_euroc,
+    write_kitti,
+    write_video,
+)
+
+
+def same_path(poses: np.ndarray | None, matrices: np.ndarray) -> None:
+    assert poses is not None
+    np.testing.assert_allclose(poses[:, :3], matrices[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(np.abs(np.sum(poses[:, 3:] * quaternions(matrices), axis=1)), 1, atol=1e-6)
+
+
+def test_euroc_has_the_poses_of_the_camera_not_of_the_body(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path)
+    assert layout_of(folder) == "euroc"
+    sequence = read_sequence(folder)
+    same_path(sequence.poses, path())
+    assert sequence.names[1] == "mav0/cam0/data/1403636580000000000.png"
+    assert sequence.doubts == ()
+    assert sequence.camera is not None
+    assert sequence.camera.fy == 28.25
+    assert sequence.camera.distortion == (-0.28, 0.07, 0.0002, 1.8e-05)
+    data = load_sequence(sequence)
+    assert {(int(i) - int(j)) for i, j in np.argwhere(data.truth.hard & data.truth.judged)} == {24}
+
+
+def test_euroc_without_its_truth_or_with_a_missing_image(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path)
+    (folder / "mav0/state_groundtruth_estimate0/data.csv").unlink()
+    sequence = read_sequence(folder)
+    assert sequence.poses is None
+    with pytest.raises(InputError, match="MH_00: has no poses; expected"):
+        posed(sequence)
+    (folder / "mav0/cam0/data/1403636581000000000.png").unlink()
+    with pytest.raises(InputError, match=r'data\.csv:4:1: no such image "1403636581000000000\.png"'):
+        read_sequence(folder)
+    with pytest.raises(InputError, match="expected an EuRoC sequence, a folder with mav0/cam0"):
+        read_sequence(tmp_path, "euroc")
+
+
+def test_a_distortion_that_is_not_known_is_refused(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path)
+    sensor = folder / "mav0/cam0/sensor.yaml"
+    sensor.write_text(sensor.read_text().replace("radial-tangential", "equidistant"))
+    with pytest.raises(InputError, match="distortion model equidistant is not supported"):
+        read_sequence(folder)
+
+
+@pytest.mark.parametrize(("camera", "aside"), [("image_0", 0.0), ("image_2", -0.06)])
+def test_kitti_has_the_poses_of_its_camera(camera: str, aside: float, tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path, camera)
+    assert layout_of(folder) == "kitti"
+    sequence = read_sequence(folder)
+    beside = np.eye(4)
+    beside[0, 3] = aside
+    same_path(sequence.poses, path() @ beside)
+    assert sequence.stamps is not None
+    assert sequence.stamps[3] == 3.0
+    assert sequence.camera is not None
+    assert (sequence.camera.fx, sequence.camera.cx) == (30, 15.5)
+
+
+def test_kitti_with_too_few_poses_or_no_images(tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path)
+    (tmp_path / "dataset/poses/07.txt").write_text(kitti_rows(path()[:40]))
+    with pytest.raises(InputError, match=r"07\.txt: has 40 poses, but there are 48 images"):
+        read_sequence(folder)
+    (folder / "times.txt").write_text("0\n1\n")
+    with pytest.raises(InputError, match=r"times\.txt: has 2 times, but there are 48 images"):
+        read_sequence(folder)
+    with pytest.raises(InputError, match="has none of image_0, image_2, image_1, image_3; expected a folder such as"):
+        read_sequence(tmp_path, "kitti")
+
+
+def test_a_file_of_poses_takes_the_place_of_the_sequences_own(tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path)
+    poses = tmp_path / "slam.txt"
+    poses.write_text(tum_rows(path()[:30]))
+    sequence = read_posed(folder, poses=PoseChoice(poses))
+    assert (len(sequence), sequence.dropped) == (30, 18)
+    assert sequence.frames[29].path == "image_0/000029.png"
+
+
+def test_a_video_becomes_a_folder_and_stays_one(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "drive.avi")
+    folder, said = extract(video, tmp_path / "frames")
+    assert said == f"{video}: 48 frames: {folder}"
+    poses = tmp_path / "poses.txt"
+    poses.write_text(tum_rows(path()))
+    same_path(read_sequence(folder, poses=PoseChoice(poses)).poses, path())
+    again, said = extract(video, tmp_path / "frames")
+    assert (again, said) == (folder, f"{video}: its frames are in {folder} already")
+    other = write_video(tmp_path / "other.avi")
+    with pytest.raises(InputError, match="is there already, and not made from"):
+        extract(other, folder)
+
+
+def test_a_benchmark_with_its_lists_of_matches(tmp_path: Path) -> None:
+    folder = write_benchmark(tmp_path)
+    queries, references, truth = benchmark_parts(folder)
+    data = load_traverses(queries, references, truth_file=truth)
+    assert data.truth.hard.shape == (12, 14)
+    assert {(int(i), int(j)) for i, j in np.argwhere(data.truth.hard)} == {
+        (i, i + k) for i in range(12) for k in range(3)
+    }
+    per_query = np.empty(12, dtype=object)
+    for i in range(12):
+        per_query[i] = np.arange(i, i + 3)
+    np.save(tmp_path / "lists.npy", per_query)
+    np.testing.assert_array_equal(read_matches(tmp_path / "lists.npy", 12, 14)[0], data.truth.hard)
+    np.save(tmp_path / "mask.npy", data.truth.hard)
+    np.testing.assert_array_equal(read_matches(tmp_path / "mask.npy", 12, 14)[0], data.truth.hard)
+
+
+def test_a_benchmarks_faults_are_named(tmp_path: Path) -> None:
+    folder = write_benchmark(tmp_path / "a", references=12)
+    with pytest.raises(InputError, match="names query 10 and reference 12; there are 12 queries and 12 references"):
+        load_traverses(folder / "query", folder / "ref", truth_file=folder / "ground_truth_new.npy")
+    (folder / "ground_truth_new.npy").unlink()
+    with pytest.raises(InputError, match=r"expected one ground_truth\*\.npy, found none"):
+        benchmark_parts(folder)
+    with pytest.raises(InputError, match="has no folder query or queries or Query with the queries"):
+        benchmark_parts(tmp_path)
+
+
+class Harmful:
+    """What a pickle may run when it is read."""
+
+    def __reduce__(self) -> tuple:
+        return (Path.touch, (Path("harmed"),))
+
+
+def test_lists_of_matches_run_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rows = np.empty(2, dtype=object)
+    rows[:] = [Harmful(), [1]]
+    np.save("truth.npy", rows)
+    with pytest.raises(InputError, match="is no list of numbers"):
+        read_matches("truth.npy", 2, 2)
+    assert not Path("harmed").exists()
+
+
+@pytest.mark.slow
+def test_evaluate_reads_them_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    poses = tmp_path / "poses.txt"
+    poses.write_text(tum_rows(path()))
+    euroc, kitti = write_euroc(tmp_path / "e"), write_kitti(tmp_path / "k")
+    video, benchmark = write_video(tmp_path / "v.avi"), write_benchmark(tmp_path / "b")
+    lines = [
+        f"--euroc {euroc}",
+        f"--kitti {kitti}",
+        f"--video {video} --poses {poses}",
+        f"--images {kitti / 'image_0'} --poses {poses}",
+        f"--nordland {benchmark}",
+        f"--traverses {benchmark}/query {benchmark}/ref --truth {benchmark}/ground_truth_new.npy",
+    ]
+    for number, line in enumerate(lines):
+        out = tmp_path / f"out{number}"
+        assert main(["evaluate", *line.split(), "--method", "thumbnails", "--out", str(out)]) == 0
+        assert capsys.readouterr().err == ""
+        assert (out / "report.html").is_file()
+
+
+def test_images_with_both_a_mask_and_poses_are_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = "evaluate --images x --truth t.npy --poses p.txt --method thumbnails --out o"
+    assert main(line.split()) == 2
+    assert "--truth and --poses both say" in capsys.readouterr().err
+    line = "evaluate --tum x --pose-form kitti --method thumbnails --out o"
+    assert main(line.split()) == 2
+    assert "--pose-form means nothing without --poses" in capsys.readouterr().err
+
+
+def test_detect_takes_euroc_with_its_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_euroc(tmp_path)
+    line = ["detect", str(folder), "--threshold", "-0.001", "--exclude-recent", "10", "--out", str(tmp_path / "found")]
+    assert main(line) == 0
+    assert "24 of 24 loops are the same place by their poses" in capsys.readouterr().out

@@ -1,0 +1,187 @@
+"""``netspec fmt``: one form for a text; the comments stay, and what it means."""
+
+import io
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from netspec.cli import main
+from netspec.errors import SpecError
+from netspec.proto.format import WIDTH, format_text
+from netspec.proto.lexer import END, STRING, SYMBOL, Lexer
+from netspec.proto.text import parse_net_text, parse_solver_text, text_of
+from paths import GOLDEN, ROOT, SHARED
+
+OWN = sorted((ROOT / "prototxt").rglob("*.prototxt"))
+OTHERS = [*GOLDEN.rglob("*.prototxt"), *(SHARED / "corpus").rglob("*.prototxt"), *SHARED.glob("golden/**/*.prototxt")]
+
+
+def test_the_form() -> None:
+    text = """
+
+# About the net.
+name:'x' ; input : "data"
+
+
+layer{name:"a" # why
+  type: "Convolution",  bottom: "data"
+  # its settings
+  convolution_param <num_output:4  kernel_size:[3,3]>  # both
+
+  # the end
+}
+layer { name: "r"   type: "ReLU" bottom: "a" top: "a" }
+state {
+}
+"""
+    assert (
+        format_text(text, "f")
+        == """# About the net.
+name: "x"
+input: "data"
+
+layer {
+  name: "a"  # why
+  type: "Convolution"
+  bottom: "data"
+  # its settings
+  convolution_param { num_output: 4 kernel_size: [3, 3] }  # both
+
+  # the end
+}
+layer { name: "r" type: "ReLU" bottom: "a" top: "a" }
+state {
+}
+"""
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "formed"),
+    [
+        ("", ""),
+        ("\n\n# only this\n\n", "# only this\n"),
+        ("a:1\r\nb:2\r\n", "a: 1\nb: 2\n"),
+        ("a: 'say \"no\"' 'x'", 'a: \'say "no"\' "x"\n'),
+        ("a: - # minus\n 1", "# minus\na: -1\n"),
+        ("a # one\n : # two\n 1 # three\n ; # four\nb: 2", "# one\n# two\n# three\na: 1  # four\nb: 2\n"),
+        ("a { # open\n b: 1 }", "a {  # open\n  b: 1\n}\n"),
+        ("a: [ {b: 1}, {b: 2} ]", "a { b: 1 }\na { b: 2 }\n"),
+        ("a: []", "a: []\n"),
+        ("a {}", "a { }\n"),
+        ("a { b { c: 1\n } d: 2 }", "a {\n  b {\n    c: 1\n  }\n  d: 2\n}\n"),
+        ("a: 1 # é\udcff\n", "a: 1  # é\udcff\n"),
+    ],
+)
+def test_small_texts(text: str, formed: str) -> None:
+    assert format_text(text, "f") == formed
+    assert format_text(formed, "f") == formed
+
+
+def test_what_does_not_fit_a_line_is_broken() -> None:
+    long = "a { " + " ".join(f"field_{k}: {k}" for k in range(12)) + " }"
+    assert len(format_text(long, "f").splitlines()) == 14
+    numbers = format_text(f"a: [{', '.join(map(str, range(100)))}]", "f")
+    assert max(map(len, numbers.splitlines())) <= WIDTH
+    assert format_text(numbers, "f") == numbers
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a 1", 'f:1:3: expected ":" or "{", found \'1\''),
+        ("a {\n b: 1\n", "f:3:1: expected a field name, found the end of the file"),
+        ("a: [1 2]", 'f:1:7: expected "," or "]", found \'2\''),
+        ("a: [1, {b: 2}]", "f:1:1: found messages and other values in one list"),
+        ("}", "f:1:1: expected a field name, found '}'"),
+        ("a {" * 101, "f:1:303: messages are nested more than 100 deep"),
+    ],
+)
+def test_what_is_not_protobuf_text(text: str, message: str) -> None:
+    with pytest.raises(SpecError) as raised:
+        format_text(text, "f")
+    assert str(raised.value) == message
+
+
+def meaning(text: str) -> list[str]:
+    """Return the tokens that mean something, in order."""
+    tokens = [token for token in Lexer(text, "f") if token.kind != END]
+    return [
+        Lexer(t.text, "f").unquote(type(t)(STRING, t.text, 0)).decode() if t.kind == STRING else t.text
+        for t in tokens
+        if t.kind != SYMBOL or t.text == "-"
+    ]
+
+
+SPACE = st.sampled_from([" ", "  ", "\n", "\n\n\n", " # one\n", "\n# two\n\n", "\t#three\n#four\n"])
+VALUE = st.sampled_from(["1", "-2.5", "- 3", '"s"', "'t' \"u\"", "MAX", "[1,2]", "[]"])
+
+
+@st.composite
+def texts(draw: st.DrawFn, depth: int = 0) -> str:
+    text = draw(SPACE)
+    for _ in range(draw(st.integers(0, 4))):
+        spaces = [draw(SPACE) for _ in range(5)]
+        if depth < 3 and draw(st.booleans()):
+            inner = draw(texts(depth + 1))
+            opening, closing = draw(st.sampled_from(["{}", "<>"]))
+            value = f"{draw(st.sampled_from(['', ':']))}{spaces[0]}{opening}{inner}{closing}"
+        else:
+            value = f"{spaces[1]}:{spaces[0]}{draw(VALUE)}"
+        text += f"{spaces[2]}f{value}{spaces[3]}{draw(st.sampled_from(['', ';', ',']))}{spaces[4]}"
+    return text
+
+
+@given(texts())
+@example(" # one\nf:1 # two\n ;# three\n")
+def test_any_text_keeps_its_tokens_and_comments_and_is_formatted_once(text: str) -> None:
+    formed = format_text(text, "f")
+    assert format_text(formed, "f") == formed
+    assert meaning(formed) == meaning(text)
+    assert sorted(filter(None, comments(formed))) == sorted(filter(None, comments(text)))
+
+
+def comments(text: str) -> list[str]:
+    return [line.partition("#")[2].strip() for line in text.split("\n")]
+
+
+@pytest.mark.parametrize("path", [*OWN, *OTHERS], ids=lambda path: "/".join(path.parts[-3:]))
+def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
+    text = text_of(path)
+    formed = format_text(text, str(path))
+    assert format_text(formed, str(path)) == formed
+    assert meaning(formed) == meaning(text)
+    for parse in (parse_net_text, parse_solver_text):
+        try:
+            before = parse(text, str(path))[0]
+        except SpecError:
+            continue
+        assert parse(formed, str(path))[0] == before
+
+
+@pytest.mark.parametrize("path", OWN, ids=lambda path: "/".join(path.parts[-3:]))
+def test_the_projects_own_files_have_the_form(path: Path) -> None:
+    assert format_text(text_of(path), str(path)) == text_of(path)
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("good").write_text('name: "x"\n')
+    Path("other").write_text('name: "x"\nlayer{name:"y"}')
+    Path("link").symlink_to("other")
+    assert main(["fmt", "--check", "good"]) == 0
+    assert main(["fmt", "--check", "good", "link"]) == 1
+    assert capsys.readouterr().out == "link:2:1: netspec fmt would change this line, the first of them\n"
+    assert main(["fmt", "good", "link"]) == 0
+    assert Path("link").is_symlink()
+    assert Path("other").read_text() == 'name: "x"\nlayer { name: "y" }\n'
+    assert capsys.readouterr().out == "link\n"
+    Path("bad").write_text("name")
+    assert main(["fmt", "bad", "none", "good"]) == 1
+    assert main(["fmt", "--check", "bad", "other"]) == 2
+    assert "bad:1:5: expected" in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin", io.StringIO("a:1"))
+    assert main(["fmt", "-"]) == 0
+    assert capsys.readouterr().out == "a: 1\n"
