@@ -102,11 +102,14 @@ def test_an_iteration_that_overflows_is_counted_and_changes_nothing(work_in: Cal
     solver.close()
 
 
-def test_gradients_that_overflow_whatever_the_scale_end_the_training(work_in: Callable[..., Path]) -> None:
+def test_gradients_that_overflow_whatever_the_scale_end_the_training(
+    work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     work_in("train/sgd_step")
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel", precision=FP16)
     solver._scale.factor = 1.0
-    solver._scale.remove = lambda gradients: setattr(solver._scale, "factor", 0.5)  # as if one were infinite
+    remove = solver._scale.remove
+    monkeypatch.setattr(solver._scale, "remove", lambda gradients: remove([torch.tensor([torch.inf])]))
     with pytest.raises(SpecError, match="the gradients overflow float16"):
         solver.step(1)
     solver.close()
