@@ -47,10 +47,10 @@ def add_to(commands: Commands) -> None:
     add_exact(p)
     p.add_argument(
         "--precision",
-        choices=("fp32", "tf32", "bf16"),
+        choices=("fp32", "tf32", "bf16", "fp16"),
         default="fp32",
-        help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, and rounds more "
-        "(default: fp32)",
+        help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, fp16 on GPUs; both round "
+        "more (default: fp32)",
     )
     add_strict(p)
 
