@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -145,7 +146,7 @@ def frames(size: int) -> Found:
 
 def faiss(size: int) -> Found:
     """Search the same with FAISS: exactly, and with its graph of neighbors, HNSW."""
-    import faiss
+    faiss = import_module("faiss")
 
     faiss.omp_set_num_threads(1)
     rows, queries = descriptors(size)
