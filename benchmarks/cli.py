@@ -14,7 +14,7 @@ from netspec.command_line import Commands, WrongUsage, run
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
-TRAINING = ("netspec", "pytorch", "pycaffe")
+TRAINING = ("netspec", "netspec-bf16", "pytorch", "pycaffe")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     _add_common(p, FORWARD, (*ENGINES, "pytorch", "opencv4"))
     p = commands.add("train", _train, "time training iterations: forward, backward, update")
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
-    _add_common(p, TRAINING, TRAINING[:2])
+    _add_common(p, TRAINING, ("netspec", "pytorch"))
     p.add_argument("--device", default="cpu", help="torch's name of it, for netspec and pytorch (default: cpu)")
     p = commands.add("start", _start, "time processes that load a net and describe one image")
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list), or a prototxt")
@@ -78,6 +78,13 @@ def _add_common(p: argparse.ArgumentParser, known: Sequence[str], default: Seque
     p.add_argument("--caffe", metavar="BINARY", help="also Caffe's own program")
     p.add_argument("--batch", type=int, nargs="+", default=[1], help="items of a batch, one or several (default: 1)")
     p.add_argument("--threads", type=int, nargs="+", default=[1], help="threads of a pass, one or several (default: 1)")
+    p.add_argument(
+        "--seconds",
+        type=float,
+        default=60,
+        help="fewer rounds, but at least 3, where those of one net, batch and number of threads take longer "
+        "(default: 60)",
+    )
 
 
 def _add_ways(p: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
@@ -161,7 +168,8 @@ def _compare(
                 with case_of(name, batch) as case:
                     for threads in arguments.threads:
                         ways, caffe = arguments.ways, arguments.caffe
-                        yield rows_of(case, threads, ways, suffix, yardsticks, caffe, arguments.rounds, device)
+                        rounds, limit = arguments.rounds, arguments.seconds
+                        yield rows_of(case, threads, ways, suffix, yardsticks, caffe, rounds, limit, device)
 
     _report(arguments, rows)
 

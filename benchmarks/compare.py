@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -23,23 +24,27 @@ def rows_of(
     yardsticks: str | None,
     caffe: str | None,
     rounds: int,
+    limit: float,
     device: str = "cpu",
 ) -> list[Row]:
     """Return a row for each way; ``suffix`` is that of the worker's functions, ``yardsticks`` the Python of some.
 
+    The rounds take at most ``limit`` seconds, or as long as three of them do.
     Trainings of netspec and of the twin run on ``device``, a name of torch's.
     """
     task = {**task_of(case, threads), "device": device}
     contestants = [_worker(case, way, task, suffix, yardsticks) for way in ways]
     if caffe:
         contestants.append(CaffeProgram(caffe, task, training=bool(suffix)))
-    return _rows(case, threads, contestants, rounds)
+    return _rows(case, threads, contestants, rounds, limit)
 
 
-def _rows(case: Case, threads: int, contestants: Sequence[Contestant], rounds: int) -> list[Row]:
+def _rows(
+    case: Case, threads: int, contestants: Sequence[Contestant], rounds: int, limit: float = math.inf
+) -> list[Row]:
     able = [one for one in contestants if not one.fault]
     try:
-        times = measure(able, rounds, lambda k: _tell(case, threads, k, rounds))
+        times = measure(able, rounds, lambda k: _tell(case, threads, k, rounds), limit)
     finally:
         for one in contestants:
             one.close()
@@ -53,8 +58,15 @@ def _rows(case: Case, threads: int, contestants: Sequence[Contestant], rounds: i
         ratios = {
             name: ratio(own, seconds[name]) for name in REFERENCES if own and name in seconds and name != one.name
         }
+        spent = {
+            name: ratio(computing, [used for _, used in times[name]])
+            for name in ratios
+            if not any(math.isnan(used) for _, used in (*times[name], *times[one.name]))
+        }
         off = difference(one.outputs, expected) if expected and one.name != "netspec" and one.outputs else None
-        rows.append(Row(case.name, case.batch, threads, one.name, own, computing, ratios, off, one.fault))
+        rows.append(
+            Row(case.name, case.batch, threads, one.name, own, computing, ratios, off, one.fault, spent, one.peak)
+        )
     return rows
 
 
@@ -110,6 +122,8 @@ def starts_of(case: Case, ways: Sequence[str], yardsticks: str | None, rounds: i
 
 class _Absent:
     """A way that there is not for this net."""
+
+    peak: float | None = None
 
     def __init__(self, name: str, fault: str) -> None:
         self.name, self.fault, self.outputs = name, fault, {}

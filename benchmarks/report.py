@@ -10,7 +10,7 @@ import platform
 import statistics
 import subprocess
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ class Row:
     """How one way ran one net.
 
     ``seconds`` and ``computing`` have each round: the time of a pass, and that of all its threads together; ``ratios``
-    are those of its ``seconds`` to the references'.
+    and ``spent`` are those of the one and of the other to the references'. ``peak`` is the most memory that the
+    process had, in MB.
     """
 
     net: str
@@ -36,6 +37,8 @@ class Row:
     ratios: Mapping[str, float]
     difference: float | None
     fault: str = ""
+    spent: Mapping[str, float] = field(default_factory=dict)
+    peak: float | None = None
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -50,6 +53,8 @@ def table(rows: Sequence[Row]) -> str:
         "best",
         "CPU ms",
         *(f"/ {name}" for name in references),
+        *(f"CPU / {name}" for name in references),
+        "MB",
         "off by",
     ]
     lines = [head, ["---"] * len(head)]
@@ -60,8 +65,9 @@ def table(rows: Sequence[Row]) -> str:
             continue
         found = (statistics.median(row.seconds), min(row.seconds), statistics.median(row.computing))
         times = ["-" if math.isnan(value) else f"{1e3 * value:.2f}" for value in found]
-        ratios = [f"{row.ratios[name]:.2f}" if name in row.ratios else "-" for name in references]
-        lines.append([*where, *times, *ratios, "-" if row.difference is None else f"{row.difference:.0e}"])
+        ratios = [f"{of[name]:.2f}" if name in of else "-" for of in (row.ratios, row.spent) for name in references]
+        memory = "-" if row.peak is None else f"{row.peak:.0f}"
+        lines.append([*where, *times, *ratios, memory, "-" if row.difference is None else f"{row.difference:.0e}"])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

@@ -19,15 +19,20 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN, MOST = 0.4, 50  # seconds of a turn, and at most so many passes
+FEWEST = 3  # rounds, however long they take
 REST = 0.03  # seconds before a turn: threads of the one before may still spin
 Pass = tuple[float, float]  # seconds of the clock, and those that all threads together spent computing
 
 
 class Contestant(Protocol):
-    """What takes turns. ``fault`` says why it cannot, else it is empty; ``outputs`` are those of its first pass."""
+    """What takes turns. ``fault`` says why it cannot, else it is empty; ``outputs`` are those of its first pass.
+
+    ``peak`` is the most memory that it had until it was closed, in MB; None where that is unknown.
+    """
 
     name: str
     fault: str
+    peak: float | None
     outputs: dict[str, np.ndarray]
 
     def turn(self, passes: int) -> list[Pass]:
@@ -55,6 +60,7 @@ class Worker:
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors, text=True
         )
         self.fault = self._said().get("fault", "")
+        self.peak: float | None = None
         self.outputs: dict[str, np.ndarray] = {}
         if not self.fault:
             with np.load(result) as arrays:
@@ -79,6 +85,7 @@ class Worker:
 
     def close(self) -> None:
         """See :class:`Contestant`."""
+        self.peak = _peak(self.process.pid)
         self.process.communicate()
         self.errors.close()
 
@@ -93,8 +100,17 @@ class Worker:
         return {"fault": lines[-1] if lines else f"ended with status {status}"}
 
 
+def _peak(process: int) -> float | None:
+    """Return the most memory that a process had so far, in MB; None where the system does not tell."""
+    path = Path(f"/proc/{process}/status")
+    told = re.search(r"VmHWM:\s+(\d+) kB", path.read_text()) if path.is_file() else None
+    return int(told[1]) / 1e3 * 1.024 if told else None
+
+
 class Starter:
     """Processes of benchmarks/start.py, one after the other; the time of importing torch is subtracted."""
+
+    peak: float | None = None
 
     def __init__(self, name: str, python: str, task: Mapping[str, Any]) -> None:
         self.name, self.fault = name, ""
@@ -131,6 +147,7 @@ class CaffeProgram:
     """The program ``caffe`` itself, begun anew at each turn; times are those in its log."""
 
     name = "caffe"
+    peak: float | None = None
 
     def __init__(self, binary: str, task: Mapping[str, Any], training: bool) -> None:
         self.binary, self.task, self.training = binary, task, training
@@ -179,14 +196,21 @@ class CaffeProgram:
         """See :class:`Contestant`."""
 
 
-def measure(contestants: Sequence[Contestant], rounds: int, tell: Callable[[int], object]) -> dict[str, list[Pass]]:
+def measure(
+    contestants: Sequence[Contestant], rounds: int, tell: Callable[[int], object], limit: float = math.inf
+) -> dict[str, list[Pass]]:
     """Return, by name, the times of a pass in each round: the medians of its turn.
 
-    ``tell`` gets the number of each round before it begins.
+    ``tell`` gets the number of each round before it begins. After three rounds none begins that would end later than
+    ``limit`` seconds after the first began.
     """
     times: dict[str, list[Pass]] = {one.name: [] for one in contestants}
     passes = {one.name: max(1, min(MOST, int(TURN / one.turn(1)[0][0]))) for one in contestants}
+    began = time.monotonic()
     for k in range(rounds):
+        passed = time.monotonic() - began
+        if k >= FEWEST and passed * (k + 1) / k > limit:
+            break
         tell(k)
         for one in contestants if k % 2 == 0 else reversed(contestants):
             time.sleep(REST)

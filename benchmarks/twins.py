@@ -94,6 +94,43 @@ class LeNet(nn.Module):
         return self.ip2(F.relu(self.ip1(x.flatten(1))))
 
 
+class Cifar10Quick(nn.Module):
+    """Caffe's quick net for CIFAR-10, for images (N, 3, 32, 32)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1, self.conv2 = nn.Conv2d(3, 32, 5, padding=2), nn.Conv2d(32, 32, 5, padding=2)
+        self.conv3 = nn.Conv2d(32, 64, 5, padding=2)
+        self.ip1, self.ip2 = nn.Linear(1024, 64), nn.Linear(64, 10)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the scores (N, 10)."""
+        x = F.relu(F.max_pool2d(self.conv1(x), 3, 2, ceil_mode=True))
+        x = F.avg_pool2d(F.relu(self.conv2(x)), 3, 2, ceil_mode=True)
+        x = F.avg_pool2d(F.relu(self.conv3(x)), 3, 2, ceil_mode=True)
+        return self.ip2(self.ip1(x.flatten(1)))
+
+
+class Cifar10Full(nn.Module):
+    """Caffe's full net for CIFAR-10, for images (N, 3, 32, 32)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1, self.conv2 = nn.Conv2d(3, 32, 5, padding=2), nn.Conv2d(32, 32, 5, padding=2)
+        self.conv3, self.ip1 = nn.Conv2d(32, 64, 5, padding=2), nn.Linear(1024, 10)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the scores (N, 10)."""
+        x = _within_channel(F.relu(F.max_pool2d(self.conv1(x), 3, 2, ceil_mode=True)))
+        x = _within_channel(F.avg_pool2d(F.relu(self.conv2(x)), 3, 2, ceil_mode=True))
+        x = F.avg_pool2d(F.relu(self.conv3(x)), 3, 2, ceil_mode=True)
+        return self.ip1(x.flatten(1))
+
+
+def _within_channel(x: Tensor) -> Tensor:
+    return x / (1 + 5e-5 * F.avg_pool2d(x.square(), 3, 1, 1)).pow(0.75)
+
+
 class AlexNet(nn.Module):
     """For images (N, 3, 227, 227)."""
 
@@ -267,6 +304,8 @@ class SqueezeNet(nn.Module):
 
 CLASSIFIERS = {
     "lenet": LeNet,
+    "cifar10_quick": Cifar10Quick,
+    "cifar10_full": Cifar10Full,
     "alexnet": AlexNet,
     "googlenet": GoogLeNet,
     "resnet50": ResNet50,

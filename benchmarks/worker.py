@@ -140,7 +140,8 @@ def netspec_training(task: Task) -> Run:
     import netspec
 
     torch.set_num_threads(task["threads"])
-    solver = netspec.load_solver(task["solver"], task["caffemodel"], device=task["device"])
+    precision = task.get("precision", "fp32")
+    solver = netspec.load_solver(task["solver"], task["caffemodel"], device=task["device"], precision=precision)
 
     def run() -> dict[str, Any]:
         solver.step(1)

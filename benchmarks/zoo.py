@@ -22,6 +22,25 @@ def lenet(n: Any) -> str:
     return _full(n, "ip2", _relu(n, "relu1", _full(n, "ip1", top, 500)), 10)
 
 
+def cifar10_quick(n: Any) -> str:
+    """Caffe's quick net for CIFAR-10."""
+    top = _relu(n, "relu1", _pool(n, "pool1", _conv(n, "conv1", "data", 32, 5, pad=2), 3))
+    for k, width in ((2, 32), (3, 64)):
+        top = _average(n, f"pool{k}", _relu(n, f"relu{k}", _conv(n, f"conv{k}", top, width, 5, pad=2)))
+    return _full(n, "ip2", _full(n, "ip1", top, 64), 10)
+
+
+def cifar10_full(n: Any) -> str:
+    """Caffe's full net for CIFAR-10: LRN within channels."""
+    within = {"local_size": 3, "alpha": 5e-5, "beta": 0.75, "norm_region": 1}
+    top = _relu(n, "relu1", _pool(n, "pool1", _conv(n, "conv1", "data", 32, 5, pad=2), 3))
+    top = _add(n, "LRN", "norm1", top, lrn_param=within)
+    top = _average(n, "pool2", _relu(n, "relu2", _conv(n, "conv2", top, 32, 5, pad=2)))
+    top = _add(n, "LRN", "norm2", top, lrn_param=within)
+    top = _average(n, "pool3", _relu(n, "relu3", _conv(n, "conv3", top, 64, 5, pad=2)))
+    return _full(n, "ip1", top, 10)
+
+
 def alexnet(n: Any) -> str:
     """Krizhevsky et al. 2012: two groups, LRN before pooling."""
     top = _lrn(n, "norm1", _relu(n, "relu1", _conv(n, "conv1", "data", 96, 11, stride=4)))
@@ -130,6 +149,8 @@ SQUEEZENET = ((16, 64), (16, 64), (32, 128), (32, 128), (48, 192), (48, 192), (6
 
 ZOO: dict[str, tuple[Callable[[Any], str], tuple[int, int, int]]] = {  # the layers, and the image (C, H, W)
     "lenet": (lenet, (1, 28, 28)),
+    "cifar10_quick": (cifar10_quick, (3, 32, 32)),
+    "cifar10_full": (cifar10_full, (3, 32, 32)),
     "alexnet": (alexnet, (3, 227, 227)),
     "googlenet": (googlenet, (3, 224, 224)),
     "resnet50": (resnet50, (3, 224, 224)),
@@ -198,6 +219,10 @@ def _lrn(n: Any, name: str, bottom: str) -> str:
 
 def _pool(n: Any, name: str, bottom: str, size: int, stride: int = 2, pad: int = 0) -> str:
     return _add(n, "Pooling", name, bottom, pooling_param={"kernel_size": size, "stride": stride, "pad": pad})
+
+
+def _average(n: Any, name: str, bottom: str) -> str:
+    return _add(n, "Pooling", name, bottom, pooling_param={"pool": "AVE", "kernel_size": 3, "stride": 2})
 
 
 def _sum(n: Any, name: str, *bottoms: str) -> str:

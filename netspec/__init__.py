@@ -76,6 +76,10 @@ __path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the n
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from netspec.version import version
+
+        return version()
     if name in _HOMES:
         return getattr(importlib.import_module(_HOMES[name]), name)
     if importlib.util.find_spec(f"netspec.{name}"):

@@ -4,8 +4,9 @@ An edge i -> j measures the pose Z of j in the frame of i. Its error is that of 
 and its rotation as a vector in radians, weighted by an information matrix (6, 6).
 
 False loops: the loss of an edge with squared error s is that of Geman and McClure, s / (1 + s / c), which is nearly s
-for a small error and never more than c. To start far from the solution, c is large at first and then made smaller
-(graduated non-convexity: Yang, Antonante, Tzoumas, Carlone, RA-L 2020). Odometry edges keep the square.
+for a small error and never more than c. To start far from the solution, c is large at first, at least as large as the
+greatest error, and then made smaller (graduated non-convexity: Yang, Antonante, Tzoumas, Carlone, RA-L 2020). Odometry
+edges keep the square.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
-# A true edge of six numbers is below this in 99 of 100 cases (chi-squared), times a margin for what is not Gaussian.
+# A true edge of six numbers is below this in 99 of 100 cases (chi-squared).
 ACCEPTED_SQUARE = 16.8
-GRADUATION = (1000.0, 100.0, 10.0, 1.0)
+WIDEST, NARROWER = 1000.0, 10.0  # the loss at first, in units of that square; and from one stage to the next
 STEPS_PER_STAGE = 20
 
 
@@ -58,7 +59,9 @@ def solve(poses: Array, odometry: Sequence[Edge], loops: Sequence[Edge]) -> Solu
     graph = _Graph(poses, [*odometry, *loops])
     x = np.zeros(6 * (len(poses) - 1))
     solver: Any = optimize.least_squares  # its stubs know no function for jac and loss
-    for factor in GRADUATION if loops else ():
+    worst = np.square(graph.errors(x).reshape(-1, 6)).sum(axis=1)[len(odometry) :].max(initial=0)
+    factor = max(WIDEST, float(worst) / ACCEPTED_SQUARE) if loops else 0.0
+    while factor:
         loss = _loss(6 * len(odometry), factor * ACCEPTED_SQUARE)
         x = solver(
             graph.errors,
@@ -70,6 +73,7 @@ def solve(poses: Array, odometry: Sequence[Edge], loops: Sequence[Edge]) -> Solu
             tr_options={"maxiter": 3000, "atol": 1e-8, "btol": 1e-8},
             max_nfev=STEPS_PER_STAGE,
         ).x
+        factor = max(1.0, factor / NARROWER) if factor > 1 else 0.0
     squares = np.square(graph.errors(x).reshape(-1, 6)).sum(axis=1)[len(odometry) :]
     positions, turns, _ = graph.state(x)
     return Solution(np.hstack([positions, turns.as_quat(canonical=True)]), squares)

@@ -16,14 +16,17 @@ KINDS = {
     "by value": "like a layer in training: the shapes follow from values",
 }
 
+_BFLOAT16 = {True: "yes", False: "no", None: "unknown"}
+
 
 def plan_text(net: Net) -> str:
     """Return one line per step, and what the kinds of steps mean; data is not opened.
 
     The net must have been built with memory for its weights.
     """
+    bfloat16 = f"bfloat16 on this CPU: {_BFLOAT16[has_bfloat16()]}"
     if net.programs is None:
-        return "no passes: nets run layer by layer in phase TRAIN, and where passes are switched off"
+        return f"no passes: nets run layer by layer in phase TRAIN, and where passes are switched off; {bfloat16}"
     given = tuple(
         (v, shape, torch.float32)
         for node, layer in zip(net.plan.nodes, net.layers, strict=True)
@@ -35,12 +38,11 @@ def plan_text(net: Net) -> str:
     used = [kind for kind in KINDS if kind in program.kinds]
     names = [_name(net, step) for step in steps]
     width = max((len(kind) for kind in used), default=0)
-    bfloat16 = {True: "yes", False: "no", None: "unknown"}[has_bfloat16()]
     passes = ", ".join(name for name in PASSES if name in net.programs.passes)
     layers = sum(bool(node.bottoms) for node in net.plan.nodes)
     return "\n".join(
         [
-            f"{layers} layers run as {len(steps)} steps; passes: {passes}; bfloat16 on this CPU: {bfloat16}",
+            f"{layers} layers run as {len(steps)} steps; passes: {passes}; {bfloat16}",
             *(f"  {kind:{width}}  {name}" for kind, name in zip(program.kinds, names, strict=True)),
             *(f"{kind}: {KINDS[kind]}" for kind in used),
         ]

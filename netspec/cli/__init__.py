@@ -7,24 +7,32 @@ import sys
 from collections.abc import Sequence
 
 from netspec.cli import (
+    bug_report,
     caffe_tools,
     check,
     completion,
+    data,
     diff,
     draw,
     export,
     extract,
     fmt,
     lint,
+    look,
     lsp,
     measure,
+    plot,
     run_script,
     train,
+    watch,
 )
 from netspec.cli.run import Commands
 from netspec.command_line import run
 
-_FAMILIES = (train, measure, check, draw, diff, fmt, lint, lsp, extract, export, run_script, caffe_tools)
+_FAMILIES = (
+    *(train, measure, check, draw, diff, fmt, lint, lsp, extract, plot, watch, data, look, export),
+    *(run_script, bug_report, caffe_tools),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,8 +50,19 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="netspec", description="Run Caffe's prototxt in PyTorch, with Caffe's numbers.", allow_abbrev=False
     )
+    made.add_argument("--version", nargs=0, action=_Version, help="show the version and exit")
     commands = Commands(made)
     for family in _FAMILIES:
         family.add_to(commands)
     completion.add_to(commands, parser)
     return made
+
+
+class _Version(argparse.Action):
+    """Show the version, which takes a while to find."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object, **__: object) -> None:
+        from netspec.version import version
+
+        print(f"{parser.prog} {version()}")
+        parser.exit()

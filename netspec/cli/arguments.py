@@ -98,6 +98,26 @@ def add_python(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_steps(parser: argparse.ArgumentParser) -> None:
+    """Add ``--swap``, ``--raw-scale``, ``--mean`` and ``--scale``: what is done to the pixels of image files."""
+    parser.add_argument("--swap", action="store_true", help="images: reverse the channels, to RGB")
+    parser.add_argument(
+        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply pixels, 0 to 255, by this"
+    )
+    parser.add_argument(
+        "--mean",
+        metavar="A,B,C|FILE",
+        help="then subtract this: numbers in the net's order, or a .binaryproto or .npy",
+    )
+    parser.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="then multiply by this; these four replace the data layer's transform_param",
+    )
+
+
 def positive(text: str) -> int:
     """Read a whole number above 0."""
     value = int(text)

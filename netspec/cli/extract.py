@@ -15,6 +15,7 @@ from netspec.cli.arguments import (
     add_passes,
     add_python,
     add_state,
+    add_steps,
     add_strict,
     bar,
     choice,
@@ -57,20 +58,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument(
         "--shape", type=shape, metavar="BLOB=N,C,H,W", help="the input blob's shape, if its data is not available"
     )
-    p.add_argument("--swap", action="store_true", help="with --images: reverse the channels, to RGB")
-    p.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="then multiply pixels, 0 to 255, by this")
-    p.add_argument(
-        "--mean",
-        metavar="A,B,C|FILE",
-        help="then subtract this: numbers in the net's order, or a .binaryproto or .npy",
-    )
-    p.add_argument(
-        "--scale",
-        type=float,
-        default=1.0,
-        metavar="S",
-        help="then multiply by this; these four replace the data layer's transform_param",
-    )
+    add_steps(p)
     add_device(p)
     add_state(p, phase="TEST")
     add_python(p)

@@ -35,6 +35,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument(
         "--scores", metavar="F.json", help="write the scores of each test and the snapshots taken to this file"
     )
+    p.add_argument("--tensorboard", metavar="DIR", help="write losses, rates and test outputs here for TensorBoard")
     p.add_argument("--nan", choices=NAN, default="stop", help="what a loss of NaN or infinity does (default: stop)")
     add_device(p)
     add_state(p, phase=None)
@@ -46,10 +47,10 @@ def add_to(commands: Commands) -> None:
     add_exact(p)
     p.add_argument(
         "--precision",
-        choices=("fp32", "tf32", "bf16"),
+        choices=("fp32", "tf32", "bf16", "fp16"),
         default="fp32",
-        help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, and rounds more "
-        "(default: fp32)",
+        help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, fp16 on GPUs; both round "
+        "more (default: fp32)",
     )
     add_strict(p)
 
@@ -98,8 +99,10 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
         bar = tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False)
         with _sole_writer(solver) if processes.is_root else nullcontext(), bar:
             solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
+            board = _board(solver, arguments.tensorboard) if processes.is_root else nullcontext()
             try:
-                solver.solve()
+                with board:
+                    solver.solve()
             except Lost as fault:  # told here: torchrun ends this process as soon as signals work again
                 kept = (
                     f"the last snapshot is {solver.last_snapshot}" if solver.last_snapshot else "no snapshot was taken"
@@ -161,6 +164,15 @@ def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
     if not has_locks():
         log.logger.warning(f'no file locks here: nothing stops another training from writing over "{prefix}"')
     return only_one(f"{prefix}.lock", f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
+
+
+def _board(solver: Solver, folder: str | None) -> AbstractContextManager[object]:
+    """Write for TensorBoard within the block, if a folder is given."""
+    if not folder:
+        return nullcontext()
+    from netspec.solver.board import board
+
+    return board(solver, folder)
 
 
 def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:

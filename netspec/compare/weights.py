@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from netspec.compare.difference import Difference, Differences
-from netspec.data import blobs
+from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError, Where
-from netspec.hdf5_file import layer_groups, open_hdf5
-from netspec.proto.binary import read_net_binary
 
-Weights = dict[str, list[np.ndarray]]
+Weights = dict[str, tuple[np.ndarray, ...]]
 
 
 def compare_weights(first: str | Path, second: str | Path, tolerance: float = 0.0) -> Differences:
@@ -43,32 +39,10 @@ def read_weights(path: str | Path) -> Weights:
     """Return the blobs of each layer that has any, in the file's order."""
     if not Path(path).is_file():
         raise SpecError("is not a file", Where(str(path)))
-    read = dict(_from_hdf5(path) if h5py.is_hdf5(path) else _from_message(path))
+    read = {layer.name: layer.blobs for layer in stored_layers(path)}
     if not read:
         raise SpecError("holds no weights", Where(str(path)))
     return read
-
-
-def _from_message(path: str | Path) -> Iterator[tuple[str, list[np.ndarray]]]:
-    for layer in read_net_binary(path).layer:
-        try:
-            arrays = [blobs.to_array(blob) for blob in layer.blobs]
-        except ValueError as fault:
-            raise SpecError(f'layer "{layer.name}": {fault}', Where(str(path))) from None
-        if arrays:
-            yield layer.name, arrays
-
-
-def _from_hdf5(path: str | Path) -> Iterator[tuple[str, list[np.ndarray]]]:
-    with open_hdf5(path) as file:
-        data = file.group("data")
-        for name, arrays in layer_groups(data) if data else ():
-            if arrays:
-                yield name, [np.asarray(arrays[key][()], np.float32) for key in sorted(arrays, key=_number)]
-
-
-def _number(key: str) -> tuple[int, str]:
-    return (int(key), "") if key.isdigit() else (1 << 31, key)
 
 
 def _difference(was: np.ndarray, now: np.ndarray, tolerance: float) -> str:

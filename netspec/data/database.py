@@ -8,12 +8,15 @@ Caffe: src/caffe/util/db_lmdb.cpp, src/caffe/util/db_leveldb.cpp
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 import weakref
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from itertools import islice
+from multiprocessing.util import Finalize
 from pathlib import Path
+from tempfile import mkdtemp
 from types import ModuleType, TracebackType
 
 import lmdb
@@ -47,7 +50,8 @@ class Reader(ABC):
 
 
 # A database cannot be opened twice in a process, but two nets (training and test, for example) may use the same one.
-_open_readers: weakref.WeakValueDictionary[tuple[int, int], Reader] = weakref.WeakValueDictionary()
+# A forked process opens it anew.
+_open_readers: weakref.WeakValueDictionary[tuple[int, int, int], Reader] = weakref.WeakValueDictionary()
 _open_lock = threading.Lock()
 
 
@@ -63,14 +67,15 @@ def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) 
             default = " (LEVELDB is Caffe's default)" if found == "lmdb" else ""
             named = found.upper()
             raise ValueError(f"has backend {named}, not {backend.upper()}{default}; set backend: {named}")
-        identity = os.stat(os.path.join(source, "data.mdb") if found == "lmdb" else source)
+        status = os.stat(os.path.join(source, "data.mdb") if found == "lmdb" else source)
+        identity = os.getpid(), status.st_dev, status.st_ino
         with _open_lock:
-            reader = _open_readers.get((identity.st_dev, identity.st_ino))
+            reader = _open_readers.get(identity)
             if reader is None:
                 reader = _LmdbReader(source) if found == "lmdb" else _LevelDbReader(source)
                 if not len(reader):
                     raise ValueError("is empty: it contains no records")
-                _open_readers[identity.st_dev, identity.st_ino] = reader
+                _open_readers[identity] = reader
     except (ValueError, OSError) as fault:
         raise SpecError(f'database "{source}" {fault}', where or Where(source)) from None
     _log_opened(found, source)
@@ -140,10 +145,21 @@ class _LmdbReader(Reader):
 
 
 class _LevelDbReader(Reader):
+    """A LevelDB, opened in a folder of links to its files.
+
+    The library locks a database and rewrites parts of it, even to read. The links let several processes read one, and
+    one on read-only media.
+    """
+
     def __init__(self, source: str) -> None:
         plyvel = _plyvel()
+        folder = mkdtemp(prefix="netspec-leveldb-")
+        # Unlike weakref's, this runs at the end of a worker too, and never in a process that was forked later.
+        Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
+        for name in set(os.listdir(source)) - {"LOCK", "LOG", "LOG.old"}:
+            os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
         try:
-            self._db = plyvel.DB(source, create_if_missing=False)
+            self._db = plyvel.DB(folder, create_if_missing=False)
         except (plyvel.Error, OSError) as fault:
             raise ValueError(f"cannot be opened as a LevelDB ({fault})") from None
         with self._db.iterator(include_value=False) as keys:

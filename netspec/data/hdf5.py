@@ -26,15 +26,16 @@ _FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may span two
 
 
 class Hdf5Source:
-    """The datasets with the names of the tops, row by row, from the files listed in ``list_file`` (space-separated).
+    """The datasets with the names of the tops, row by row, from the files that a list names (space-separated).
 
-    A batch may span files. With ``shuffle`` each epoch has its own order of files, and of the rows within each file.
-    Raises SpecError for a missing file or dataset, and if rows differ in shape between files.
+    ``files`` is the path of the list, or the files' own paths. A batch may span files. With ``shuffle`` each epoch has
+    its own order of files, and of the rows within each file. Raises SpecError for a missing file or dataset, and if
+    rows differ in shape between files.
     """
 
     def __init__(
         self,
-        list_file: str,
+        files: str | Sequence[str],
         tops: Sequence[str],
         batch_size: int,
         shuffle: bool,
@@ -44,11 +45,7 @@ class Hdf5Source:
         rank: int = 0,
         ranks: int = 1,
     ) -> None:
-        log.info("hdf5_data_layer.cpp:80", f"Loading list of HDF5 filenames from: {list_file}")
-        named = [(name, place) for line, place in list_lines(list_file, where) for name in line.split()]
-        log.info("hdf5_data_layer.cpp:94", f"Number of HDF5 files: {len(named)}")
-        if not named:
-            raise SpecError(f'the list "{list_file}" names no HDF5 file', where or Where(list_file))
+        named = _listed(files, where) if isinstance(files, str) else [(name, Where(name)) for name in files]
         self._tops = tuple(tops)
         self._files = [name for name, _ in named]
         self._places = [place for _, place in named]
@@ -115,6 +112,16 @@ class Hdf5Source:
             message = f'rows of "{name}" have shapes {shapes}, those of "{self._files[0]}" have {self._row_shapes}'
             raise SpecError(f"{message}; all files must agree", place)
         return count
+
+
+def _listed(path: str, where: Where | None) -> list[tuple[str, Where]]:
+    """Return the files that a list names, and where it does. Raises SpecError if it names none."""
+    log.info("hdf5_data_layer.cpp:80", f"Loading list of HDF5 filenames from: {path}")
+    named = [(name, place) for line, place in list_lines(path, where) for name in line.split()]
+    log.info("hdf5_data_layer.cpp:94", f"Number of HDF5 files: {len(named)}")
+    if not named:
+        raise SpecError(f'the list "{path}" names no HDF5 file', where or Where(path))
+    return named
 
 
 def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list[Shape]]:

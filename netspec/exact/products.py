@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -257,6 +257,111 @@ class SpreadProducts(ParameterSums):
             if maps_diff is not None:
                 _gemm_by_group(filters, columns, maps_diff[these].flatten(2), ctx.group)
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
+
+
+_rounded: dict[int, tuple[torch.Tensor, torch.Tensor]] | None = None  # by id, a weight and its rounded copy
+
+
+@contextmanager
+def weights_rounded_once() -> Iterator[None]:
+    """Within the block, in which weights do not change, :func:`rounded_weight` makes one copy of each."""
+    global _rounded
+    before, _rounded = _rounded, {}
+    try:
+        yield
+    finally:
+        _rounded = before
+
+
+def rounded_weight(weight: torch.Tensor) -> torch.Tensor | None:
+    """Return a weight in the precision that autocast asks for; None where it asks for none, or has that of the weight.
+
+    Towers that share it, and their backward passes, take the same copy.
+    """
+    kind = weight.device.type
+    if kind not in ("cpu", "cuda") or not torch.is_autocast_enabled(kind) or weight.dtype != torch.float32:
+        return None
+    if _rounded is None:
+        return weight.to(torch.get_autocast_dtype(kind))
+    if id(weight) not in _rounded:
+        _rounded[id(weight)] = weight, weight.to(torch.get_autocast_dtype(kind))
+    return _rounded[id(weight)][1]
+
+
+class SummedConvolutions(ParameterSums):
+    """What :class:`ColumnProducts` and :class:`SpreadProducts` compute, by torch's kernels, on any device.
+
+    Unlike torch's own functions it adds each gradient of the filters to the sum at once: autograd holds those of one
+    tower until it has those of all towers that share the filters. And it keeps the maps as they come, which others may
+    keep too, instead of the copy that ``lay_out`` makes for the kernel.
+    """
+
+    @staticmethod
+    @override
+    def forward(
+        ctx: Any,
+        maps: torch.Tensor,
+        weight: torch.Tensor,
+        bias: torch.Tensor | None,
+        sliding: Filter,
+        group: int,
+        transposed: bool,
+        lay_out: Callable[[torch.Tensor], torch.Tensor],
+    ) -> torch.Tensor:
+        """Return the responses, in the precision that autocast chooses."""
+        ParameterSums.keep(ctx, maps, (weight, bias), True)
+        ctx.geometry, ctx.lay_out = (sliding, group, transposed), lay_out
+        ctx.rounded = rounded_weight(weight)
+        tops = convolution(lay_out(maps), weight if ctx.rounded is None else ctx.rounded, bias, *ctx.geometry)
+        ctx.kind = tops.dtype
+        return tops
+
+    @staticmethod
+    @once_differentiable
+    @override
+    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
+        """Return the gradients of maps, weight and bias, where they are asked for."""
+        maps, weight, bias = ctx.saved_tensors
+        sums = ParameterSums.sums(ctx)
+        sliding, group, transposed = ctx.geometry
+        maps_diff, *found = torch.ops.aten.convolution_backward(
+            tops_diff,
+            ctx.lay_out(maps).to(ctx.kind),
+            weight if ctx.rounded is None else ctx.rounded,
+            None if bias is None else list(bias.shape),
+            *(sliding.stride, sliding.pad, sliding.dilation, transposed, [0] * len(sliding.kernel), group),
+            ctx.needs_input_grad[:3],
+        )
+        for total, gradient in zip(sums, found, strict=True):
+            if total is not None:
+                total += gradient
+        if maps_diff is not None:
+            maps_diff = _laid_out_like(maps, maps_diff).to(maps.dtype)
+        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
+
+
+def _laid_out_like(maps: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+    """Return the gradient of maps in their order in memory: where the two differ, torch's kernels are slow."""
+    if maps.dim() == 4 and not maps.is_contiguous() and maps.is_contiguous(memory_format=torch.channels_last):
+        return diff.contiguous(memory_format=torch.channels_last)
+    return diff.contiguous()
+
+
+def convolution(
+    maps: torch.Tensor,
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    sliding: Filter,
+    group: int,
+    transposed: bool = False,
+) -> torch.Tensor:
+    """Return what torch's kernel for so many axes computes: the filters slide, or each pixel is spread by them."""
+    axes = len(sliding.kernel) - 1
+    if transposed:
+        function = (F.conv_transpose1d, F.conv_transpose2d, F.conv_transpose3d)[axes]
+        return function(maps, weight, bias, sliding.stride, sliding.pad, 0, group, sliding.dilation)
+    function = (F.conv1d, F.conv2d, F.conv3d)[axes]
+    return function(maps, weight, bias, sliding.stride, sliding.pad, sliding.dilation, group)
 
 
 class Columns(torch.autograd.Function):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +23,7 @@ from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights
 from netspec.proto.schema import PHASES
 from netspec.proto.text import parse_net
+from netspec.version import version
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Source:
             told["level"] = str(self.level)
         if any(self.stages):
             told["stages"] = ",".join(self.stages)
-        return {**told, "version": _version()}
+        return {**told, "version": version()}
 
     @property
     def origin(self) -> str:
@@ -125,10 +125,3 @@ def _sha256(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as fault:
         raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version("netspec-caffe")
-    except importlib.metadata.PackageNotFoundError:  # the source is used without being installed
-        return "unknown"

@@ -71,7 +71,7 @@ class ImageNet:
         if len(shape) != 4 or shape[1] not in (1, 3):
             message = f'input blob "{input_blob}" has shape {tuple(shape)}, expected N x 1 or 3 x H x W for images'
             raise SpecError(message, Where(source.file))
-        self.blob, self.input = blob, input_blob
+        self.blob, self.input, self.file = blob, input_blob, source.file
         self.shape: Shape = tuple(shape[1:])
         self.zooms = tuple(zooms)
         transforming = [layer for layer in before.layer if layer.HasField("transform_param")]
@@ -111,10 +111,15 @@ class ImageNet:
 
     def __call__(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return the blob (N, V D) float32, views in order, of images (H, W, 3) or (H, W), uint8, BGR, of any size."""
-        views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
-        return self._values(self.scaling(np.stack(views)).astype(np.float32)).reshape(len(images), -1)
+        return self.values(self.inputs(images)).reshape(len(images), -1)
 
-    def _values(self, data: np.ndarray) -> np.ndarray:
+    def inputs(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return what the net gets of images: the input blob (N V, C, H, W) float32, the views of each in order."""
+        views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
+        return self.scaling(np.stack(views)).astype(np.float32)
+
+    def values(self, data: np.ndarray) -> np.ndarray:
+        """Return the blob (N V, ...) float32 in its own shape, of what :meth:`inputs` returned."""
         if self._model is not None:
             try:
                 return self._model.run({self.input: data})[self.blob]
@@ -122,10 +127,14 @@ class ImageNet:
                 self._use_torch(str(fault))
         import torch
 
-        assert self._net is not None
         with torch.no_grad():
-            self._net(**{self.input: data})
-        return self._net.blobs[self.blob].cpu().numpy()
+            return self.differentiable(torch.from_numpy(data)).cpu().numpy()
+
+    def differentiable(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the blob as torch computes it, so that its gradient can be taken; of another engine there is none."""
+        assert self._net is not None, "torch runs this net"
+        self._net(**{self.input: data})
+        return self._net.blobs[self.blob]
 
 
 def extract_images(describe: ImageNet, images: ImageList, progress: Progress = iter) -> dict[str, np.ndarray]:
@@ -136,7 +145,7 @@ def extract_images(describe: ImageNet, images: ImageList, progress: Progress = i
     parts = []
     begin = time.perf_counter()
     for start in progress(range(0, len(images.paths), BATCH)):
-        parts.append(describe([_read(path, describe.shape[0]) for path in images.paths[start : start + BATCH]]))
+        parts.append(describe([read_pixels(path, describe.shape[0]) for path in images.paths[start : start + BATCH]]))
     seconds = (time.perf_counter() - begin) / len(images.paths)
     arrays = {
         "features": np.concatenate(parts),
@@ -210,7 +219,8 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
             return
 
 
-def _read(path: Path, channels: int) -> np.ndarray:
+def read_pixels(path: Path, channels: int) -> np.ndarray:
+    """Return an image file as (H, W, 3) BGR for three ``channels``, else as (H, W), uint8. Raises SpecError."""
     try:
         return decode_pixels(path.read_bytes(), channels == 3)
     except OSError as fault:

@@ -11,7 +11,7 @@ from netspec import log
 from netspec.command_line import SEVERITIES, VARIABLE
 
 
-class _Stderr(logging.StreamHandler[Any]):
+class _Stderr(logging.StreamHandler):
     """Writes to what stderr is at the time."""
 
     def __init__(self) -> None:

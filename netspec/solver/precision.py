@@ -3,8 +3,10 @@
 ``fp32``   float32, the default; on GPUs without TF32, which torch allows cuDNN by itself
 ``tf32``   float32 whose products drop 13 bits of the mantissa, on GPUs that have it; elsewhere as fp32
 ``bf16``   products and the blobs between layers in bfloat16, 8 bits of mantissa, as torch.autocast chooses
+``fp16``   the same in float16, 11 bits of mantissa, but a small range: the loss is scaled (:class:`LossScale`)
 """
 
+# pyright: reportPrivateImportUsage=false
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -13,7 +15,11 @@ from typing import Any
 
 import torch
 
-FP32, TF32, BF16 = PRECISIONS = ("fp32", "tf32", "bf16")
+from netspec.exact.products import weights_rounded_once
+
+FP32, TF32, BF16, FP16 = PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
+_ROUNDED = {BF16: torch.bfloat16, FP16: torch.float16}
+FIRST_SCALE, LARGEST_SCALE, PATIENCE = 2.0**16, 2.0**24, 2000
 
 
 def check_precision(precision: str) -> None:
@@ -30,8 +36,41 @@ def computing(precision: str, device: torch.device) -> Iterator[None]:
     try:
         for library in cuda:
             library.allow_tf32 = precision == TF32
-        with torch.autocast(device.type, torch.bfloat16) if precision == BF16 else nullcontext():
+        kind = _ROUNDED.get(precision)
+        with torch.autocast(device.type, kind) if kind else nullcontext(), weights_rounded_once():
             yield
     finally:
         for library, allowed in zip(cuda, before, strict=True):
             library.allow_tf32 = allowed
+
+
+class LossScale:
+    """What the loss is multiplied by before the backward pass, so that small gradients do not vanish in float16.
+
+    It is a power of two, so it changes no gradient but those that would vanish. Where a gradient overflows, the
+    iteration is to update nothing, and the factor is halved; after ``PATIENCE`` iterations without that it is doubled.
+    Of the other precisions it is always 1.
+    """
+
+    def __init__(self, precision: str) -> None:
+        self.factor = FIRST_SCALE if precision == FP16 else 1.0
+        self._scales, self._good = precision == FP16, 0
+
+    def of(self, loss: torch.Tensor) -> torch.Tensor:
+        """Return the scaled loss."""
+        return loss * self.factor if self._scales else loss
+
+    @torch.no_grad()
+    def remove(self, gradients: list[torch.Tensor]) -> bool:
+        """Divide the gradients by the factor, then set the next; return whether all of them are finite."""
+        if not self._scales or not gradients:
+            return True
+        largest = torch._foreach_norm(gradients, torch.inf)
+        if not bool(torch.stack(largest).isfinite().all()):
+            self.factor, self._good = self.factor / 2, 0
+            return False
+        torch._foreach_mul_(gradients, 1 / self.factor)
+        self._good += 1
+        if self._good == PATIENCE:
+            self.factor, self._good = min(2 * self.factor, LARGEST_SCALE), 0
+        return True

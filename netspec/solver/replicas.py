@@ -15,7 +15,7 @@ import torch
 
 from netspec.net.net import Net
 from netspec.solver import update
-from netspec.solver.precision import FP32, computing
+from netspec.solver.precision import LossScale, computing
 from netspec.solver.processes import Processes
 
 
@@ -31,15 +31,15 @@ class Replicas:
         self._processes.copy_root(item.parameter.detach() for item in self._root.learnable)
         self._copy(everything=True)
 
-    def backward(self, precision: str = FP32) -> None:
-        """Add the gradients of one pass to each replica's own. The devices run in parallel."""
+    def backward(self, precision: str, scale: LossScale) -> None:
+        """Add the gradients of one pass, scaled, to each replica's own. The devices run in parallel."""
         losses = []
         for net in self.nets:
             with computing(precision, net.device):
                 losses.append(net.forward_loss()[0])
         for loss in losses:
             if loss.requires_grad:
-                loss.backward()
+                scale.of(loss).backward()
 
     @torch.no_grad()
     def reduce(self) -> None:

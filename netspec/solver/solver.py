@@ -45,7 +45,7 @@ from netspec.solver.extra import (
 from netspec.solver.heap import keep_freed_memory
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.nan import bad_parameter, bad_top
-from netspec.solver.precision import FP32, check_precision, computing
+from netspec.solver.precision import FP16, FP32, LossScale, check_precision, computing
 from netspec.solver.processes import Processes, own_device
 from netspec.solver.replicas import Replicas
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
@@ -207,6 +207,7 @@ class Solver:
         self._allow_python = allow_python
         check_precision(precision)
         self._precision = precision
+        self._scale, self._overflowed = LossScale(precision), False
         self._exact = exact if precision == FP32 else NONE
         self._strict = strict
         if seed is None:
@@ -234,6 +235,8 @@ class Solver:
             log.warning("solver.cpp:45", line)
         if said := dependence(self.net, torch.get_num_threads()):
             log.info("solver.cpp:57", said)
+        if precision == FP16 and self._device.type == "cpu":
+            log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs")
         log.info("solver.cpp:57", "Solver scaffolding done.")
         self.history = [
             torch.zeros_like(learnable.parameter.detach())
@@ -377,10 +380,21 @@ class Solver:
             wanted = self.param.debug_info and self._is_due(self.param.display)
             with self.debugged(self.net) if wanted else nullcontext():
                 loss, outputs = self.train_pass()
-            self.replicas.backward(self._precision)
+            self.replicas.backward(self._precision, self._scale)
             total += np.float32(loss.item())
         self.replicas.reduce()
+        self._unscale()
         return float(total / np.float32(self.param.iter_size)), outputs
+
+    def _unscale(self) -> None:
+        """Take the loss scale off the gradients; where one has overflowed, this iteration will update nothing."""
+        gradients = [item.parameter.grad for item in self.net.learnable if item.parameter.grad is not None]
+        self._overflowed = not self._scale.remove(gradients)
+        if self._overflowed:
+            factor = log.number(self._scale.factor)
+            log.info("sgd_solver.cpp:99", f"Iteration {self.iteration}: float16 overflowed; loss scale {factor}")
+            if self._scale.factor < 1:
+                self._tell_nan("the gradients overflow float16")
 
     def clear_gradients(self) -> None:
         """Clear the gradients, before an iteration sums them up."""
@@ -391,7 +405,7 @@ class Solver:
         with computing(self._precision, self._device):
             loss, outputs = self.net.forward_loss()
         if loss.requires_grad:
-            loss.backward()
+            self._scale.of(loss).backward()
         return loss, outputs
 
     def test_pass(self, net: Net) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -404,10 +418,16 @@ class Solver:
 
     @torch.no_grad()
     def apply_update(self) -> None:
-        """Update the weights and count the iteration; the gradients then contain the subtracted values, as in Caffe."""
+        """Update the weights and count the iteration; the gradients then contain the subtracted values, as in Caffe.
+
+        In float16 an iteration whose gradients overflowed is counted only.
+        """
         rate = self._advance_rate()
         if self._is_due(self.param.display):
             log.info("sgd_solver.cpp:112", f"Iteration {self.iteration}, lr = {log.number(rate)}")
+        if self._overflowed:
+            self.iteration += 1
+            return
         learnable = self.net.learnable
         weights = [item.parameter.detach() for item in learnable]
         diffs = [

@@ -20,6 +20,7 @@ class Clock:
 
     def __init__(self, name: str, seconds: float, turns: list[str]) -> None:
         self.name, self.seconds, self.turns, self.fault, self.outputs = name, seconds, turns, "", {}
+        self.peak = None
 
     def turn(self, passes: int) -> list[tuple[float, float]]:
         self.turns.append(self.name)
@@ -36,6 +37,12 @@ def test_all_take_their_turn_in_every_round_in_either_order() -> None:
     assert found == {"a": [(0.1, 0.2)] * 3, "b": [(0.2, 0.4)] * 3}
 
 
+def test_a_time_limit_leaves_three_rounds() -> None:
+    turns: list[str] = []
+    found = measure([Clock("a", 0.1, turns)], 9, lambda k: None, limit=0)
+    assert found == {"a": [(0.1, 0.2)] * 3}
+
+
 def test_a_ratio_is_that_of_times_in_the_same_round() -> None:
     assert ratio([1, 10, 3], [2, 20, 3]) == 0.5
 
@@ -49,16 +56,30 @@ def test_a_difference_is_relative_and_needs_equal_shapes() -> None:
 
 def test_a_table_has_the_ratios_of_what_ran_and_a_line_for_what_did_not() -> None:
     rows = [
-        Row("lenet", 1, 2, "netspec", [1e-3, 3e-3, 2e-3], [5e-3] * 3, {"pytorch": 0.5}, None),
+        Row(
+            "lenet",
+            1,
+            2,
+            "netspec",
+            [1e-3, 3e-3, 2e-3],
+            [5e-3] * 3,
+            {"pytorch": 0.5},
+            None,
+            "",
+            {"pytorch": 0.75},
+            612.3,
+        ),
         Row("lenet", 1, 2, "pytorch", [4e-3] * 3, [math.nan] * 3, {}, 1e-7),
         Row("lenet", 1, 2, "opencv4", [], [], {}, None, "it cannot"),
     ]
     lines = table(rows).splitlines()
-    assert lines[0] == "| net | batch | threads | run by | ms | best | CPU ms | / pytorch | off by |"
+    assert (
+        lines[0] == "| net | batch | threads | run by | ms | best | CPU ms | / pytorch | CPU / pytorch | MB | off by |"
+    )
     assert lines[2:] == [
-        "| lenet | 1 | 2 | netspec | 2.00 | 1.00 | 5.00 | 0.50 | - |",
-        "| lenet | 1 | 2 | pytorch | 4.00 | 4.00 | - | - | 1e-07 |",
-        "| lenet | 1 | 2 | opencv4 | - | - | - | - | - |",
+        "| lenet | 1 | 2 | netspec | 2.00 | 1.00 | 5.00 | 0.50 | 0.75 | 612 | - |",
+        "| lenet | 1 | 2 | pytorch | 4.00 | 4.00 | - | - | - | - | 1e-07 |",
+        "| lenet | 1 | 2 | opencv4 | - | - | - | - | - | - | - |",
     ]
 
 

@@ -14,6 +14,8 @@ from paths import shared
 
 CORPUS = {
     "lenet": "BVLC+caffe/examples/mnist/lenet.prototxt",
+    "cifar10_quick": "BVLC+caffe/examples/cifar10/cifar10_quick.prototxt",
+    "cifar10_full": "BVLC+caffe/examples/cifar10/cifar10_full.prototxt",
     "alexnet": "BVLC+caffe/models/bvlc_alexnet/deploy.prototxt",
     "googlenet": "BVLC+caffe/models/bvlc_googlenet/deploy.prototxt",
     "resnet50": "KaimingHe+deep-residual-networks/prototxt/ResNet-50-deploy.prototxt",
@@ -21,7 +23,14 @@ CORPUS = {
     "squeezenet": "forresti+SqueezeNet/SqueezeNet_v1.1/deploy.prototxt",
 }
 # 128 differs from 8 only in its last layer; the full sizes are those of the small ones
-TRAINED = ["lenet", "mobilenet", "small/siamese_8", "small/siamese_resnet27_256"]  # those that draw no dropout
+TRAINED = [
+    "lenet",
+    "cifar10_quick",
+    "cifar10_full",
+    "mobilenet",
+    "small/siamese_8",
+    "small/siamese_resnet27_256",
+]  # those that draw no dropout
 
 
 def difference(name: str, caffemodel: Path, inputs: Path, expected: np.ndarray) -> float:

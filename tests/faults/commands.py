@@ -135,6 +135,14 @@ def detect_inputs() -> None:
     images(30)
 
 
+def log_inputs() -> None:
+    shutil.copy(GOLDEN / "log" / "caffe_train.log", "train.log")
+
+
+def database_inputs() -> None:
+    Path("pairs").symlink_to(GOLDEN / "pairs")
+
+
 CASES = {
     "train": Case(netspec.cli.main, ["train", "solver.prototxt"], train_inputs, check_snapshots),
     "convert": Case(
@@ -160,5 +168,12 @@ CASES = {
         ["detect", "images", "--threshold", "0.5", "--out", "out", "--save", "out/d.npz"],
         detect_inputs,
         lambda: check_npz("out/d.npz"),
+    ),
+    "plot": Case(netspec.cli.main, ["plot", "train.log", "--out", "out/x.html"], log_inputs, check_report),
+    "data": Case(
+        netspec.cli.main,
+        ["data", "show", "pairs/test_lmdb", "--count", "4", "--out", "out/x.png"],
+        database_inputs,
+        check_report,
     ),
 }

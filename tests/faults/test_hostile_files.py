@@ -25,7 +25,7 @@ from netspec.data.database import Writer, open_reader
 from netspec.data.images import read_image
 from netspec.data.mean import read_mean_option
 from netspec.errors import SpecError
-from netspec.features.images import _read as read_for_features
+from netspec.features.images import read_pixels as read_for_features
 from netspec.net.weights import load_weights
 from netspec.solver.snapshot import read_state
 from paths import ROOT

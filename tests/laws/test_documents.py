@@ -28,7 +28,7 @@ BLOCKS = {
     (f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, found.start()) + 2}", found[1]): found[2]
     for path in DOCUMENTS
     for text in [path.read_text()]
-    for found in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S)
+    for found in re.finditer(r"^```([^\n`]*)\n(.*?)^```$", text, re.M | re.S)
 }
 SHELL = {where: text for (where, language), text in BLOCKS.items() if language in ("", "bash")}
 PYTHON = {where: text for (where, language), text in BLOCKS.items() if language == "python"}

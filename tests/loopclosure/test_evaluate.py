@@ -109,6 +109,7 @@ def test_the_soft_zone_excuses_overlapping_views(two_laps):
     assert outcome.measures[BEST_MATCH + SOFT_ZONE]["recall at 100 % precision"] == 0
     assert blameless.measures[BEST_MATCH]["recall at 100 % precision"] == 0
     assert blameless.measures[BEST_MATCH + SOFT_ZONE]["recall at 100 % precision"] == pytest.approx(0.95)
+    assert outcome.soft is not None
     assert "no mistake where views overlap: they are neighbors" in outcome.soft.best.truth_description
     alone = evaluate(replace(data, overlap=None), [("x", Says(scores))]).outcomes[0]
     assert alone.soft is None

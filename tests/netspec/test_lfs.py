@@ -11,7 +11,7 @@ from netspec.data.hdf5 import Hdf5Source
 from netspec.data.images import read_image
 from netspec.data.mean import read_mean
 from netspec.errors import SpecError
-from netspec.features.images import _read
+from netspec.features.images import read_pixels
 from netspec.lfs import pointer_fault
 from netspec.net.build import build_net
 from netspec.net.weights import load_weights
@@ -46,7 +46,7 @@ READERS: list[tuple[str, Callable[[str], object]]] = [
     ("mean.binaryproto", read_mean),
     ("data.mdb", of_database),
     ("1.png", read_image),
-    ("1.png", lambda path: _read(Path(path), 3)),
+    ("1.png", lambda path: read_pixels(Path(path), 3)),
 ]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Any, ClassVar
 
@@ -12,15 +12,21 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.products import ColumnProducts, Columns, Filter, SpreadProducts, prepared_columns
+from netspec.exact.products import (
+    ColumnProducts,
+    Columns,
+    Filter,
+    SpreadProducts,
+    SummedConvolutions,
+    convolution,
+    prepared_columns,
+)
+from netspec.exact.switch import is_recorded
 from netspec.layers import fused
 from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.layout import channels_side_by_side
-
-_CONVOLVE = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
-_DECONVOLVE = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
 
 
 def _by(sizes: Shape) -> str:
@@ -199,31 +205,44 @@ class Convolution(_SlidingFilter):
         """Return the responses to each bottom."""
         weight = self.blob(0)
         bias = self.blob(1) if len(self.blobs) > 1 else None
-        axes = max(self.spatial_axes, 1)  # a map without spatial axes is one of a single pixel
-        if not self.kernel:
+        if not self.kernel:  # a map without spatial axes is one of a single pixel
             weight = weight.unsqueeze(2)
         geometry = [v or (n,) for v, n in ((self.stride, 1), (self.pad, 0), (self.dilation, 1))]
+        sliding = Filter(tuple(weight.shape[2:]), *geometry)
         tops = []
         for bottom in reversed(bottoms):  # autograd goes backward from the last: as in Caffe, through the first bottom
             images = math.prod(bottom.shape[: self.channel_axis])
             maps = bottom.reshape(images, self.channels, *(bottom.shape[self.channel_axis + 1 :] or (1,)))
-            tops.append(self.apply_filters(axes, maps, weight, bias, *geometry).reshape(self.top_shapes[0]))
+            tops.append(self.apply_filters(maps, weight, bias, sliding).reshape(self.top_shapes[0]))
         return tuple(reversed(tops))
 
     def apply_filters(
-        self, axes: int, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, *geometry: Shape
+        self, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter
     ) -> torch.Tensor:
-        """Run torch's kernel for ``axes`` spatial axes; ``geometry`` is stride, pad, dilation."""
+        """Return the responses to maps (N, C, spatial axes), at least one."""
         overhang = self.overhang(self.bottom_shapes[0])
         if any(overhang):
             maps = F.pad(maps, overhang)
-        stride, pad, dilation = geometry
         if self.is_exact(maps, self.small):
-            sliding, in_place = Filter(weight.shape[2:], *geometry), self.context.accumulate_in_place
-            return ColumnProducts.apply(maps, weight, bias, sliding, self.group, in_place)
-        if torch.is_grad_enabled():  # else weights would be laid out anew for each product: this pays for large maps
-            maps = channels_side_by_side(maps) if maps.numel() > 2 * weight.numel() else maps.contiguous()
-        return _CONVOLVE[axes](maps, weight, bias, stride, pad, dilation, self.group)
+            return ColumnProducts.apply(maps, weight, bias, sliding, self.group, self.context.accumulate_in_place)
+        if not torch.is_grad_enabled():  # weights would be laid out anew for each product
+            return convolution(maps, weight, bias, sliding, self.group)
+        lay_out = channels_side_by_side if maps.numel() > 2 * weight.numel() else torch.Tensor.contiguous
+        return self.convolved(maps, weight, bias, sliding, lay_out)
+
+    def convolved(
+        self,
+        maps: torch.Tensor,
+        weight: torch.Tensor,
+        bias: torch.Tensor | None,
+        sliding: Filter,
+        lay_out: Callable[[torch.Tensor], torch.Tensor],
+        transposed: bool = False,
+    ) -> torch.Tensor:
+        """Return what torch's kernel computes of maps that ``lay_out`` puts into its order, with gradients."""
+        if self.context.accumulate_in_place and not is_recorded():
+            return SummedConvolutions.apply(maps, weight, bias, sliding, self.group, transposed, lay_out)
+        return convolution(lay_out(maps), weight, bias, sliding, self.group, transposed)
 
     @property
     @override
@@ -348,15 +367,15 @@ class Deconvolution(Convolution):
 
     @override
     def apply_filters(
-        self, axes: int, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, *geometry: Shape
+        self, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter
     ) -> torch.Tensor:
-        """Run torch's kernel for ``axes`` spatial axes; ``geometry`` is stride, pad, dilation."""
-        stride, pad, dilation = geometry
+        """Return the maps (N, C, spatial axes), at least one, spread by the filters."""
         if self.is_exact(maps):
-            sliding, in_place = Filter(weight.shape[2:], *geometry), self.context.accumulate_in_place
-            size = self.top_shapes[0][self.channel_axis + 1 :] or (1,)
+            in_place, size = self.context.accumulate_in_place, self.top_shapes[0][self.channel_axis + 1 :] or (1,)
             return SpreadProducts.apply(maps, weight, bias, sliding, self.group, in_place, size)
-        return _DECONVOLVE[axes](maps, weight, bias, stride, pad, 0, self.group, dilation)
+        if not torch.is_grad_enabled():
+            return convolution(maps, weight, bias, sliding, self.group, transposed=True)
+        return self.convolved(maps, weight, bias, sliding, lambda maps: maps, transposed=True)
 
     @override
     def multiply_adds(self) -> int:

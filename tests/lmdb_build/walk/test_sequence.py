@@ -13,7 +13,9 @@ from lmdb_build.walk.render import Camera, Light, Renderer
 from lmdb_build.walk.season import redecorate
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.closing.measure import read_depth
+from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.errors import InputError
+from loopclosure.places.frames import read_gray
 from loopclosure.places.same_place import same_place_matrix
 from loopclosure.places.sequences import read_posed, read_sequence
 from loopclosure.places.trajectory import PosedSequence, read_groundtruth, rotation_matrices
@@ -204,12 +206,8 @@ def test_the_way_leads_through_every_room_and_never_into_furniture(rooms: int) -
 
 
 def thumbnails(folder: Path, sequence: PosedSequence) -> np.ndarray:
-    pictures = [cv2.imread(str(folder / frame.path), cv2.IMREAD_GRAYSCALE) for frame in sequence.frames]
-    small = (
-        np.array([cv2.resize(picture, (16, 12), interpolation=cv2.INTER_AREA).ravel() for picture in pictures]) / 1.0
-    )
-    small -= small.mean(axis=1, keepdims=True)
-    return small / small.std(axis=1, keepdims=True)
+    pictures = [read_gray(folder / frame.path) for frame in sequence.frames]
+    return np.array([Thumbnailer(width=16, height=12)(picture).ravel() for picture in pictures])
 
 
 @pytest.mark.parametrize("season", [2, 3])

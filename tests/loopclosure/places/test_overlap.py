@@ -103,6 +103,7 @@ def test_the_field_of_view_is_the_cameras_where_it_is_known():
 
 def test_queries_in_another_recording_of_the_same_place(two_laps):
     data = load_tum(two_laps, references=two_laps)
+    assert data.overlap is not None
     assert data.truth.hard.shape == data.overlap.shape == (40, 40)
     assert data.truth.judged.all()
     assert data.truth.hard.diagonal().all()

@@ -1,5 +1,6 @@
 """``netspec check --plan`` and ``--passes``."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -31,7 +32,9 @@ def test_an_unknown_pass_is_refused(run: Callable[..., Any]) -> None:
 
 
 def test_a_training_net_has_no_passes(run: Callable[..., Any]) -> None:
-    assert "no passes" in run("check", DEPLOY, "--plan", "--phase", "TRAIN").out
+    out = run("check", DEPLOY, "--plan", "--phase", "TRAIN").out
+    assert "no passes" in out
+    assert re.search("bfloat16 on this CPU: (yes|no|unknown)\n", out)
 
 
 def test_extract_takes_passes(run: Callable[..., Any]) -> None:

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import gc
 import os
 import sys
+import tempfile
 import threading
 from pathlib import Path
 
@@ -286,6 +288,23 @@ def test_leveldb_goes_there_and_back(tmp_path: Path) -> None:
     reader = open_reader(str(tmp_path / "db"), "LEVELDB")
     assert {reader.key(i): reader.record(i) for i in range(len(reader))} == records
     assert open_reader(str(tmp_path / "db"), "leveldb").record(3) == b"\x03" * 3  # LevelDB itself would refuse a second
+
+
+def test_reading_a_leveldb_neither_locks_nor_changes_it(tmp_path: Path) -> None:
+    plyvel = pytest.importorskip("plyvel")
+    write(tmp_path / "db", {b"%04d" % i: bytes(i) for i in range(3000)}, "leveldb")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "db").iterdir()}
+    other = plyvel.DB(str(tmp_path / "db"))  # as another process that reads it
+    during = {path.name: path.read_bytes() for path in (tmp_path / "db").iterdir()}
+    reader = open_reader(str(tmp_path / "db"), "leveldb")
+    assert [len(reader.record(i)) for i in range(3000)] == list(range(3000))
+    assert {path.name: path.read_bytes() for path in (tmp_path / "db").iterdir()} == during
+    folders = set(Path(tempfile.gettempdir()).glob("netspec-leveldb-*"))
+    del reader
+    gc.collect()
+    assert len(folders - set(Path(tempfile.gettempdir()).glob("netspec-leveldb-*"))) >= 1
+    other.close()
+    assert set(before) - set(during) <= {name for name in before if name.endswith(".log") or "MANIFEST" in name}
 
 
 def test_without_plyvel_leveldb_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from netspec.exact import products
+from netspec.exact.products import rounded_weight, weights_rounded_once
+
 SIAMESE = """
     layer { name: "data" type: "Input" top: "a" top: "b"
             input_param { shape { dim: 2 dim: 1 dim: 4 dim: 4 } shape { dim: 2 dim: 1 dim: 4 dim: 4 } } }
@@ -64,13 +67,28 @@ def test_a_net_trains_side_by_side_as_torchs_wrappers_have_it(net_of, tmp_path) 
         torch.testing.assert_close(mine.parameter.grad, theirs.parameter.grad)
 
 
-def test_in_place_leaves_nothing_for_autograd(net_of) -> None:
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+def test_in_place_leaves_nothing_for_autograd(net_of, exact: str) -> None:
     """What one asks for when one builds so."""
-    net = net_of(SIAMESE, phase=0, accumulate_in_place=True)
+    net = net_of(SIAMESE, phase=0, exact=exact, accumulate_in_place=True)
     parameters = [item.parameter for item in net.learnable]
     gradients = torch.autograd.grad(net.forward_loss(**images())[0], parameters, allow_unused=True)
     assert gradients == (None,) * 4
     assert all(parameter.grad is not None for parameter in parameters)
+
+
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+def test_no_gradient_of_a_tower_waits_for_the_other_tower(net_of, exact: str) -> None:
+    """Autograd would hold those of the first tower, as large as the weights, until the second has its own."""
+    net = net_of(SIAMESE, phase=0, exact=exact, accumulate_in_place=True)
+    seen: list[list[torch.Tensor]] = []
+    inputs = {name: values.requires_grad_() for name, values in images().items()}
+    for values in inputs.values():
+        values.register_hook(lambda _: seen.append([item.parameter.grad.clone() for item in net.learnable]))
+    net.forward_loss(**inputs)[0].backward()
+    for item, of_one, of_both in zip(net.learnable, *seen, strict=True):
+        assert of_one.any(), item.layer
+        assert not torch.equal(of_one, of_both), item.layer
 
 
 @pytest.mark.parametrize("in_place", [False, True])
@@ -104,3 +122,26 @@ def test_an_inner_product_adds_up_in_memory_that_is_there(net_of, transposed: st
     reference = net_of(text, phase=0, exact="none")
     reference.forward_loss(data=data)[0].backward()
     torch.testing.assert_close(one, reference.params["ip"][0].grad)
+
+
+def test_towers_share_a_rounded_copy_of_their_weights(net_of, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is made once per pass; the gradients are those that autocast brings, up to its rounding."""
+    net, inputs = net_of(SIAMESE, phase=0, exact="none", accumulate_in_place=True), images()
+    copies: list[torch.Tensor | None] = []
+    monkeypatch.setattr(products, "rounded_weight", lambda weight: copies.append(rounded_weight(weight)) or copies[-1])
+    for _ in range(2):
+        with torch.autocast("cpu", torch.bfloat16), weights_rounded_once():
+            loss, _ = net.forward_loss(**inputs)
+        loss.backward()
+    first, second, third, _ = copies
+    assert first is second
+    assert first is not third
+    assert first is not None
+    assert first.dtype == torch.bfloat16
+    expected = net_of(SIAMESE, phase=0, exact="none")
+    expected.forward_loss(**inputs)[0].backward()
+    for mine, theirs in zip(net.learnable, expected.learnable, strict=True):
+        assert mine.parameter.grad.dtype == torch.float32
+        atol = 0.03 * float(theirs.parameter.grad.abs().max())
+        torch.testing.assert_close(mine.parameter.grad / 2, theirs.parameter.grad, rtol=0, atol=atol)
+    assert rounded_weight(net.learnable[0].parameter) is None

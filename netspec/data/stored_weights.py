@@ -1,0 +1,60 @@
+"""The weights of a .caffemodel or .caffemodel.h5 by themselves, without a net."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from netspec.data.blobs import is_legacy, to_array
+from netspec.errors import SpecError, Where
+from netspec.hdf5_file import layer_groups, open_hdf5
+from netspec.proto.binary import read_net_binary
+
+
+@dataclass(frozen=True)
+class StoredLayer:
+    """A layer's weights in a file. HDF5 files do not say the ``type``; ``legacy``: shapes are those of old, 4-D."""
+
+    name: str
+    type: str
+    blobs: tuple[np.ndarray, ...]
+    legacy: bool = False
+
+    @property
+    def has_filters(self) -> bool:
+        """Whether the first blob holds filters: four axes, and not those of an old InnerProduct (1, 1, M, N)."""
+        shape = self.blobs[0].shape
+        return len(shape) == 4 and not (self.legacy and shape[:2] == (1, 1))
+
+
+def stored_layers(path: str | Path) -> list[StoredLayer]:
+    """Return the layers that have weights: in the net's order, in HDF5 in alphabetical order. Raises SpecError."""
+    if h5py.is_hdf5(path):
+        return list(_of_hdf5(path))
+    layers = []
+    for layer in read_net_binary(path).layer:
+        if layer.blobs:
+            try:
+                blobs = tuple(to_array(blob) for blob in layer.blobs)
+            except ValueError as fault:
+                raise SpecError(str(fault), Where(str(path), layer=layer.name, type=layer.type)) from None
+            layers.append(StoredLayer(layer.name, layer.type, blobs, is_legacy(layer.blobs[0])))
+    return layers
+
+
+def _of_hdf5(path: str | Path) -> Iterator[StoredLayer]:
+    with open_hdf5(path) as file:
+        data = file.group("data")
+        if data is None:
+            raise SpecError("this is not a weights file: the HDF5 file has no group /data")
+        for name, arrays in layer_groups(data):
+            if arrays:
+                yield StoredLayer(name, "", tuple(np.asarray(arrays[key][()]) for key in sorted(arrays, key=_number)))
+
+
+def _number(key: str) -> tuple[int, str]:
+    return (int(key), "") if key.isdigit() else (1 << 31, key)

@@ -1,0 +1,216 @@
+"""What is in a database: counts, labels, statistics of the values, and what is wrong."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from netspec.data.datum import times
+from netspec.data.records import Record, Records
+from netspec.limits import amount
+
+Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
+_MOST_FAULTS = 100  # that are kept by name; all are counted
+_SORTED = 100  # so many records in the order of their labels are no accident
+
+
+@dataclass
+class Channels:
+    """Statistics over all values of each channel of records of one number of channels."""
+
+    count: int = 0
+    sums: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    squares: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    least: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    most: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    histogram: np.ndarray | None = None
+
+    def add(self, values: np.ndarray) -> None:
+        """Add the values (C, H, W) of a record; of bytes, how often each of the 256 occurs is counted."""
+        flat = values.reshape(len(values), -1)
+        if not len(self.sums):
+            size = len(values)
+            self.sums, self.squares = np.zeros(size), np.zeros(size)
+            self.least, self.most = np.full(size, np.inf), np.full(size, -np.inf)
+            self.histogram = np.zeros((size, 256), np.int64) if values.dtype == np.uint8 else None
+        self.count += flat.shape[1]
+        if values.dtype == np.uint8 and self.histogram is not None:
+            self.histogram += np.stack([np.bincount(channel, minlength=256) for channel in flat])
+        else:
+            self.histogram = None
+        wide = flat.astype(np.float64)
+        self.sums += wide.sum(axis=1)
+        self.squares += np.square(wide).sum(axis=1)
+        self.least, self.most = np.minimum(self.least, flat.min(axis=1)), np.maximum(self.most, flat.max(axis=1))
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The mean of each channel (C,)."""
+        return self.sums / max(self.count, 1)
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """The standard deviation of each channel (C,)."""
+        return np.sqrt(np.maximum(self.squares / max(self.count, 1) - np.square(self.mean), 0))
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a record: its number and its key, and one line."""
+
+    number: int
+    key: str
+    text: str
+
+
+@dataclass
+class Survey:
+    """What :func:`survey` found.
+
+    ``records`` were looked at of ``total``. ``forms`` counts records by storage and shape, ``labels`` by label.
+    ``faults`` are records that a data layer would refuse; ``notes`` say what is worth a look.
+    """
+
+    total: int
+    records: int = 0
+    size: int = 0
+    forms: Counter[str] = field(default_factory=Counter)
+    labels: Counter[float] = field(default_factory=Counter)
+    unlabeled: int = 0
+    channels: Channels = field(default_factory=Channels)
+    faults: list[Fault] = field(default_factory=list)
+    num_faults: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+def survey(records: Records, numbers: Sequence[int], progress: Progress = iter) -> Survey:
+    """Look at the records of these numbers."""
+    found = Survey(len(records))
+    watch = _Watch(found)
+    for number in progress(numbers):
+        record = records[number]
+        found.records += 1
+        found.size += record.size
+        if record.label is None:
+            found.unlabeled += 1
+        else:
+            found.labels[record.label] += 1
+        fault = record.fault or watch.fault(record)
+        if fault:
+            found.num_faults += 1
+            if len(found.faults) < _MOST_FAULTS:
+                found.faults.append(Fault(number, record.key, fault))
+        watch.see(record, sound=not fault)
+    found.notes = list(watch.notes())
+    return found
+
+
+class _Watch:
+    """Remembers what later records are compared with."""
+
+    def __init__(self, found: Survey) -> None:
+        self._found = found
+        self._first: Record | None = None
+        self._hashes: list[int] = []
+        self._labels: list[float] = []
+        self._flat = 0
+
+    def fault(self, record: Record) -> str:
+        """Return what is wrong with a record that can be read."""
+        values = record.values
+        assert values is not None
+        if self._first is None:
+            self._first = record
+        assert self._first.values is not None
+        if values.shape != self._first.values.shape:
+            first = f'the first record, "{self._first.key}", {times(self._first.values.shape)}'
+            return f"is {times(values.shape)}, {first}"
+        if values.dtype != np.uint8 and not np.isfinite(values).all():
+            return "has a NaN or an infinity"
+        return ""
+
+    def see(self, record: Record, sound: bool) -> None:
+        """Count a record; of ``sound`` ones the values too."""
+        values = record.values
+        if values is None:
+            self._found.forms[record.kind] += 1
+            return
+        self._found.forms[f"{record.kind}, {times(values.shape)}"] += 1
+        self._flat += bool(values.size > 1 and (values == values.flat[0]).all())
+        if sound:
+            self._found.channels.add(values)
+        digest = hashlib.blake2b(values.tobytes(), digest_size=8).digest()
+        self._hashes.append(int.from_bytes(digest, "little"))
+        self._labels.append(np.nan if record.label is None else record.label)
+
+    def notes(self) -> Iterable[str]:
+        """Yield what is worth a look."""
+        labels = np.array(self._labels)
+        _, place, counts = np.unique(np.array(self._hashes, np.uint64), return_inverse=True, return_counts=True)
+        if (twice := int((counts - 1).sum())) > 0:
+            yield f"records with the values of another one: {twice:,}"
+        least, most = (np.full(len(counts), end) for end in (np.inf, -np.inf))
+        known = ~np.isnan(labels)
+        np.minimum.at(least, place[known], labels[known])
+        np.maximum.at(most, place[known], labels[known])
+        if differing := int((most > least).sum()):
+            yield f"images that occur with different labels: {differing:,}"
+        if self._flat:
+            yield f"records with one value everywhere: {self._flat:,}"
+        if 0 < self._found.unlabeled < self._found.records:
+            yield f"records without a label, which Caffe reads as 0: {self._found.unlabeled:,}"
+        if len(labels) >= _SORTED and len(self._found.labels) > 1 and (np.diff(labels) >= 0).all():
+            yield "the records are in the order of their labels: batches hold few classes; shuffle when converting"
+
+
+def as_json(found: Survey) -> dict[str, Any]:
+    """Return the survey for programs."""
+    channels = found.channels
+    return {
+        "records": found.total,
+        "looked_at": found.records,
+        "bytes": found.size,
+        "forms": dict(found.forms),
+        "labels": {f"{label:g}": count for label, count in sorted(found.labels.items())},
+        "unlabeled": found.unlabeled,
+        "channels": [
+            {"mean": float(mean), "deviation": float(deviation), "least": float(least), "most": float(most)}
+            for mean, deviation, least, most in zip(
+                channels.mean, channels.deviation, channels.least, channels.most, strict=True
+            )
+        ],
+        "num_faults": found.num_faults,
+        "faults": [{"key": fault.key, "fault": fault.text} for fault in found.faults],
+        "notes": found.notes,
+    }
+
+
+def as_lines(found: Survey, name: str) -> list[str]:
+    """Return the survey for people."""
+    looked = "" if found.records == found.total else f", looked at {found.records:,} spread over them"
+    lines = [f"{name}: {found.total:,} records{looked}, {amount(found.size)} of values"]
+    lines += [f"  {count:>9,}  {form}" for form, count in found.forms.most_common(10)]
+    lines += [f"labels: {labels_line(found)}"]
+    channels = found.channels
+    for k, mean in enumerate(channels.mean[:12]):
+        spread = f"deviation {channels.deviation[k]:.4g}, {channels.least[k]:g} to {channels.most[k]:g}"
+        lines.append(f"channel {k}: mean {mean:.4g}, {spread}")
+    if len(channels.mean) > 12:
+        lines.append(f"and {len(channels.mean) - 12} more channels")
+    return lines + [f"note: {note}" for note in found.notes]
+
+
+def labels_line(found: Survey, most: int = 8) -> str:
+    """Return how often the labels occur, in one line."""
+    common = sorted(found.labels.items()) if len(found.labels) <= most else found.labels.most_common(most)
+    told = ", ".join(f"{label:g} ({count:,})" for label, count in common)
+    if len(found.labels) > most:
+        counts = found.labels.values()
+        told = f"{len(found.labels):,} different ones, {min(counts):,} to {max(counts):,} records each; most: {told}"
+    missing = f"{found.unlabeled:,} without" if found.unlabeled else ""
+    return ", ".join(part for part in (told, missing) if part) or "none"

@@ -1,0 +1,45 @@
+"""A source of batches that each process opens for itself."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from netspec.data.sources import Source
+from netspec.layers.data.files import ReadingLayer
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A source, and the names of its tops."""
+
+    source: Source
+    tops: tuple[str, ...]
+
+
+def of_layer(layer: ReadingLayer) -> Opened:
+    """Return what a data layer reads."""
+    return Opened(layer.source, tuple(layer.param.top))
+
+
+class PerProcess:
+    """Calls ``open_it`` once in each process that uses it: files and locks must not cross into a worker.
+
+    A forked worker keeps what its parent opened, unused: to close it there could disturb the parent.
+    """
+
+    def __init__(self, open_it: Callable[[], Opened]) -> None:
+        self._open = open_it
+        self._opened: dict[int, Opened] = {}
+
+    def __call__(self) -> Opened:
+        """Return what was opened in this process."""
+        process = os.getpid()
+        if process not in self._opened:
+            self._opened[process] = self._open()
+        return self._opened[process]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": {}}

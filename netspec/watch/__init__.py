@@ -1,0 +1,1 @@
+"""A training in the terminal, drawn again as its log grows."""

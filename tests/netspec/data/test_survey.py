@@ -1,0 +1,167 @@
+"""``netspec data``: statistics of databases, what is wrong with them, and sheets of their records."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from netspec.data.database import Writer
+from netspec.data.datum import array_to_datum, encoded_datum
+from netspec.data.records import open_records, spread
+from netspec.data.survey import Survey, survey
+from netspec.errors import SpecError
+from netspec.pictures.tiles import as_picture, images_in, split
+from paths import GOLDEN
+
+Run = Callable[..., Any]
+
+
+def image(seed: int, shape: tuple[int, ...] = (3, 6, 8)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
+
+
+def write(path: Path, values: list[Any], backend: str = "lmdb") -> str:
+    """Write a database of arrays, of (array, label) or of what is no Datum."""
+    with Writer(str(path), backend) as writer:
+        for number, value in enumerate(values):
+            array, label = value if isinstance(value, tuple) else (value, number % 2)
+            stored = array if isinstance(array, bytes) else array_to_datum(array, label).SerializeToString()
+            writer.put(b"%08d" % number, stored)
+    return str(path)
+
+
+def look(path: str) -> Survey:
+    records = open_records(path)
+    return survey(records, range(len(records)))
+
+
+@pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
+def test_statistics_are_those_of_numpy(tmp_path: Path, backend: str) -> None:
+    if backend == "leveldb":
+        pytest.importorskip("plyvel")
+    images = [image(k) for k in range(9)]
+    found = look(write(tmp_path / "db", images, backend))
+    together = np.stack(images)
+    np.testing.assert_allclose(found.channels.mean, together.mean(axis=(0, 2, 3)))
+    np.testing.assert_allclose(found.channels.deviation, together.std(axis=(0, 2, 3)))
+    assert found.channels.least.tolist() == together.min(axis=(0, 2, 3)).tolist()
+    assert found.channels.histogram is not None
+    assert found.channels.histogram[1, 7] == (together[:, 1] == 7).sum()
+    assert found.labels == {0: 5, 1: 4}
+    assert (found.total, found.faults, found.notes) == (9, [], [])
+    assert found.forms == {"raw bytes, 3 x 6 x 8": 9}
+
+
+def test_floats(tmp_path: Path) -> None:
+    values = [np.random.default_rng(k).normal(size=(4, 1, 1)).astype(np.float32) for k in range(5)]
+    found = look(write(tmp_path / "db", values))
+    np.testing.assert_allclose(found.channels.deviation, np.stack(values).std(axis=(0, 2, 3)), rtol=1e-6)
+    assert found.channels.histogram is None
+
+
+def test_what_a_data_layer_refuses_is_a_fault(tmp_path: Path) -> None:
+    nan = np.full((3, 6, 8), np.nan, np.float32)
+    broken = encoded_datum(b"\x89PNG....", 1).SerializeToString()
+    found = look(write(tmp_path / "db", [image(0), b"\xff\xff\xff", broken, image(1, (3, 6, 9)), nan, image(2)]))
+    assert [(fault.number, fault.text) for fault in found.faults] == [
+        (1, "is not a Datum (3 bytes)"),
+        (2, "cannot be decoded as an image"),
+        (3, 'is 3 x 6 x 9, the first record, "00000000", 3 x 6 x 8'),
+        (4, "has a NaN or an infinity"),
+    ]
+    np.testing.assert_allclose(found.channels.mean, np.stack([image(0), image(2)]).mean(axis=(0, 2, 3)))
+
+
+def test_what_is_worth_a_look_is_noted(tmp_path: Path) -> None:
+    images: list[Any] = [(image(k), k // 50) for k in range(100)]
+    images += [(image(0), 2), (image(0), 2), (np.zeros((3, 6, 8), np.uint8), 3)]
+    notes = look(write(tmp_path / "db", images)).notes
+    assert notes[:3] == [
+        "records with the values of another one: 2",
+        "images that occur with different labels: 1",
+        "records with one value everywhere: 1",
+    ]
+    assert "in the order of their labels" in notes[3]
+    some = [array_to_datum(image(k), None if k else 1).SerializeToString() for k in range(3)]
+    assert look(write(tmp_path / "some", some)).notes == ["records without a label, which Caffe reads as 0: 2"]
+
+
+def test_rows_of_hdf5_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, start in (("a.h5", 0), ("b.h5", 4)):
+        with h5py.File(name, "w") as file:
+            file["data"] = np.arange(start, start + 4.0).reshape(4, 1) + np.zeros((4, 5))
+            file["label"] = np.arange(start, start + 4)
+    Path("files.txt").write_text("a.h5\nb.h5\n")
+    records = open_records("files.txt")
+    assert len(records) == 8
+    assert (records[5].key, records[5].label) == ("b.h5:1", 5)
+    assert records[5].values is not None
+    assert records[5].values.ravel().tolist() == [5.0] * 5
+    assert look("a.h5").labels == dict.fromkeys(range(4), 1)
+
+
+@pytest.mark.parametrize("name", ["nothing", "folder", "empty.txt"])
+def test_what_is_no_database_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "empty.txt").write_text("")
+    with pytest.raises(SpecError, match=name):
+        open_records(tmp_path / name)
+
+
+def test_a_spread_is_even_and_always_the_same() -> None:
+    assert spread(5, None) == spread(5, 7) == [0, 1, 2, 3, 4]
+    numbers = spread(1000, 40)
+    assert [number // 25 for number in numbers] == list(range(40))
+    assert numbers == spread(1000, 40)
+    assert len({number % 2 for number in numbers}) == 2
+
+
+def test_pictures_of_records() -> None:
+    pair = np.stack([image(1)[0], image(2)[0]])
+    assert [images_in(values) for values in (pair, image(0), image(0, (6, 4, 4)), image(0, (6, 1, 1)))] == [2, 1, 2, 1]
+    left, right = (as_picture(part) for part in split(pair, 2))
+    np.testing.assert_array_equal(left, pair[0] / 255)
+    np.testing.assert_array_equal(right, pair[1] / 255)
+    np.testing.assert_array_equal(as_picture(image(0))[..., 0], image(0)[2] / 255)  # red is Caffe's last
+    assert as_picture(np.arange(5.0).reshape(5, 1, 1)).shape == (2, 3)
+
+
+def test_the_command_tells_and_its_status_says_whether_there_are_faults(run: Run, tmp_path: Path) -> None:
+    result = run("data", "stat", "pairs/train_lmdb")
+    assert (result.status, result.err) == (0, "")
+    assert "640 records" in result.out
+    assert "labels: 0 (320), 1 (320)" in result.out
+    found = json.loads(run("data", "stat", "pairs/train_lmdb", "--records", 10, "--json").out)
+    assert (found["records"], found["looked_at"], len(found["channels"])) == (640, 10, 2)
+    path = write(tmp_path / "bad", [image(0), b"\xff"])
+    result = run("data", "stat", path)
+    assert (result.status, result.err) == (1, f'{path}: record "00000001" is not a Datum (1 bytes)\n')
+    assert run("data", "stat", "nowhere").fault.startswith('nowhere: database "nowhere" does not exist')
+
+
+def test_the_command_draws_pairs_side_by_side_and_faults_first(run: Run, tmp_path: Path) -> None:
+    assert run("data", "show", "pairs/train_lmdb", "--out", "x.png", "--count", 6).status == 0
+    assert cv2.imread("x.png") is not None
+    path = write(tmp_path / "bad", [*(image(k) for k in range(30)), b"\xff"])
+    result = run("data", "show", path, "--out", "x.svg", "--count", 4)
+    assert result.out == "x.svg: 4 of 31 records\n"
+    text = Path("x.svg").read_text()
+    assert text.index("is not a Datum") < text.index("label 0<")
+    assert "00000030" in text
+    run("data", "show", GOLDEN / "images" / "lmdb_encoded", "--out", "y.svg", "--start", 4)
+    assert "00000003" not in Path("y.svg").read_text()
+
+
+@pytest.mark.parametrize("words", [("show", "db"), ("stat", "db", "--out", "x.png"), ("draw", "db")])
+def test_wrong_usage(run: Run, words: tuple[str, ...]) -> None:
+    assert run("data", *words).status == 2
+
+
+def test_a_picture_in_another_form_is_refused(run: Run) -> None:
+    assert run("data", "show", "pairs/test_lmdb", "--out", "x.html").fault.endswith(".png, .svg")
