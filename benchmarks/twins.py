@@ -27,7 +27,7 @@ class Siamese(nn.Module):
         super().__init__()
         self.conv1, self.conv2 = nn.Conv2d(3, 20, 5), nn.Conv2d(20, 50, 5)
         self.ip1 = nn.Linear(50 * (((size - 4) // 2 - 4) // 2) ** 2, 500)
-        self.feat = scaled(500, neurons)
+        self.feat = nn.Linear(500, neurons)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the descriptors (N, neurons)."""
