@@ -269,8 +269,9 @@ def table(rows: Sequence[Found]) -> str:
 
 
 def draw(path: str, rows: Sequence[Found]) -> None:
-    """Draw each column against the size, both axes logarithmic, as a picture whose kind ``path`` ends with."""
+    """Draw each column against the size; ``path`` ends with the kind of picture, .png or .svg."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullLocator
 
     unit, *columns = rows[0]
     across = min(3, len(columns))
@@ -278,8 +279,15 @@ def draw(path: str, rows: Sequence[Found]) -> None:
     figure = Figure(figsize=(3.4 * across, 2.6 * down), layout="constrained")
     for k, column in enumerate(columns):
         axes = figure.add_subplot(down, across, k + 1)
-        axes.plot([row[unit] for row in rows], [row[column] for row in rows], "o-")
-        axes.set(xscale="log", yscale="log", xlabel=unit, title=column)
+        sizes, values = [row[unit] for row in rows], [row[column] for row in rows]
+        axes.plot(sizes, values, "o-")
+        axes.set(xscale="log", xlabel=unit, title=column)
+        axes.set_xticks(sizes, [f"{size:,.0f}" for size in sizes], rotation=30)
+        axes.xaxis.set_minor_locator(NullLocator())
+        if max(values) > 10 * min(values) > 0:
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=0)
         axes.title.set_fontsize(9)
         axes.grid(alpha=0.3)
     figure.savefig(path)
