@@ -287,8 +287,8 @@ def draw(path: str, rows: Sequence[Found]) -> None:
         if max(values) > 10 * min(values) > 0:
             axes.set_yscale("log")
         else:
-            axes.set_ylim(bottom=0)
-        axes.title.set_fontsize(9)
+            axes.set_ylim(0, 1.08 * max(values))
+        axes.title.set_fontsize(8)
         axes.grid(alpha=0.3)
     figure.savefig(path)
 
