@@ -17,8 +17,6 @@ from torch import Tensor, nn
 
 from benchmarks.zoo import GOOGLENET, MOBILENET, RESNET50, SQUEEZENET
 
-Normalization = nn.BatchNorm1d | nn.BatchNorm2d
-
 
 class Siamese(nn.Module):
     """One tower of the paper's LeNet-like net, for images (N, 3, size, size)."""
@@ -34,13 +32,6 @@ class Siamese(nn.Module):
         x = F.max_pool2d(self.conv1(x), 2)
         x = F.max_pool2d(self.conv2(x), 2)
         return self.feat(F.relu(self.ip1(x.flatten(1))))
-
-
-def scaled(inputs: int, outputs: int) -> nn.Sequential:
-    """Return a product and its normalization, with a scale but without a bias."""
-    normalization = nn.BatchNorm1d(outputs)
-    normalization.register_parameter("bias", None)
-    return nn.Sequential(nn.Linear(inputs, outputs, bias=False), normalization)
 
 
 def conv_bn(inputs: int, outputs: int, size: int = 1, bias: bool = False, **others: Any) -> nn.Sequential:
@@ -72,11 +63,12 @@ class Resnet27(nn.Module):
             stages += [ResidualPair(wide) for _ in range(blocks)]
             width = wide
         self.stages = nn.Sequential(*stages)
-        self.feat = scaled(512 * (size // 32) ** 2, neurons)
+        self.feat = nn.Linear(512 * (size // 32) ** 2, neurons)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the descriptors (N, neurons)."""
-        return self.feat(self.stages(x).flatten(1))
+        """Return the descriptors (N, neurons), of length 1."""
+        feat = self.feat(self.stages(x).flatten(1))
+        return feat * (feat.square().sum(1, keepdim=True) + 1e-8).rsqrt()
 
 
 class LeNet(nn.Module):
@@ -361,7 +353,7 @@ def load(twin: nn.Module, caffemodel: str | Path) -> None:
     with torch.no_grad():
         for module in _learning(twin):
             values = next(layers)
-            if isinstance(module, Normalization):
+            if isinstance(module, nn.BatchNorm2d):
                 mean, variance, weight = values
                 values = next(layers)
                 factor = 1 / weight if weight else weight  # Caffe: a net that was not trained has 0
@@ -377,16 +369,16 @@ def parameter_groups(twin: nn.Module, rate: float, decay: float) -> list[dict]:
     """Return what torch.optim takes: biases learn at twice the rate, only weights decay."""
     groups = []
     for module in _learning(twin):
-        weighs = not isinstance(module, Normalization)
+        weighs = not isinstance(module, nn.BatchNorm2d)
         groups.append({"params": [module.weight], "lr": rate, "weight_decay": decay if weighs else 0})
         if module.bias is not None:
             groups.append({"params": [module.bias], "lr": 2 * rate if weighs else rate, "weight_decay": 0})
     return groups
 
 
-def _learning(twin: nn.Module) -> Iterator[nn.Conv2d | nn.Linear | Normalization]:
+def _learning(twin: nn.Module) -> Iterator[nn.Conv2d | nn.Linear | nn.BatchNorm2d]:
     for module in twin.modules():
-        if isinstance(module, nn.Conv2d | nn.Linear | Normalization):
+        if isinstance(module, nn.Conv2d | nn.Linear | nn.BatchNorm2d):
             yield module
 
 

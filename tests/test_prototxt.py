@@ -78,8 +78,8 @@ def test_the_nets_of_one_kind_differ_in_their_last_layer_alone() -> None:
         for one, other in (("siamese_8", "siamese_128"), ("siamese_resnet27_256", "siamese_resnet27_512")):
             texts = [(ROOT / f"prototxt/{part}{name}/train_val.prototxt").read_text() for name in (one, other)]
             changed = [pair for pair in zip(*(t.splitlines() for t in texts), strict=True) if pair[0] != pair[1]]
-            of_last = [pair for pair in changed if "num_output:" in pair[0] or "filler { value:" in pair[0]]
-            assert len(of_last) == (4 if "resnet" in one else 2)  # per tower the InnerProduct, and the Scale after it
+            of_last = [pair for pair in changed if "num_output:" in pair[0]]
+            assert len(of_last) == 2  # one per tower
             assert all(line.startswith(("#", "name:")) for pair in changed if pair not in of_last for line in pair)
 
 
@@ -87,26 +87,24 @@ def test_the_residual_net_has_27_convolutions_and_7x7x512_reach_the_features() -
     (checked,) = check_file(ROOT / "prototxt/siamese_resnet27_256/deploy.prototxt", TEST)
     assert checked.net is not None
     kinds = [layer.type for layer in checked.net.param.layer]
-    assert kinds.count("Convolution") == 27
-    assert kinds.count("BatchNorm") == kinds.count("Scale") == 27 + 1  # the features' own
+    assert kinds.count("Convolution") == kinds.count("BatchNorm") == 27
+    assert kinds.count("Scale") == 27 + 1  # the last makes descriptors of length 1
     assert kinds.count("Eltwise") == 1 + 2 + 5 + 3
     (last,) = (node for node in checked.net.plan.nodes if node.type == "InnerProduct")
     assert checked.net.shapes[checked.net.plan.blobs[last.bottoms[0]]] == (1, 512, 7, 7)
 
 
 @pytest.mark.parametrize("part", ["", "small/"])
-def test_distances_start_at_the_margin_or_below(part: str) -> None:
-    """What keeps trainings from diverging: a small filler; in the ResNets a Scale of 1 / sqrt(2 num_output)."""
+def test_what_keeps_trainings_from_diverging(part: str) -> None:
+    """Distances start below the margin: a small filler. Those of descriptors of length 1 stay below 2."""
     for name in NETS:
         layers = {layer.name: layer for layer in read_net(ROOT / f"prototxt/{part}{name}/train_val.prototxt").layer}
-        feat = layers["feat"].inner_product_param
         if "resnet" in name:
-            assert not feat.bias_term
-            assert layers["scale_feat"].scale_param.filler.value == pytest.approx(
-                (2 * feat.num_output) ** -0.5, rel=0.01
-            )
+            assert list(layers["feat"].bottom) == ["ip_feat", "feat_inverse"]
+            assert layers["feat_inverse"].power_param.power == -0.5
         else:
-            assert (feat.weight_filler.type, feat.weight_filler.std) == ("gaussian", pytest.approx(0.01))
+            filler = layers["feat"].inner_product_param.weight_filler
+            assert (filler.type, filler.std) == ("gaussian", pytest.approx(0.01))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -156,10 +154,11 @@ def test_one_iteration_and_back_into_the_deploy_net(
             writer.put(b"%08d" % k, array_to_datum(pixels, k % 2).SerializeToString())
     bring_here(folder, batch=2)
     trained = netspec.load_solver("solver.prototxt", device="cpu")
-    before = trained.net.params["feat"][0].detach().clone()
+    last = "ip_feat" if "ip_feat" in trained.net.params else "feat"
+    before = trained.net.params[last][0].detach().clone()
     trained.step(1)
     assert np.isfinite(trained.loss)
-    assert not np.array_equal(before.numpy(), trained.net.params["feat"][0].detach().numpy())
+    assert not np.array_equal(before.numpy(), trained.net.params[last][0].detach().numpy())
     save_weights(trained.net, "x.caffemodel")
     trained.close()
     deploy = load_net(folder / "deploy.prototxt")

@@ -20,7 +20,7 @@ class Clock:
 
     def __init__(self, name: str, seconds: float, turns: list[str]) -> None:
         self.name, self.seconds, self.turns, self.fault, self.outputs = name, seconds, turns, "", {}
-        self.peak = None
+        self.peak: float | None = None
 
     def turn(self, passes: int) -> list[tuple[float, float]]:
         self.turns.append(self.name)
