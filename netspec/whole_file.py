@@ -8,12 +8,14 @@ whether a file can be written.
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import re
 import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -114,9 +116,14 @@ def has_locks() -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to disk, where the system can: a rename is otherwise lost with the power."""
-    with suppress(OSError):  # Windows opens no folders, and some file systems do not sync them
+    """Bring the names in a folder to disk, where the system can: a rename is otherwise lost with the power.
+
+    Windows opens no folders, and some file systems do not sync them; that is logged once.
+    """
+    try:
         _sync(folder)
+    except OSError as fault:
+        _say_not_synced(os.strerror(fault.errno) if fault.errno else str(fault))
 
 
 def why_unwritable(path: str | Path) -> str:
@@ -223,6 +230,13 @@ def _remove(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink()
+
+
+@cache
+def _say_not_synced(reason: str) -> None:
+    logging.getLogger(__name__).warning(
+        "folders cannot be brought to disk here (%s): after a power failure an old file may be back", reason
+    )
 
 
 def _sync(path: Path) -> None:

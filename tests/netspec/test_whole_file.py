@@ -1,6 +1,7 @@
 """Files that appear whole, locks, and whether a file could be written: in netspec and, the same, in loopclosure."""
 
 import errno
+import logging
 import os
 import signal
 import subprocess
@@ -81,16 +82,22 @@ def test_the_file_and_its_folder_are_on_disk_before_the_block_ends(
     assert synced == [(False, [unfinished.name]), (True, ["file"])]
 
 
-def test_a_folder_that_cannot_be_synced_is_no_fault(
-    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_folder_that_cannot_be_synced_is_no_fault_and_said_once(
+    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(path: Path) -> None:
-        raise PermissionError  # as on Windows
+        raise PermissionError(errno.EACCES, "Access is denied")  # as on Windows
 
     monkeypatch.setattr(package, "_sync", refuse)
-    with package.whole_file(tmp_path / "file") as unfinished:
-        unfinished.write_text("new")
-    assert (tmp_path / "file").read_text() == "new"
+    monkeypatch.setattr(logging.getLogger(package.__name__), "propagate", True)
+    monkeypatch.setattr(logging.getLogger(package.__name__.partition(".")[0]), "propagate", True)
+    package._say_not_synced.cache_clear()
+    for text in ("new", "newer"):
+        with package.whole_file(tmp_path / "file") as unfinished:
+            unfinished.write_text(text)
+    assert (tmp_path / "file").read_text() == "newer"
+    (record,) = caplog.records
+    assert record.getMessage().startswith("folders cannot be brought to disk here (Permission denied)")
 
 
 def test_where_files_have_no_locks(package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
