@@ -1,6 +1,7 @@
 """Caffe's data for PyTorch: what a DataLoader gives is what a net reads, whatever the number of workers."""
 
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
@@ -33,6 +34,14 @@ WORKERS = [0, pytest.param(2, marks=pytest.mark.slow)]
 def model(tmp_path: Path) -> str:
     (tmp_path / "net.prototxt").write_text(NET)
     return str(tmp_path / "net.prototxt")
+
+
+@pytest.fixture(autouse=True)
+def no_handler_stays() -> Iterator[None]:
+    """Undo what torch's DataLoader does to the process: its handler of SIGCHLD would stay for all later tests."""
+    before = signal.getsignal(signal.SIGCHLD)
+    yield
+    signal.signal(signal.SIGCHLD, before)
 
 
 @pytest.mark.parametrize("workers", WORKERS)
