@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.progress import Progress
+from loopclosure.progress import Progress, timed
 
 
 @dataclass(frozen=True)
@@ -137,3 +137,14 @@ def refuse_overlap(train_images: list[Path], test_images: list[Path], model: str
             "train on images of other places",
             model,
         )
+
+
+def describe_each(
+    images: Images, stage: str, describe: Callable[[Path], np.ndarray], progress: Progress, seconds: dict[str, float]
+) -> list[np.ndarray]:
+    """Return what ``describe`` makes of each tested image; its time is added to that of the ``stage``."""
+    found = []
+    for path in progress(images.tested, stage, len(images.tested)):
+        with timed(seconds, stage):
+            found.append(describe(path))
+    return found

@@ -14,7 +14,15 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer, differences
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_inner, refuse_overlap
+from loopclosure.methods.base import (
+    Images,
+    Method,
+    MethodContext,
+    MethodResult,
+    describe_each,
+    refuse_inner,
+    refuse_overlap,
+)
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
@@ -129,11 +137,10 @@ class ThumbnailMethod:
     def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
-        tested = images.tested
-        small = np.zeros((len(tested), self.thumbnailer.height, self.thumbnailer.width), np.float32)
-        for i, path in enumerate(progress(tested, "thumbnails", len(tested))):
-            with timed(seconds, "thumbnails"):
-                small[i] = self.thumbnailer(read_gray(path))
+        small = np.array(
+            describe_each(images, "thumbnails", lambda path: self.thumbnailer(read_gray(path)), progress, seconds),
+            np.float32,
+        )
         with timed(seconds, "differences"):
             queries, references = np.split(small, [len(images.queries)])
             scores = -differences(queries, queries if images.references is None else references)

@@ -9,7 +9,7 @@ import numpy as np
 from loopclosure.descriptors.hog import Hog
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_inner
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, describe_each, refuse_inner
 from loopclosure.methods.baselines import WordModelSource
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
@@ -32,10 +32,9 @@ class HogMethod:
     def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
-        rows = []
-        for path in progress(images.tested, "HOG", len(images.tested)):
-            with timed(seconds, "HOG"):
-                rows.append(self.hog.blocks(read_gray(path)).reshape(-1))
+        rows = describe_each(
+            images, "HOG", lambda path: self.hog.blocks(read_gray(path)).reshape(-1), progress, seconds
+        )
         return _cosine(np.array(rows), images, seconds, [f"{self.hog}"])
 
 
@@ -89,10 +88,10 @@ class VladMethod:
         """Score as :class:`loopclosure.methods.base.Method` says."""
         seconds: dict[str, float] = {}
         model, notes = self.source.learn(images, progress, seconds)
-        rows = []
-        for path in progress(images.tested, "features", len(images.tested)):
-            with timed(seconds, "features"):
-                rows.append(vlad(model.vocabulary.extractor(read_gray(path)), model.vocabulary))
+        words = model.vocabulary
+        rows = describe_each(
+            images, "features", lambda path: vlad(words.extractor(read_gray(path)), words), progress, seconds
+        )
         return _cosine(np.array(rows), images, seconds, notes, TRAINING_STAGES)
 
 
