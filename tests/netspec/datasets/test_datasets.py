@@ -1,7 +1,6 @@
 """Caffe's data for PyTorch: what a DataLoader gives is what a net reads, whatever the number of workers."""
 
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -34,14 +33,6 @@ WORKERS = [0, pytest.param(2, marks=pytest.mark.slow)]
 def model(tmp_path: Path) -> str:
     (tmp_path / "net.prototxt").write_text(NET)
     return str(tmp_path / "net.prototxt")
-
-
-@pytest.fixture(autouse=True)
-def no_handler_stays() -> Iterator[None]:
-    """Undo what torch's DataLoader does to the process: its handler of SIGCHLD would stay for all later tests."""
-    before = signal.getsignal(signal.SIGCHLD)
-    yield
-    signal.signal(signal.SIGCHLD, before)
 
 
 @pytest.mark.parametrize("workers", WORKERS)
