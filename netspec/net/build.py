@@ -13,6 +13,7 @@ import torch
 
 from netspec import log
 from netspec.exact import SMALL
+from netspec.garbage import no_collection
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
@@ -63,6 +64,7 @@ def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None
     return build_filtered(*filter_net(net, source, options.report), options)
 
 
+@no_collection()
 def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
     """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
