@@ -143,8 +143,10 @@ def test_hdf5_rows_of_a_list_have_the_tops_that_are_asked_for(tmp_path: Path) ->
     [
         (lambda model: Batches(model, layer="dat"), 'no data layer "dat" in phase TRAIN; did you mean "data"'),
         (lambda model: Batches(model, "DEPLOY"), "found phase 'DEPLOY', expected TRAIN or TEST"),
+        (lambda model: netspec.load_net(model, "DEPLOY"), "found phase 'DEPLOY', expected TRAIN or TEST"),
         (lambda model: Batches("none.prototxt"), "none.prototxt"),
         (lambda model: Records("nowhere"), 'database "nowhere" does not exist'),
+        (lambda model: Records(TRAIN, phase="DEPLOY"), "found phase 'DEPLOY', expected TRAIN or TEST"),
         (lambda model: Records(TRAIN, "crop: 3"), 'no field "crop"'),
         (lambda model: Records(TRAIN, "crop_size: 99"), "crop_size 99 is larger than the image"),
         (lambda model: Records(model, "scale: 2"), "Caffe does not transform data of HDF5 files"),
