@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from netspec import log
+from netspec import log, waiting
 from netspec.check.check import check_file
 from netspec.data.records import open_records
 from netspec.data.stored_weights import stored_layers
@@ -62,6 +62,7 @@ def _machine() -> Iterator[tuple[str, str]]:
     yield "memory", amount(memory())
     yield "BLAS kernels", ", ".join(sorted(kernels())) or "another BLAS"
     yield "torch", f"CUDA {torch.version.cuda or 'none'}, {torch.get_num_threads()} threads"
+    yield "idle OpenMP threads", printable(waiting.how())
     for k in range(torch.cuda.device_count()):
         yield f"GPU {k}", torch.cuda.get_device_name(k)
     for name in sorted(os.environ):
