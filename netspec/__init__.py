@@ -8,9 +8,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import sys
 from typing import TYPE_CHECKING, Any
 
+from netspec import waiting
 from netspec.errors import SpecError
 from netspec.proto.dialect.folders import FOLDERS
 
@@ -22,13 +22,7 @@ if TYPE_CHECKING:
     from netspec.net.weights import load_weights, save_weights
     from netspec.solver.solver import Solver, load_solver
 
-# How idle OpenMP threads wait, which is read when torch is loaded: they soon fall asleep. GNU's runtime has them spin
-# 150 times as long, which takes the cores from other programs; threads that do not spin at all are woken for every
-# layer, which doubles the time of small ones (tools/bench waiting). A user's choice stays.
-_WAITS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
-if "torch" not in sys.modules and not any(name in os.environ for name in _WAITS):
-    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-    os.environ["GOMP_SPINCOUNT"] = "2000"
+waiting.sleep_soon()  # before torch is loaded
 
 # The most pixels of an image, which is read when OpenCV is loaded: a small file may unpack to gigabytes.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -11,8 +13,11 @@ from importlib import import_module
 def program(module: str, words: Sequence[str] | None = None) -> int:
     """Run the command line of a module, and return its exit status.
 
-    An interrupt is one line and status 130 from the start: most of a short command's time goes into imports.
+    An interrupt is one line and status 130 from the start: most of a short command's time goes into imports. What the
+    encoding of stdout does not have, such as bytes of a file name that are not UTF-8, is printed as escapes.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     usual = signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     try:
         if usual:
@@ -20,10 +25,23 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
         run = import_module(module).main
         if usual:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        return run(words)
+        return _written(run(words))
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+
+
+def _written(status: int) -> int:
+    """Write what stdout still holds, and return the status. At its own end Python would print a traceback."""
+    try:
+        if sys.stdout is not None:  # a caller may have closed it
+            sys.stdout.flush()
+    except OSError as fault:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # it is written once more
+        if not isinstance(fault, BrokenPipeError):
+            print(f"standard output: {fault.strerror}", file=sys.stderr)
+        return status or 1
+    return status
 
 
 def main() -> int:

@@ -79,8 +79,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[typ
         print(f"{parser.prog} {arguments.command}: error: {fault}", file=sys.stderr)
         return WRONG_USAGE
     except BrokenPipeError:
-        sys.stderr.close()  # otherwise Python complains again at exit
-        return FAULT
+        return FAULT  # quietly
     except OSError as fault:
         print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
         return arguments.fault_status

@@ -29,12 +29,13 @@ class Where:
 def printable(text: str) -> str:
     """Return a text in one line that moves no cursor: control characters are written as escapes.
 
-    Names come from files of strangers; raw, they could forge lines of a log, or talk to the terminal.
+    Names come from files of strangers; raw, they could forge lines of a log, or talk to the terminal. Bytes of a file's
+    name that are not UTF-8 are escaped too: nothing could write them.
     """
     return text.translate(_ESCAPES)
 
 
-# C0 and C1 controls, separators of lines, and marks that turn the direction of writing.
+# C0 and C1 controls, separators of lines, marks that turn the direction of writing, and halves of characters.
 _CONTROLS = [
     *(code for code in range(32) if chr(code) != "\t"),
     *range(127, 160),
@@ -42,6 +43,7 @@ _CONTROLS = [
     0x2029,
     *range(0x202A, 0x202F),
     *range(0x2066, 0x206A),
+    *range(0xD800, 0xE000),
 ]
 _ESCAPES = {code: repr(chr(code))[1:-1] for code in _CONTROLS}
 

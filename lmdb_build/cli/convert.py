@@ -43,12 +43,12 @@ def add_to(commands: Commands) -> None:
     _add_flags(p)
 
     p = commands.add("mean", _mean, "compute the mean image of a database (compute_image_mean)")
-    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: lmdb)")
+    _add_backend(p)
     p.add_argument("INPUT_DB")
     p.add_argument("OUTPUT_FILE", nargs="?", help="where to write the mean, as .binaryproto")
 
     p = commands.add("mnist", _mnist, "write the files of MNIST into a database (convert_mnist_data)")
-    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: lmdb)")
+    _add_backend(p)
     p.add_argument("IMAGES", help="the file of images, unpacked: train-images-idx3-ubyte")
     p.add_argument("LABELS", help="the file of labels, unpacked: train-labels-idx1-ubyte")
     p.add_argument("DB_NAME", help="the database to write; it must not exist")
@@ -59,11 +59,15 @@ def add_to(commands: Commands) -> None:
     p.add_argument("DB_TYPE", choices=BACKENDS)
 
 
+def _add_backend(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: lmdb)")
+
+
 def _add_flags(p: argparse.ArgumentParser) -> None:
     p.add_argument("--gray", action="store_true", help="read images as grayscale")
     p.add_argument("--shuffle", action="store_true", help="write in random order")
     p.add_argument("--seed", type=int, default=1, help="seed of the random order (default: 1)")
-    p.add_argument("--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: lmdb)")
+    _add_backend(p)
     p.add_argument("--resize_width", type=int, default=0, help="resize images to this width")
     p.add_argument("--resize_height", type=int, default=0, help="resize images to this height")
     p.add_argument("--check_size", action="store_true", help="refuse images of different sizes")

@@ -54,8 +54,7 @@ def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
         print(f"{parser.prog} {arguments.command}: error: {fault}", file=sys.stderr)
         return WRONG_USAGE
     except BrokenPipeError:
-        sys.stderr.close()  # or Python complains once more, at its end
-        return FAULT
+        return FAULT  # quietly
     except OSError as fault:
         print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
         return FAULT

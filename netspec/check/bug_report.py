@@ -14,8 +14,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from netspec import log
+from netspec import log, waiting
 from netspec.check.check import check_file
+from netspec.data.npz import read_npz
 from netspec.data.records import open_records
 from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError, printable
@@ -62,6 +63,7 @@ def _machine() -> Iterator[tuple[str, str]]:
     yield "memory", amount(memory())
     yield "BLAS kernels", ", ".join(sorted(kernels())) or "another BLAS"
     yield "torch", f"CUDA {torch.version.cuda or 'none'}, {torch.get_num_threads()} threads"
+    yield "idle OpenMP threads", printable(waiting.how())
     for k in range(torch.cuda.device_count()):
         yield f"GPU {k}", torch.cuda.get_device_name(k)
     for name in sorted(os.environ):
@@ -137,13 +139,8 @@ def _not_finite(blob: np.ndarray) -> str:
 
 
 def _arrays(path: Path) -> Iterator[str]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            lines = [f"{name}: {archive[name].dtype} {archive[name].shape}" for name in archive.files]
-    except ValueError as fault:
-        yield f"no archive of arrays: {fault}"
-        return
-    yield from _block(lines)
+    arrays = read_npz(path, "an archive of arrays")
+    yield from _block([f"{name}: {array.dtype} {array.shape}" for name, array in arrays.items()])
 
 
 def _text(path: Path, text: str) -> Iterator[str]:

@@ -82,8 +82,15 @@ def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
         parser.add_argument(
             "--phase", default=phase, choices=("TEST", "TRAIN"), type=str.upper, help=f"default: {phase}"
         )
-    parser.add_argument("--level", type=int, default=0, help="the NetState's level (default: 0)")
+    parser.add_argument("--level", type=_int32, default=0, help="the NetState's level (default: 0)")
     parser.add_argument("--stage", default="", help="the NetState's stages, separated by commas")
+
+
+def _int32(text: str) -> int:
+    value = int(text)
+    if not -(2**31) <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"found {text}, expected {-(2**31)} to {2**31 - 1}")
+    return value
 
 
 def add_shapes(parser: argparse.ArgumentParser, what: str) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, stages
 from netspec.cli.run import Commands
 from netspec.errors import printable
+from netspec.garbage import no_collection
 from netspec.proto.schema import PHASES
 
 
@@ -36,19 +34,7 @@ def add_to(commands: Commands) -> None:
     add_python(p)
 
 
-@contextmanager
-def _nothing_collected() -> Iterator[None]:
-    """Leave garbage alone within the block: of a large net, looking for it takes longer than building."""
-    was = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was:
-            gc.enable()
-
-
-@_nothing_collected()
+@no_collection()  # of the whole command: of the text and the table too
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.check.check import check_file
     from netspec.check.findings import said_as_json

@@ -15,12 +15,19 @@ def add_to(commands: Commands) -> None:
     p.add_argument("second", metavar="B", help="another of the same kind")
     p.add_argument(
         "--tolerance",
-        type=float,
+        type=_tolerance,
         default=0.0,
         metavar="X",
         help="weights no further apart are equal (default: 0)",
     )
     p.set_defaults(fault_status=UNREADABLE)
+
+
+def _tolerance(text: str) -> float:
+    value = float(text)
+    if not value >= 0:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a number of at least 0")
+    return value
 
 
 def _diff(arguments: argparse.Namespace) -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 from netspec.cli.arguments import positive
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
+from netspec.errors import printable
 
 
 def add_to(commands: Commands) -> None:
@@ -27,7 +28,7 @@ def _plot(arguments: argparse.Namespace) -> None:
     from netspec.runs.run import read_log
     from netspec.runs.summary import summary
 
-    names = arguments.names.split(",") if arguments.names else _names(arguments.logs)
+    names = [printable(name) for name in (arguments.names.split(",") if arguments.names else _names(arguments.logs))]
     if len(names) != len(arguments.logs):
         raise WrongUsage(f"found {len(names)} --names and {len(arguments.logs)} logs, expected equal numbers")
     ending = ending_of(arguments.out)

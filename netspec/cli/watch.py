@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shutil
 import signal
 import subprocess
@@ -36,8 +37,8 @@ def _watch(arguments: argparse.Namespace) -> int:
 
     if bool(arguments.log) == bool(arguments.solver):
         raise WrongUsage("give the log of a training, or --solver to start one")
-    if arguments.every <= 0:
-        raise WrongUsage(f"found --every {arguments.every:g}, expected more than 0")
+    if not 0 < arguments.every < math.inf:
+        raise WrongUsage(f"found --every {arguments.every:g}, expected a number above 0")
     if arguments.solver:
         return _train(arguments)
     follower = Follower(arguments.log)

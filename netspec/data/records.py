@@ -18,6 +18,7 @@ from netspec.data.random_words import words
 from netspec.errors import SpecError, Where
 from netspec.hdf5_file import open_hdf5
 
+_NUMBERS = "biuf"  # kinds of numpy types
 _SIGNATURES = {b"\xff\xd8\xff": "JPEG", b"\x89PNG": "PNG", b"BM": "BMP", b"II*\0": "TIFF", b"MM\0*": "TIFF"}
 
 
@@ -121,8 +122,11 @@ class _RowRecords:
             axes = {each: getattr(file.dataset(each), "ndim", 0) for each in names}
             chosen = "data" if "data" in names else max(names, key=lambda each: axes[each])
             data = file.values(chosen)
+            if data.dtype.kind not in _NUMBERS:
+                raise SpecError(f'dataset "{chosen}" has values of type {data.dtype}, expected numbers')
             labels = file.values("label") if "label" in names and chosen != "label" else None
-        return data, labels if labels is not None and len(labels) == len(data) else None
+        told = labels is not None and len(labels) == len(data) and labels.dtype.kind in _NUMBERS
+        return data, labels if told else None
 
 
 def _listed(path: str) -> Iterator[tuple[str, Where]]:

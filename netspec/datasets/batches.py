@@ -16,8 +16,10 @@ from netspec.graph.filter import filter_net, with_state
 from netspec.layers import layer_class
 from netspec.layers.base import Context
 from netspec.layers.data.files import ReadingLayer
-from netspec.proto.schema import PHASES
+from netspec.proto.schema import PHASE_NAMES, PhaseValue, phase_of
 from netspec.proto.text import parse_net
+
+_State = tuple[PhaseValue, int, tuple[str, ...]]  # phase, level, stages
 
 
 class Batches(Dataset[dict[str, torch.Tensor]]):
@@ -43,7 +45,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         rank: int = 0,
         ranks: int = 1,
     ) -> None:
-        state = (phase.upper(), level, tuple(stages))
+        state = (phase_of(phase), level, tuple(stages))
         self._opened = PerProcess(partial(_open, str(model), state, layer, seed, rank, ranks))
         opened = self._opened()
         cursor = opened.source.cursor
@@ -65,12 +67,10 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return self._opened().source.keys(iteration)
 
 
-def _open(model: str, state: tuple[str, int, tuple[str, ...]], name: str, seed: int, rank: int, ranks: int) -> Opened:
+def _open(model: str, state: _State, name: str, seed: int, rank: int, ranks: int) -> Opened:
     phase, level, stages = state
-    if phase not in PHASES:
-        raise SpecError(f"found phase {phase!r}, expected TRAIN or TEST")
     net, source = parse_net(model)
-    net, source = filter_net(with_state(net, PHASES[phase], level, stages), source)
+    net, source = filter_net(with_state(net, phase, level, stages), source)
     readers = {}
     for index, param in enumerate(net.layer):
         cls = layer_class(param.type)
@@ -81,10 +81,10 @@ def _open(model: str, state: tuple[str, int, tuple[str, ...]], name: str, seed: 
         known = ", ".join(readers) or "none"
         hint = did_you_mean(name, list(readers)) if name else ""
         message = f'no data layer "{name}"' if name else "no layer reads records"
-        raise SpecError(f"{message} in phase {phase}{hint or ';'} its data layers: {known}", Where(model))
+        raise SpecError(f"{message} in phase {PHASE_NAMES[phase]}{hint or ';'} its data layers: {known}", Where(model))
     index, cls = readers[chosen]
     param = net.layer[index]
-    param.phase = PHASES[phase]
+    param.phase = phase
     at = partial(source.at, index, layer=param.name, type=param.type)
-    context = Context(phase=PHASES[phase], data_seed=seed, at=at, rank=rank, ranks=ranks)
+    context = Context(phase=phase, data_seed=seed, at=at, rank=rank, ranks=ranks)
     return of_layer(cls(param, [], context))

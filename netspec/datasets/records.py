@@ -17,7 +17,7 @@ from netspec.datasets.opened import Opened, PerProcess, of_layer
 from netspec.errors import SpecError
 from netspec.layers.data.files import BACKENDS, ReadingLayer
 from netspec.net.one_layer import make_layer
-from netspec.proto.schema import PHASES, LayerParameter
+from netspec.proto.schema import LayerParameter, phase_of
 from netspec.proto.text import write_text
 
 
@@ -74,14 +74,12 @@ class Records(Dataset[tuple[torch.Tensor, ...]]):
 
 
 def _open_database(source: str, transform: str, phase: str, seed: int) -> Opened:
-    if phase.upper() not in PHASES:
-        raise SpecError(f"found phase {phase!r}, expected TRAIN or TEST")
     backend = "leveldb" if (Path(source) / "CURRENT").is_file() else "lmdb"
     param: Any = LayerParameter(name="data", type="Data", top=["data", "label"])
     param.data_param.source, param.data_param.batch_size = source, 1
     param.data_param.backend = BACKENDS.index(backend)
     text = f"transform_param {{ {transform} }} {write_text(param)}"
-    layer = make_layer(text, [], phase=PHASES[phase.upper()], data_seed=seed)
+    layer = make_layer(text, [], phase=phase_of(phase), data_seed=seed)
     assert isinstance(layer, ReadingLayer)
     return of_layer(layer)
 

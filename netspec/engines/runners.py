@@ -17,6 +17,7 @@ import numpy as np
 from netspec import log
 from netspec.engines.choice import BF16, FP32, ONNXRUNTIME, OPENVINO, Choice
 from netspec.engines.key import processor
+from netspec.engines.signal_stack import signal_stack_kept
 
 MODEL, OPTIMIZED = "net.onnx", "optimized.onnx"
 MOST_SHAPES = 4  # for which a model stays compiled
@@ -108,8 +109,11 @@ class OpenVino:
         import openvino
 
         self._core = openvino.Core()
-        if precision == BF16 and BF16.upper() not in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
-            raise Unable("this CPU has no bf16")
+        if precision == BF16:
+            with signal_stack_kept():
+                able = self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+            if BF16.upper() not in able:
+                raise Unable("this CPU has no bf16")
         self._path, self._precision = folder / MODEL, "bf16" if precision == BF16 else "f32"
         self._compiled: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
@@ -147,7 +151,9 @@ class OpenVino:
             "INFERENCE_NUM_THREADS": threads(),
             "PERFORMANCE_HINT": "LATENCY",
         }
-        return self._core.compile_model(model, "CPU", settings).create_infer_request(), wanted, outputs
+        with signal_stack_kept():
+            compiled = self._core.compile_model(model, "CPU", settings)
+        return compiled.create_infer_request(), wanted, outputs
 
 
 RUNNERS: dict[str, type[OnnxRuntime] | type[OpenVino]] = {ONNXRUNTIME: OnnxRuntime, OPENVINO: OpenVino}

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from netspec.data.npz import read_npz
 from netspec.errors import SpecError, Where, did_you_mean
 
 PCA, TSNE = "pca", "tsne"
@@ -27,13 +28,7 @@ class Features:
 def read_features(path: str | Path, array: str = "") -> Features:
     """Return the descriptors of a features.npz (docs/features.md); ``array`` names one of several. Raises SpecError."""
     where = Where(str(path))
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror or fault}", where) from None
-    except (ValueError, AttributeError, EOFError) as fault:
-        raise SpecError(f"is not a features.npz of netspec extract: {fault}", where) from None
+    arrays = read_npz(path, "a features.npz of netspec extract")
     found = {name: values for name, values in arrays.items() if name not in _BESIDE and values.ndim == 2}
     chosen = array or next(iter(found), "")
     if chosen not in found:

@@ -13,6 +13,7 @@ import torch
 
 from netspec import log
 from netspec.exact import SMALL
+from netspec.garbage import no_collection
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
@@ -20,7 +21,7 @@ from netspec.graph.steps import PASSES
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.weights import copy_weights, load_weights
-from netspec.proto.schema import PHASES, NetParameter, PhaseValue
+from netspec.proto.schema import NetParameter, phase_of
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 
@@ -47,11 +48,10 @@ def load_net(
     Without ``write_files`` no layer writes one. Raises SpecError for every fault of the files.
     """
     net, source = parse_net(path)
-    number = PHASES[phase] if isinstance(phase, str) else PhaseValue(phase)
     options = BuildOptions(
         torch.device(device), seed, allow_python=allow_python, exact=exact, write_files=write_files, passes=passes
     )
-    built = build_net(with_state(net, number, level, stages), source, options)
+    built = build_net(with_state(net, phase_of(phase), level, stages), source, options)
     if weights is not None:
         load_weights(built, weights, strict)
     return built
@@ -63,6 +63,7 @@ def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None
     return build_filtered(*filter_net(net, source, options.report), options)
 
 
+@no_collection()
 def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
     """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):

@@ -16,7 +16,7 @@ from netspec.layers import Context, Layer, Random, layer_class, unknown_type
 from netspec.layers.base import Shape
 from netspec.net.net import Array
 from netspec.proto.reader import read_text
-from netspec.proto.schema import PHASES, LayerParameter, NetParameter
+from netspec.proto.schema import LayerParameter, NetParameter, phase_of
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.upgrade.current import upgrade_net
 
@@ -41,8 +41,7 @@ def layer(
     (netspec/exact). Raises SpecError, and ValueError for an unknown ``exact``.
     """
     check_choice(exact)
-    number = PHASES[phase] if isinstance(phase, str) else phase
-    context = {"phase": number, "random": Random(seed), "data_seed": seed, "device": torch.device(device)}
+    context = {"phase": phase_of(phase), "random": Random(seed), "data_seed": seed, "device": torch.device(device)}
     return OneLayer(partial(make_layer, text, tops=tops, allow_python=allow_python, exact=exact, **context), shapes)
 
 

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
+from netspec import log
 from netspec.pictures.style import COLORS, FAULT, GRID, STYLE
 from netspec.runs.curve import Curve, shown_range, smoothed, thinned
 from netspec.runs.run import Run
@@ -146,11 +147,14 @@ def _line(axis: Axes, x: np.ndarray, y: np.ndarray, name: str, **options: object
 
 def _scale_losses(axis: Axes, runs: Sequence[Run], look: Look) -> None:
     """Show the whole range but for a few outliers."""
-    if look.log:
+    tests = [curves[name] for run in runs for curves in run.tests.values() for name in run.losses & set(curves)]
+    curves = [curve.arrays()[1] for curve in [*(run.loss for run in runs), *tests]]
+    if look.log and any((curve > 0).any() for curve in curves):
         axis.set_yscale("log")
         return
-    tests = [curves[name] for run in runs for curves in run.tests.values() for name in run.losses & set(curves)]
-    found = shown_range([curve.arrays()[1] for curve in [*(run.loss for run in runs), *tests]])
+    if look.log:
+        log.logger.warning("no loss is above 0: its axis is not logarithmic")
+    found = shown_range(curves)
     if found is not None and found[1] > found[0]:
         margin = 0.05 * (found[1] - found[0])
         axis.set_ylim(found[0] - margin, found[1] + margin)

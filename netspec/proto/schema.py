@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
+from netspec.errors import SpecError
+
 PACKAGE = "caffe"
 _LAST_NUMBER = 1 << 29  # field numbers end before this
 
@@ -103,6 +105,15 @@ else:
 TRAIN, TEST = PhaseValue(0), PhaseValue(1)  # enum Phase
 PHASES = {"TRAIN": TRAIN, "TEST": TEST}
 PHASE_NAMES = ("TRAIN", "TEST")
+
+
+def phase_of(phase: str | int) -> PhaseValue:
+    """Return a phase by its name, in small letters too, or by its number. Raises SpecError for an unknown name."""
+    if not isinstance(phase, str):
+        return PhaseValue(phase)
+    if phase.upper() not in PHASES:
+        raise SpecError(f"found phase {phase!r}, expected TRAIN or TEST")
+    return PHASES[phase.upper()]
 
 
 @dataclass(frozen=True)

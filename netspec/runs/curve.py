@@ -49,7 +49,7 @@ def smoothed(values: np.ndarray, window: int | None = None) -> np.ndarray:
     NaN and infinity are left out; where nothing is left, the mean is NaN. Without a window a 25th of the values is
     taken.
     """
-    size = max(1, len(values) // _POINTS_OF_WINDOW) if window is None else window
+    size = max(1, len(values) // _POINTS_OF_WINDOW) if window is None else min(window, 2 * len(values))
     half = size // 2
     known = np.isfinite(values)
     sums = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])

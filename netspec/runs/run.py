@@ -5,11 +5,15 @@ Caffe: src/caffe/solver.cpp, src/caffe/solvers/sgd_solver.cpp; the sentences dif
 
 from __future__ import annotations
 
+import math
 import os
 import re
+import stat
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+
+import numpy as np
 
 from netspec.errors import SpecError, Where
 from netspec.runs.curve import Curve
@@ -17,20 +21,22 @@ from netspec.runs.curve import Curve
 RUNNING, DONE, STOPPED, FAILED = "running", "done", "stopped early", "failed"
 
 # `I1121 00:36:27.939015 12135 solver.cpp:239] ...`; newer versions of glog write the year too.
-_PREFIX = re.compile(r"([IWEF])(?:\d{4})?(\d\d)(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{6}) +(\d+) (\S+?)\] ?(.*)")
-_LOSS = re.compile(r"Iteration (\d+)(?: \((\S+) iter/s[^)]*\))?[^=]*, loss = (\S+)")
-_RATE = re.compile(r"Iteration (\d+), lr = (\S+)")
-_TESTING = re.compile(r"Iteration (\d+), Testing net(?: \(#(\d+)\))?")
-_OUTPUT = re.compile(r"(Train|Test) net output #(\d+): (.*) = (\S+?)(?: \(\* .* loss\))?$")
-_SCORE = re.compile(r"Test score #(\d+): (\S+)")  # until 2014
+_COUNT = "([0-9]{1,10})(?![0-9])"  # an int of 32 bits
+_PREFIX = re.compile(rf"([IWEF])(?:\d{{4}})?(\d\d)(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{{6}}) +{_COUNT} (\S+?)\] ?(.*)")
+_LOSS = re.compile(rf"Iteration {_COUNT}(?: \((\S+) iter/s[^)]*\))?[^=]*, loss = (\S+)")
+_RATE = re.compile(rf"Iteration {_COUNT}, lr = (\S+)")
+_TESTING = re.compile(rf"Iteration {_COUNT}, Testing net(?: \(#{_COUNT}\))?")
+_OUTPUT = re.compile(rf"(Train|Test) net output #{_COUNT}: (.*) = (\S+?)(?: \(\* .* loss\))?$")
+_SCORE = re.compile(rf"Test score #{_COUNT}: (\S+)")  # until 2014
 _TEST_LOSS = re.compile(r"Test loss: (\S+)")
 _WAITING = re.compile(r"Waiting for data: (\S+) %")
-_SNAPSHOT = re.compile(r"Snapshotting to (?:.* file )?(\S+_iter_(\d+)(?:\.caffemodel\S*)?)")
+_SNAPSHOT = re.compile(rf"Snapshotting to (?:.* file )?(\S+_iter_{_COUNT}(?:\.caffemodel\S*)?)")
 _SETTING = re.compile(r"(max_iter|display|test_interval|average_loss|type|net|snapshot_prefix): (.*)")
 # Python's, a signal's, and netspec's own: `solver.prototxt:3:1: ...`.
 _FAULT = re.compile(r"Traceback |\*\*\* .*SIG|\S[^:]*:\d+:\d+: |there is not enough memory")
 _WINDOWS = {"1.#QNAN": "nan", "-1.#IND": "nan", "1.#INF": "inf", "-1.#INF": "-inf"}
 _YEAR = 366 * 86400.0
+_GREATEST = float(np.finfo(np.float32).max)
 
 
 @dataclass
@@ -69,7 +75,7 @@ class Run:
     def max_iter(self) -> int | None:
         """How many iterations the solver is to do, where the log says it."""
         found = self.settings.get("max_iter", "")
-        return int(found) if found.isdigit() else None
+        return int(found) if re.fullmatch(_COUNT, found) else None
 
     def curves(self) -> list[Curve]:
         """Return all curves."""
@@ -202,10 +208,11 @@ class Follower:
         try:
             with open(self._path, "rb") as file:
                 status = os.fstat(file.fileno())
-                if status.st_size < self._offset or (self._file and status.st_ino != self._file):
-                    self._begin()
+                if stat.S_ISREG(status.st_mode):  # what comes through a pipe is there once
+                    if status.st_size < self._offset or (self._file and status.st_ino != self._file):
+                        self._begin()
+                    file.seek(self._offset)
                 self._file, self.changed = status.st_ino, status.st_mtime
-                file.seek(self._offset)
                 new = file.read()
         except OSError as fault:
             raise SpecError(f"cannot be read: {fault.strerror}", Where(str(self._path))) from None
@@ -232,7 +239,9 @@ def read_log(path: str | Path, name: str = "") -> Run:
 
 
 def _number(text: str) -> float:
+    """Read a float of 32 bits: what is greater is infinite; what is no number is NaN."""
     try:
-        return float(_WINDOWS.get(text.rstrip(","), text.rstrip(",")))
+        value = float(_WINDOWS.get(text.rstrip(","), text.rstrip(",")))
     except ValueError:
-        return float("nan")
+        return math.nan
+    return math.copysign(math.inf, value) if abs(value) > _GREATEST else value

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec import log
+from netspec import log, waiting
 from netspec.errors import SpecError, Where
 from netspec.exact import NONE, SMALL
 from netspec.graph.filter import with_train_state
@@ -234,6 +234,8 @@ class Solver:
         for line in fields_without_effect(param, node, read):
             log.warning("solver.cpp:45", line)
         if said := dependence(self.net, torch.get_num_threads()):
+            log.info("solver.cpp:57", said)
+        if self._device.type == "cpu" and (said := waiting.too_late(torch.get_num_threads())):
             log.info("solver.cpp:57", said)
         if precision == FP16 and self._device.type == "cpu":
             log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs")

@@ -6,24 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from given_scores import GivenScores
 from loopclosure.errors import InputError
 from loopclosure.evaluate import SOFT_ZONE, evaluate, named_method
-from loopclosure.methods.base import METHODS, MethodContext, MethodResult, make_method
+from loopclosure.methods.base import METHODS, MethodContext, make_method
 from loopclosure.methods.features import FeatureMethod
 from loopclosure.methods.seqslam import SeqSlam
 from loopclosure.methods.verified import Verified
 from loopclosure.places.datasets import load_tum
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
-
-
-class Says:
-    """A method that returns given scores."""
-
-    def __init__(self, scores, name="says", training_stages=()):
-        self.scores, self.name, self.training_stages = scores, name, training_stages
-
-    def score(self, images, progress):
-        return MethodResult(self.scores, {"training": 2.0, "looking": 1.0}, ["a note"], self.training_stages)
 
 
 def test_perfect_features_find_every_loop(two_laps, two_laps_features):
@@ -44,7 +35,7 @@ def test_silence_is_said_and_costs_recall(two_laps):
     data = load_tum(two_laps)
     scores = np.where(data.truth.hard, 1.0, 0.0)
     scores[30:] = np.nan
-    (outcome,) = evaluate(data, [("half", Says(scores))]).outcomes
+    (outcome,) = evaluate(data, [("half", GivenScores(scores, {"looking": 1.0}, ["a note"]))]).outcomes
     assert outcome.pairs.recall[0] == 0.5
     silent = int(np.count_nonzero(data.truth.judged[30:]))
     assert outcome.notes[-1].startswith(f"no score for {silent} of ")
@@ -52,18 +43,19 @@ def test_silence_is_said_and_costs_recall(two_laps):
 
 def test_training_is_not_counted_a_frame(two_laps):
     data = load_tum(two_laps)
-    (outcome,) = evaluate(data, [("x", Says(np.zeros((40, 40)), training_stages=("training",)))]).outcomes
+    method = GivenScores(np.zeros((40, 40)), {"training": 2.0, "looking": 1.0}, [], ("training",))
+    (outcome,) = evaluate(data, [("x", method)]).outcomes
     assert outcome.seconds_on_frames == 1.0
 
 
 def test_scores_of_another_size_are_refused(two_laps):
     with pytest.raises(InputError, match="the scores are 3 x 3, the truth is 40 x 40"):
-        evaluate(load_tum(two_laps), [("x", Says(np.zeros((3, 3))))])
+        evaluate(load_tum(two_laps), [("x", GivenScores(np.zeros((3, 3))))])
 
 
 def test_two_methods_of_one_name_are_refused(two_laps):
     with pytest.raises(InputError, match='two methods are called "x"'):
-        evaluate(load_tum(two_laps), [("x", Says(np.zeros((40, 40)))), ("x", Says(np.zeros((40, 40))))])
+        evaluate(load_tum(two_laps), [("x", GivenScores(np.zeros((40, 40)))), ("x", GivenScores(np.zeros((40, 40))))])
 
 
 @pytest.mark.parametrize(
@@ -104,20 +96,22 @@ def test_the_soft_zone_excuses_overlapping_views(two_laps):
     overlapping = replace(data, overlap=neighbors | data.truth.hard, overlap_rule="they are neighbors")
     scores = np.where(neighbors, 2.0, np.where(data.truth.hard, 1.0, 0.0))
     scores[39] = np.where(np.arange(40) == 3, 3.0, 0.0)  # the surest match is wrong in both zones
-    outcome, blameless = evaluate(overlapping, [("x", Says(scores)), ("y", Says(scores * (scores < 3)))]).outcomes
+    outcome, blameless = evaluate(
+        overlapping, [("x", GivenScores(scores)), ("y", GivenScores(scores * (scores < 3)))]
+    ).outcomes
     assert outcome.measures[BEST_MATCH]["recall at 100 % precision"] == 0
     assert outcome.measures[BEST_MATCH + SOFT_ZONE]["recall at 100 % precision"] == 0
     assert blameless.measures[BEST_MATCH]["recall at 100 % precision"] == 0
     assert blameless.measures[BEST_MATCH + SOFT_ZONE]["recall at 100 % precision"] == pytest.approx(0.95)
     assert outcome.soft is not None
     assert "no mistake where views overlap: they are neighbors" in outcome.soft.best.truth_description
-    alone = evaluate(replace(data, overlap=None), [("x", Says(scores))]).outcomes[0]
+    alone = evaluate(replace(data, overlap=None), [("x", GivenScores(scores))]).outcomes[0]
     assert alone.soft is None
     assert BEST_MATCH + SOFT_ZONE not in alone.measures
 
 
 def test_a_method_that_accepts_nothing_scores_0(two_laps):
-    (outcome,) = evaluate(load_tum(two_laps), [("x", Says(np.full((40, 40), np.nan)))]).outcomes
+    (outcome,) = evaluate(load_tum(two_laps), [("x", GivenScores(np.full((40, 40), np.nan)))]).outcomes
     assert {value for table in outcome.measures.values() for value in table.values()} == {0.0}
 
 

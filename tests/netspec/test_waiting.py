@@ -1,12 +1,19 @@
-"""How idle OpenMP threads wait in a process of netspec's, and that the user's own choice is left alone."""
+"""How idle OpenMP threads wait in a process of netspec's, where it is too late to choose, and what is said of it."""
 
+import logging
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+import torch
 
+import netspec
+from netspec import waiting
+from netspec.check.bug_report import bug_report
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -48,3 +55,43 @@ def test_where_torch_is_there_already_it_is_too_late() -> None:
         "GOMP_SPINCOUNT=2000",
     ]
     assert python("-c", f"import torch, netspec; {SHOW}").stdout.strip() == ""
+
+
+HOW = "import netspec.waiting; print(netspec.waiting.how()); print(netspec.waiting.too_late(2))"
+
+
+@pytest.mark.parametrize(
+    ("first", "variables", "how", "too_late"),
+    [
+        ("netspec", {}, "OMP_WAIT_POLICY=PASSIVE, GOMP_SPINCOUNT=2000", False),
+        ("torch", {}, "the runtime's own way: torch was imported before netspec", True),
+        ("torch", {"GOMP_SPINCOUNT": "5"}, "GOMP_SPINCOUNT=5", False),
+    ],
+)
+def test_how_threads_wait_is_known(first: str, variables: dict[str, str], how: str, too_late: bool) -> None:
+    found = python("-c", f"import {first}; {HOW}", **variables).stdout.split("\n")
+    assert found[0] == how
+    assert found[1].startswith("torch was imported before netspec") == too_late
+
+
+@pytest.fixture
+def torch_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(waiting, "_torch_came_first", True)
+
+
+def test_a_bug_report_says_how_threads_wait() -> None:
+    assert f"| idle OpenMP threads | {waiting.how()} |" in bug_report([])
+
+
+@pytest.mark.usefixtures("torch_first")
+@pytest.mark.parametrize(("threads", "times"), [(2, 1), (1, 0)])
+def test_the_log_of_a_training_says_once_that_it_was_too_late(
+    threads: int, times: int, work_in: Callable[..., Path], caplog: pytest.LogCaptureFixture, monkeypatch
+) -> None:
+    work_in("train/sgd_step")
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    with caplog.at_level(logging.INFO):
+        netspec.load_solver("sgd_step/solver.prototxt", device="cpu").close()
+    said = [line for line in caplog.messages if "torch was imported before netspec" in line]
+    assert len(said) == times
+    assert all(line.endswith("or set OMP_WAIT_POLICY=PASSIVE and GOMP_SPINCOUNT=2000") for line in said)

@@ -6,27 +6,15 @@ import re
 import numpy as np
 import pytest
 
+from given_scores import GivenScores
 from loopclosure.cli import main
 from loopclosure.errors import InputError
 from loopclosure.evaluate import evaluate
-from loopclosure.methods.base import MethodResult
 from loopclosure.places.datasets import load_tum
 from loopclosure.report.compare import read_reports, table, text, warnings
 from loopclosure.report.files import write_files
 
 pytestmark = pytest.mark.slow
-
-
-class Says:
-    """A method that returns given scores."""
-
-    name = "says"
-
-    def __init__(self, scores):
-        self.scores = scores
-
-    def score(self, images, progress):
-        return MethodResult(self.scores)
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +25,8 @@ def reports(two_laps, tmp_path_factory):
     noise = np.random.default_rng(0).normal(size=(40, 40))
     paths = []
     for label, methods in (
-        ("old", [("net", Says(noise)), ("<other>", Says(noise))]),
-        ("new", [("net", Says(perfect))]),
+        ("old", [("net", GivenScores(noise)), ("<other>", GivenScores(noise))]),
+        ("new", [("net", GivenScores(perfect))]),
     ):
         folder = tmp_path_factory.mktemp("runs") / label
         folder.mkdir()

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from given_scores import GivenScores
 from loopclosure.evaluate import evaluate, named_method
-from loopclosure.methods.base import MethodContext, MethodResult
+from loopclosure.methods.base import MethodContext
 from loopclosure.places.datasets import load_traverses, load_tum
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report.files import measures_text
@@ -20,17 +21,7 @@ from loopclosure.report.plots import best_true_references, decisions
 
 pytestmark = pytest.mark.slow
 
-
-class Says:
-    """A method that returns given scores."""
-
-    name = "says"
-
-    def __init__(self, scores, result=None):
-        self.result = result or MethodResult(scores, {"vocabulary": 3.0, "looking": 0.4}, ["a <note>"], ("vocabulary",))
-
-    def score(self, images, progress):
-        return self.result
+COSTS = {"vocabulary": 3.0, "looking": 0.4}, ["a <note>"], ("vocabulary",)  # seconds, notes, training stages
 
 
 class Tags(HTMLParser):
@@ -54,8 +45,8 @@ def evaluation(two_laps, two_laps_features):
     rng = np.random.default_rng(0)
     methods = [
         named_method(f"A net & more=features:{two_laps_features}", MethodContext()),
-        ("<noise>", Says(rng.normal(size=(40, 40)))),
-        ("silent", Says(np.full((40, 40), np.nan))),
+        ("<noise>", GivenScores(rng.normal(size=(40, 40)), *COSTS)),
+        ("silent", GivenScores(np.full((40, 40), np.nan), *COSTS)),
     ]
     return evaluate(load_tum(two_laps), methods, train="nothing")
 
@@ -87,8 +78,9 @@ def test_what_is_named_maliciously_is_text(two_laps, tmp_path):
     evil = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7 * 7 }}{% raw %}$\\frac{"
     data = load_tum(two_laps)
     data = replace(data, name=evil, notes=[evil], truth=replace(data.truth, description=evil))
-    says = MethodResult(np.zeros((40, 40)), {evil: 1.0}, [evil])
-    evaluation = evaluate(data, [(evil, Says(says.scores, says)), (evil.upper(), Says(says.scores))], train=evil)
+    scores = np.zeros((40, 40))
+    methods = [(evil, GivenScores(scores, {evil: 1.0}, [evil])), (evil.upper(), GivenScores(scores, *COSTS))]
+    evaluation = evaluate(data, methods, train=evil)
     page = write_report(evaluation, tmp_path, evil, f"loopclosure evaluate --title {evil}").read_text()
     reader = Tags()
     reader.feed(page)
@@ -193,7 +185,7 @@ def test_two_traverses_without_positions(tmp_path):
         for i in range(6):
             cv2.imwrite(str(tmp_path / folder / f"{i}.png"), np.full((30 + i, 40, 3), 40 * i, np.uint8))
     data = load_traverses(tmp_path / "night", tmp_path / "day", soft_tolerance=1)
-    evaluation = evaluate(data, [("one", Says(-np.abs(np.subtract.outer(np.arange(6.0), np.arange(6.0)))))])
+    evaluation = evaluate(data, [("one", GivenScores(-np.abs(np.subtract.outer(np.arange(6.0), np.arange(6.0)))))])
     page = write_report(evaluation, tmp_path / "out").read_text()
     assert page.count("data:image/png;base64,") == 3
     assert not (tmp_path / "out" / "map.png").exists()

@@ -9,8 +9,8 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.legend import Legend
 
+from given_scores import GivenScores
 from loopclosure.evaluate import Evaluation, evaluate
-from loopclosure.methods.base import MethodResult
 from loopclosure.places.datasets import DataSet
 from loopclosure.places.truth import Exclusion, sequence_truth
 from loopclosure.report.plots import curves, matches, matrices
@@ -20,18 +20,6 @@ FRAMES = 40
 LONG_NAME = "a net with a name of many words, as people give them when they compare settings (euclidean, whitened)"
 
 
-class Says:
-    """A method that returns given scores."""
-
-    name = "says"
-
-    def __init__(self, scores):
-        self.scores = scores
-
-    def score(self, images, progress):
-        return MethodResult(self.scores)
-
-
 def evaluation_of(names: list[str]) -> Evaluation:
     """Two laps of 20 places, scored at random."""
     rng = np.random.default_rng(0)
@@ -39,7 +27,7 @@ def evaluation_of(names: list[str]) -> Evaluation:
     data = DataSet(
         "synthetic", [Path(f"{i}.png") for i in range(FRAMES)], None, sequence_truth(hard, Exclusion(5), "the rule")
     )
-    return evaluate(data, [(name, Says(hard + rng.normal(size=hard.shape))) for name in names])
+    return evaluate(data, [(name, GivenScores(hard + rng.normal(size=hard.shape))) for name in names])
 
 
 def legend_of(axis: Axes) -> Legend:

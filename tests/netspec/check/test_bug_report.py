@@ -91,3 +91,13 @@ def test_the_version(run: Run) -> None:
     assert netspec.__version__ == version()
     assert version("no-such-distribution") == UNKNOWN
     assert run("--version").out == f"netspec {version()}\n"
+
+
+def test_a_damaged_archive_and_a_name_that_is_not_utf8_are_told(tmp_path: Path) -> None:
+    np.savez(tmp_path / "whole.npz", x=np.zeros(3))
+    path = tmp_path / "caf\udce9.npz"
+    path.write_bytes((tmp_path / "whole.npz").read_bytes()[:100])
+    text = bug_report([str(path)])
+    assert "is not an archive of arrays, or is damaged" in text
+    assert "caf\\udce9.npz" in text
+    text.encode()

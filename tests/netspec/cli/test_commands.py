@@ -311,6 +311,9 @@ def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
         (["test", "--model", "m", "--weights", "w", "--iterations", "0"], "found 0, expected a positive number"),
         (["check", "net", "--shape", "data=1x2"], "found 'data=1x2', expected BLOB=N,C,H,W, e.g. data=32,3,224,224"),
         (["time", "--model", "m", "--exact", "some"], "argument --exact: invalid choice: 'some'"),
+        (["check", "net", "--level", "2147483648"], "found 2147483648, expected -2147483648 to 2147483647"),
+        (["diff", "a", "b", "--tolerance", "-1"], "found -1, expected a number of at least 0"),
+        (["diff", "a", "b", "--tolerance", "nan"], "found nan, expected a number of at least 0"),
         (["check", "net", "--phase", "VAL"], "argument --phase: invalid choice: 'VAL'"),
         (["extract", "--model", "m", "--blob", "b", "--out", "o", "--source", "db"], "found 'db', expected LAYER=DB"),
         (

@@ -114,6 +114,16 @@ def test_what_is_no_database_is_refused(tmp_path: Path, name: str) -> None:
         open_records(tmp_path / name)
 
 
+def test_hdf5_files_of_texts(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["data"], file["label"] = np.zeros((2, 3)), np.array([b"a", b"b"])
+    assert look(str(tmp_path / "x.h5")).unlabeled == 2
+    with h5py.File(tmp_path / "y.h5", "w") as file:
+        file["data"] = np.array([b"a", b"b"])
+    with pytest.raises(SpecError, match=r'HDF5 file ".*y.h5" dataset "data" has values of type \|S1, expected numbers'):
+        open_records(str(tmp_path / "y.h5"))
+
+
 def test_a_spread_is_even_and_always_the_same() -> None:
     assert spread(5, None) == spread(5, 7) == [0, 1, 2, 3, 4]
     numbers = spread(1000, 40)

@@ -1,7 +1,6 @@
 """Caffe's data for PyTorch: what a DataLoader gives is what a net reads, whatever the number of workers."""
 
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -34,14 +33,6 @@ WORKERS = [0, pytest.param(2, marks=pytest.mark.slow)]
 def model(tmp_path: Path) -> str:
     (tmp_path / "net.prototxt").write_text(NET)
     return str(tmp_path / "net.prototxt")
-
-
-@pytest.fixture(autouse=True)
-def no_handler_stays() -> Iterator[None]:
-    """Undo what torch's DataLoader does to the process: its handler of SIGCHLD would stay for all later tests."""
-    before = signal.getsignal(signal.SIGCHLD)
-    yield
-    signal.signal(signal.SIGCHLD, before)
 
 
 @pytest.mark.parametrize("workers", WORKERS)
@@ -152,8 +143,10 @@ def test_hdf5_rows_of_a_list_have_the_tops_that_are_asked_for(tmp_path: Path) ->
     [
         (lambda model: Batches(model, layer="dat"), 'no data layer "dat" in phase TRAIN; did you mean "data"'),
         (lambda model: Batches(model, "DEPLOY"), "found phase 'DEPLOY', expected TRAIN or TEST"),
+        (lambda model: netspec.load_net(model, "DEPLOY"), "found phase 'DEPLOY', expected TRAIN or TEST"),
         (lambda model: Batches("none.prototxt"), "none.prototxt"),
         (lambda model: Records("nowhere"), 'database "nowhere" does not exist'),
+        (lambda model: Records(TRAIN, phase="DEPLOY"), "found phase 'DEPLOY', expected TRAIN or TEST"),
         (lambda model: Records(TRAIN, "crop: 3"), 'no field "crop"'),
         (lambda model: Records(TRAIN, "crop_size: 99"), "crop_size 99 is larger than the image"),
         (lambda model: Records(model, "scale: 2"), "Caffe does not transform data of HDF5 files"),

@@ -344,3 +344,35 @@ def test_warnings_of_the_files_are_given_at_every_start(
         (line,) = caplog.messages
         assert "lacks weights for 1 of the net's 2 layers that have any: conv_renamed" in line
     assert len(entries(files)) == 1
+
+
+FIRST_GOES_FIRST = """
+import gc, signal, sys
+import netspec, numpy as np
+
+def load():
+    net = netspec.load_net("net.prototxt", weights="net.caffemodel", engine="openvino", precision=sys.argv[1])
+    net(data=np.zeros((2, 3, 12, 12), np.float32))
+    return net
+
+heard = []
+first, second = load(), load()
+del first
+gc.collect()
+del second
+gc.collect()
+signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
+signal.raise_signal(signal.SIGTERM)
+assert heard == [signal.SIGTERM]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize("precision", choice.PRECISIONS)
+def test_signals_are_handled_after_nets_of_openvino_are_gone(precision: str) -> None:
+    """Each net's OpenVINO has a signal stack of its own; the first one's would stay where the second one goes last."""
+    pytest.importorskip("onnx")
+    pytest.importorskip("openvino")
+    done = subprocess.run([sys.executable, "-c", FIRST_GOES_FIRST, precision], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -72,3 +72,10 @@ def test_exact_says_whose_sums_are_made() -> None:
 def test_what_is_wrong_is_said_with_its_place(text: str, message: str) -> None:
     with pytest.raises(netspec.SpecError, match=message):
         netspec.layer(text)(*[] if "Concat" in text else [np.ones((1, 1, 4, 4))])
+
+
+def test_a_phase_has_a_name_in_any_case_or_a_number() -> None:
+    for phase in ("TRAIN", "train", 0):
+        assert 0 in netspec.layer('type: "Dropout"', phase=phase)(np.ones(1000))
+    with pytest.raises(netspec.SpecError, match="found phase 'deploy', expected TRAIN or TEST"):
+        netspec.layer('type: "Dropout"', phase="deploy")

@@ -200,7 +200,9 @@ def test_the_embedding_of_a_siamese_net(run: Run) -> None:
         (("filters", "none.caffemodel"), "none.caffemodel: cannot be read: No such file"),
         (("maps", *NET, "--blob", "no", "--image", "a.png"), 'no blob "no"'),
         (("maps", *NET, "--blob", "conv1", "--image", "no.png"), "no.png: cannot be read"),
-        (("embedding", "a.png"), "a.png: is not a features.npz"),
+        (("embedding", "a.png"), "a.png: is not a features.npz of netspec extract, or is damaged"),
+        (("embedding", "cut.npz"), "cut.npz: is not a features.npz of netspec extract, or is damaged"),
+        (("embedding", "no.npz"), "no.npz: cannot be read: No such file or directory"),
         (
             ("embedding", "f.npz", "--array", "fea"),
             'f.npz: has no descriptors "fea"; did you mean "feat"? it has: feat',
@@ -211,6 +213,7 @@ def test_the_embedding_of_a_siamese_net(run: Run) -> None:
 def test_faults(run: Run, words: tuple[object, ...], said: str) -> None:
     cv2.imwrite("a.png", image(0, (30, 40, 3)))
     np.savez("f.npz", feat=np.zeros((3, 2), np.float32))
+    Path("cut.npz").write_bytes(Path("f.npz").read_bytes()[:150])
     shutil.rmtree("none", ignore_errors=True)
     assert said in run(*words, "--out", "x.png").fault
     assert not Path("x.png").exists()

@@ -101,3 +101,19 @@ def test_what_cannot_be_drawn(run: Run_, words: tuple[object, ...], status: int,
     assert result.status == status
     assert said in result.err
     assert not Path("x.png").exists()
+
+
+def test_a_logarithmic_axis_needs_losses_above_zero(run: Run_) -> None:
+    Path("x.log").write_text("Iteration 0, loss = -1\nIteration 10, loss = -2\n")
+    result = run("plot", "x.log", "--out", "x.svg", "--log_scale")
+    assert (result.status, result.err) == (0, "warning: no loss is above 0: its axis is not logarithmic\n")
+
+
+@pytest.mark.parametrize("ending", ["png", "svg", "html"])
+def test_names_that_cannot_be_written_are_escaped(run: Run_, ending: str) -> None:
+    name = "caf\udce9\x1b.log"
+    Path(name).write_bytes(CAFFES.read_bytes())
+    result = run("plot", name, "--out", f"x.{ending}")
+    assert result.out.startswith("caf\\udce9\\x1b.log: state done")
+    if ending == "svg":
+        assert "caf\\udce9\\x1b.log" in "".join(ET.parse("x.svg").getroot().itertext())

@@ -1,5 +1,6 @@
 """Logs of trainings: Caffe's own of several versions, and netspec's."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -175,3 +176,36 @@ def test_the_range_that_is_drawn_leaves_out_few_values_and_no_curve() -> None:
     assert shown_range([loss, np.array([5.0, 6.0])]) == (1, pytest.approx(9.0))
     assert shown_range([np.array([80.0, 1, 2])]) == (1, 80)
     assert shown_range([np.full(3, np.nan)]) is None
+
+
+@pytest.mark.parametrize("digits", [11, 400, 5000])
+def test_numbers_that_no_training_has_are_not_read(digits: int) -> None:
+    """Caffe's counts are ints of 32 bits, its losses floats of 32 bits."""
+    long = "9" * digits
+    run = read(
+        "Iteration 10, loss = 1",
+        f"Iteration {long}, loss = 0.5",
+        f"Iteration {long}, lr = 0.1",
+        f"Iteration {long}, Testing net (#{long})",
+        f"Test net output #{long}: accuracy = 0.5",
+        "Iteration 20, loss = 1e308",
+        f"Snapshotting to x_iter_{long}.caffemodel",
+    )
+    run.settings["max_iter"] = long
+    assert (run.loss.iterations, run.loss.values) == ([10, 20], [1, float("inf")])
+    assert (len(run.rate), run.tests, run.snapshots, run.max_iter) == (0, {}, [], None)
+    run.settings["max_iter"] = "\u00b2"
+    assert run.max_iter is None
+
+
+def test_a_log_may_come_through_a_pipe(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.write(writer, CAFFES.read_bytes())  # less than a pipe holds
+    os.close(writer)
+    run = read_log(f"/dev/fd/{reader}")
+    os.close(reader)
+    assert run.loss.iterations[:2] == [0, 10]
+
+
+def test_a_window_may_be_larger_than_the_curve() -> None:
+    assert smoothed(np.array([1.0, 3.0]), 10**30).tolist() == [2, 2]

@@ -119,6 +119,8 @@ def test_a_log_that_still_grows_is_of_a_training_that_runs_elsewhere(run: Run_) 
 def test_it_wants_one_log_or_one_solver(run: Run_) -> None:
     assert run("watch").status == 2
     assert run("watch", CAFFES, "--solver", "x").status == 2
+    for seconds in ("0", "nan", "inf"):
+        assert run("watch", CAFFES, "--every", seconds).status == 2
     assert run("watch", "no.log").fault == "no.log: cannot be read: No such file or directory"
     assert run("watch", "--solver", "no.prototxt").fault.startswith("no.prototxt: ")
 

@@ -1,0 +1,32 @@
+"""Python's garbage collector is paused while a net is built, and afterwards is as it was."""
+
+import gc
+from collections.abc import Callable
+
+import pytest
+
+from netspec.errors import SpecError
+from netspec.garbage import no_collection
+from netspec.net.net import Net
+
+UNKNOWN = 'layer { name: "relu" type: "ReLU" bottom: "nothing" top: "relu" }'
+
+
+def test_a_net_is_built_without_collections(net_of: Callable[..., Net]) -> None:
+    during: list[bool] = []
+    net_of(UNKNOWN, report=lambda _: during.append(gc.isenabled()))
+    assert set(during) == {False}
+    assert gc.isenabled()
+
+
+def test_a_net_that_cannot_be_built_leaves_the_collector_on(net_of: Callable[..., Net]) -> None:
+    with pytest.raises(SpecError, match="nothing"):
+        net_of(UNKNOWN)
+    assert gc.isenabled()
+
+
+def test_who_paused_the_collector_goes_on_without_it(net_of: Callable[..., Net]) -> None:
+    with no_collection():
+        net_of('layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }')
+        assert not gc.isenabled()
+    assert gc.isenabled()
