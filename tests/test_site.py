@@ -70,3 +70,30 @@ def test_every_layer_and_command_is_in_the_reference(site: Path) -> None:
     commands = (site / "reference" / "commands.html").read_text()
     (choices,) = (action.choices for action in parser()._actions if action.dest == "command")
     assert all(f">netspec {name}<" in commands for name in choices or ())
+
+
+def test_every_layer_is_drawn_with_its_shapes(site: Path) -> None:
+    from netspec.layers import layer_types
+
+    page = (site / "reference" / "layers.html").read_text()
+    pictures = {
+        found["kind"]: found
+        for found in re.finditer(
+            r'<svg class="shapes" viewBox="0 0 (?P<width>\S+) (?P<height>\S+)" role="img">'
+            r"<title>(?P<kind>\w+) reads (?P<caption>.*?)</title>(?P<parts>.*?)</svg>",
+            page,
+        )
+    }
+    assert set(pictures) == set(layer_types()) - {"Python"}, "the class of a Python layer says its shapes"
+    shown = "data 1 × 3 × 227 × 227 and gives conv1 1 × 96 × 55 × 55; learned: 96 × 3 × 11 × 11, 96"
+    assert pictures["Convolution"]["caption"] == shown
+    for kind, picture in pictures.items():
+        width, height = float(picture["width"]), float(picture["height"])
+        for box in re.findall(r'<rect class="\w+" x="(\S+)" y="(\S+)" width="(\S+)" height="(\S+)"', picture["parts"]):
+            x, y, w, h = map(float, box)
+            assert 0 < x < x + w < width, kind
+            assert 0 < y < y + h < height, kind
+        for x, y, text in re.findall(r'<text class="\w+" x="(\S+)" y="(\S+)">([^<]*)<', picture["parts"]):
+            reach = 3.3 * len(text)  # half of its width, at most, at 12 px
+            assert reach < float(x) < width - reach, f"{kind}: {text}"
+            assert 10 < float(y) < height, f"{kind}: {text}"
