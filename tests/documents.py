@@ -108,7 +108,7 @@ def _status(function: Callable[[Any], None], what: object, folder: Path, log: Pa
     """Call a function in a process of its own, in which torch and our modules have been imported already."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
-    process = context.Process(target=_call, args=(function, what, folder, log))
+    process = context.Process(target=_call, args=(function, what, folder, log, multiprocessing.get_start_method()))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OMP_NUM_THREADS", "1")
         process.start()
@@ -118,7 +118,8 @@ def _status(function: Callable[[Any], None], what: object, folder: Path, log: Pa
     return process.exitcode
 
 
-def _call(function: Callable[[Any], None], what: object, folder: Path, log: Path) -> None:
+def _call(function: Callable[[Any], None], what: object, folder: Path, log: Path, usual: str) -> None:
+    multiprocessing.set_start_method(usual, force=True)  # of processes of its own, as where it is typed
     os.chdir(folder)
     os.environ["XDG_CACHE_HOME"] = str(folder / ".cache")
     out, nothing = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), os.open(os.devnull, os.O_RDONLY)

@@ -46,11 +46,11 @@ LESS = {
     "prototxt/README.md": {
         "--train 30000 --val 6000 --test 6000": "--train 20 --val 8 --test 8",
         "--train 3000 --val 600": "--train 20 --val 8",
-        "prototxt/small/siamese_8/solver.prototxt prototxt/small/siamese_128/solver.prototxt \\\n"
-        "    prototxt/small/siamese_resnet27_256/solver.prototxt ": "",
+        "prototxt/small/siamese_8/solver.prototxt prototxt/small": "prototxt/small",
+        "prototxt/small/siamese_resnet27_256/solver.prototxt prototxt/small/siamese_resnet27_512/solver.prototxt": "",
         "--train 22000 --val 800": "--train 20 --val 4",
         "--train 9000 --val 0 --test 1000": "--train 20 --val 0 --test 4",
-        "--sequences 6 --frames 250": "--sequences 6 --frames 30",
+        "--frames 250 --size 160x120": "--frames 30 --size 64x48",
         "--train 6000 --val 600": "--train 20 --val 4",
         "--batches 600": "--batches 1",
     },
