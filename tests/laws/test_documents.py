@@ -54,6 +54,44 @@ def test_every_command_is_one_that_its_parser_takes(where: str, tmp_path: Path) 
                 pytest.fail(shlex.join(command.words))
 
 
+def unknown_words(line: str) -> list[str]:
+    """Return the command and the options that a program does not have, of a line that may leave out the rest."""
+    program, *words = line.split()
+    parser = PARSERS[program]()
+    while commands_of := [a.choices for a in parser._actions if isinstance(a, argparse._SubParsersAction)]:
+        if not words or words[0].startswith("-"):
+            break
+        if words[0] not in commands_of[0]:
+            return words[:1]
+        parser = commands_of[0][words.pop(0)]
+    if line.startswith("netspec run"):
+        return []  # what follows are the script's own words
+    known = {option for action in parser._actions for option in action.option_strings}
+    return [word for word in words if word.startswith("--") and word.partition("=")[0] not in known]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_commands_in_sentences_have_commands_and_options_that_exist(document: str) -> None:
+    text = re.sub(r"^```.*?^```$", "", (ROOT / document).read_text(), flags=re.M | re.S)
+    for line in re.findall(r"`([^`]+)`", text):
+        if line.partition(" ")[0] in PARSERS:
+            assert not unknown_words(line), line
+
+
+@pytest.mark.parametrize(
+    ("line", "unknown"),
+    [
+        ("netspec", []),
+        ("netspec sow LMDB", ["sow"]),
+        ("netspec export NET --too onnx", ["--too"]),
+        ("netspec run x.py --any", []),
+        ("lmdb-build walk walk --seed=1", []),
+    ],
+)
+def test_wrong_words_in_sentences_would_be_found(line: str, unknown: list[str]) -> None:
+    assert unknown_words(line) == unknown
+
+
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_every_block_says_what_it_is(document: str) -> None:
     text = (ROOT / document).read_text()
