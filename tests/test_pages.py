@@ -99,7 +99,7 @@ NOT_RUN = {
 }
 FOUND: dict[tuple[str, ...], int] = {("netspec", "diff"): 1}  # says by its status that files differ
 
-PAGES = [page for page in DOCUMENTS if any(block.language in ("", "bash", "python") for block in blocks(page))]
+PAGES = [page for page in DOCUMENTS if any(block.language in ("", "python") for block in blocks(page))]
 
 
 @pytest.fixture(scope="session")
@@ -139,7 +139,7 @@ def test_a_page_runs_as_it_stands(page: str, folder: Path, tmp_path: Path) -> No
             (folder / block.file).write_text(text)
         elif block.language == "python":
             expect(run_snippet(GIVEN + text, folder, log), block.where)
-        elif block.language in ("", "bash"):
+        elif not block.language:
             for command in commands(text, folder):
                 line = shlex.join(command.words)
                 for beginning in [beginning for beginning in NOT_RUN.get(page, ()) if line.startswith(beginning)]:

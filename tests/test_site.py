@@ -13,6 +13,8 @@ from paths import ROOT
 
 pytestmark = pytest.mark.slow
 
+COMMANDS = re.compile(r'<div class="highlight-commands.*?</div>', re.S)
+
 
 class Links(HTMLParser):
     """The addresses that a page refers to, and the places in it that one can refer to."""
@@ -97,3 +99,12 @@ def test_every_layer_is_drawn_with_its_shapes(site: Path) -> None:
             reach = 3.3 * len(text)  # half of its width, at most, at 12 px
             assert reach < float(x) < width - reach, f"{kind}: {text}"
             assert 10 < float(y) < height, f"{kind}: {text}"
+
+
+def test_what_a_command_does_stands_above_it(site: Path) -> None:
+    shown = [
+        re.sub(r"<[^>]+>", "", block) for page in site.rglob("*.html") for block in COMMANDS.findall(page.read_text())
+    ]
+    assert len(shown) > 30
+    assert any(re.search(r"^# one process, two GPUs\nnetspec train --solver", text, re.M) for text in shown)
+    assert not [text for text in shown if re.search(r"^[^#\n]+ # ", text, re.M)]

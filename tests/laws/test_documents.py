@@ -25,7 +25,7 @@ PARSERS = {
     "tools/bench": benchmarks.cli.parser,
 }
 BLOCKS = {block.where: block for document in DOCUMENTS for block in blocks(document)}
-SHELL = [where for where, block in BLOCKS.items() if block.language in ("", "bash")]
+SHELL = [where for where, block in BLOCKS.items() if not block.language]
 PYTHON = [where for where, block in BLOCKS.items() if block.language == "python"]
 
 
@@ -97,7 +97,7 @@ def test_every_block_says_what_it_is(document: str) -> None:
     text = (ROOT / document).read_text()
     assert len(re.findall(r"^\s*(?:```|~~~)", text, re.M)) == 2 * len(blocks(document)), "a block begins a line: ```"
     for block in blocks(document):
-        assert re.fullmatch(r"|bash|python|prototxt|text|\{\w+\}.*", block.language), block.where
+        assert re.fullmatch(r"|python|prototxt|text|\{\w+\}.*", block.language), block.where
         if block.language == "text":  # is neither run nor parsed
             first = [line.split()[0] for line in block.text.splitlines() if line.strip()]
             assert not PROGRAMS.keys() & set(first), f"{block.where}: commands stand in a block without a language"
