@@ -33,7 +33,7 @@ suppress_warnings = ["myst.header", "misc.highlighting_failure"]  # READMEs begi
 # The README of each folder is a page too.
 ROOMS = {f"{name}/README.md": f"rooms/{name}.md" for name in ("netspec", "loopclosure", "prototxt", "benchmarks")}
 LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]*)(#[^)]*)?\)")
-COMMANDS = re.compile(r"^```\n.*?^```$", re.M | re.S)
+BLOCK = re.compile(r"^```([^\n`]*)\n.*?^```$", re.M | re.S)
 COMMENTED = re.compile(r"^([^\s#].*?) +(# .*)$", re.M)
 
 
@@ -49,7 +49,7 @@ def rewrite(text: str, folder: Path) -> str:
 
     Links lead to pages; those without one are text. What a command does stands above it, where it fits on a phone.
     """
-    text = COMMANDS.sub(lambda block: COMMENTED.sub(r"\2\n\1", block[0]), text)
+    text = BLOCK.sub(lambda block: block[0] if block[1] else COMMENTED.sub(r"\2\n\1", block[0]), text)
 
     def replaced(found: re.Match[str]) -> str:
         label, target, anchor = found[1], found[2], found[3] or ""
