@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlparse
@@ -108,3 +109,10 @@ def test_what_a_command_does_stands_above_it(site: Path) -> None:
     assert len(shown) > 30
     assert any(re.search(r"^# one process, two GPUs\nnetspec train --solver", text, re.M) for text in shown)
     assert not [text for text in shown if re.search(r"^[^#\n]+ # ", text, re.M)]
+
+
+def test_no_word_of_code_in_a_sentence_is_wider_than_a_phone(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        sentences = re.sub(r"<table.*?</table>", "", page.read_text(), flags=re.S)
+        for word in re.findall(r'<span class="pre">([^<]*)</span>', sentences):
+            assert len(unescape(word)) <= 45, f"{page.name}: {word}"  # they do not break: site.css
