@@ -105,7 +105,7 @@ class Net(torch.nn.Module):
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what was prepared from it."""
         prepared = self.programs and Programs(self, self.programs.passes)
-        return {**super().__getstate__(), "programs": prepared}
+        return {**super().__getstate__(), "programs": prepared, "_segments": {}}
 
     # Building
 

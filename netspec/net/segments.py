@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from netspec import log
 from netspec.errors import SpecError
 from netspec.layers.base import Layer
 from netspec.limits import is_out_of_memory
@@ -86,11 +87,7 @@ class Segment:
         self._tops = sorted(made & read)
         self._within = made - read
         self._learns = net.phase == TRAIN
-        # Torch counts the compilations of each code object; so each segment has its own.
-        code = _run.__code__.replace(co_name=f"segment_{next(_numbers)}")
-        own: Any = MethodType(FunctionType(code, globals()), self)
-        self._compiled: Any = torch.compile(own, fullgraph=True, dynamic=False)
-        self._ran = False
+        self.compiled: Any = None  # the function, once there is one
 
     def serves(self, values: Mapping[int, torch.Tensor], kept: frozenset[int]) -> bool:
         """Return whether a pass on these values, which is to keep some, can be compiled."""
@@ -109,23 +106,29 @@ class Segment:
         for layer, shapes in zip(self._layers, self._shapes, strict=True):
             layer.fit(shapes)
         bottoms = [values[v] for v in self._given]
-        tops = self._compiled(*bottoms) if self._ran else self._compile(bottoms)
+        tops = self.compiled(*bottoms) if self.compiled else self._compile(bottoms)
         values.update(zip(self._tops, tops, strict=True))
         return tuple(values[v] for v in self._steps[-1][2])
 
     def _compile(self, bottoms: Sequence[torch.Tensor]) -> Any:
+        """Make the function; return what its first call returns."""
+        first, last = self._layers[0], self._layers[-1]
+        log.logger.info(f'compiling the layers from "{first.param.name}" to "{last.param.name}"')
+        # Torch counts the compilations of each code object; so each segment has its own.
+        code = _run.__code__.replace(co_name=f"segment_{next(_numbers)}")
+        own: Any = MethodType(FunctionType(code, globals()), self)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                tops = self._compiled(*bottoms)
+                compiled: Any = torch.compile(own, fullgraph=True, dynamic=False)
+                tops = compiled(*bottoms)
         except Exception as fault:  # torch's compilers have no common base of their errors
             if is_out_of_memory(fault):
                 raise
             reason = next(iter(str(fault).strip().splitlines()), "") or type(fault).__name__
-            first, last = self._layers[0], self._layers[-1]
             message = f'cannot be compiled, up to layer "{last.param.name}": {reason}; train without --compile'
             raise SpecError(message, first.context.at()) from fault
-        self._ran = True
+        self.compiled = compiled
         return tops
 
 

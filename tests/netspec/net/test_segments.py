@@ -59,7 +59,7 @@ def traced_only(monkeypatch: pytest.MonkeyPatch) -> None:
 def segments(net: Net) -> list[str]:
     """Return the segments, as "first-last"; those that were run have a "!"."""
     names = [node.name for node in net.plan.nodes]
-    return [f"{names[i]}-{names[one.last]}{'!' * one._ran}" for i, one in net._segments.items()]
+    return [f"{names[i]}-{names[one.last]}{'!' * bool(one.compiled)}" for i, one in net._segments.items()]
 
 
 def random(*shape: int) -> torch.Tensor:
