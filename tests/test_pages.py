@@ -94,6 +94,7 @@ NOT_RUN = {
         "pip install": "needs a package index; tests/test_wheel.py installs the wheel",
     },
     "docs/training.md": {
+        "netspec train --solver solver.prototxt --compile": "compiles for long; tests/netspec/net/test_segments.py",
         "netspec train --solver solver.prototxt --gpu": "needs a GPU; tests/netspec/test_gpu.py has a fake one",
         "torchrun --nnodes 8": "needs eight machines",
     },
