@@ -48,6 +48,7 @@ def test_groundtruth_is_sorted_and_its_quaternions_are_normalized(tmp_path: Path
         ("1.5 0.1 0.2 0.3 0 0 0 1 9", 25, "found 9"),
         ("1.5 0.1 zwei 0.3 0 0 0 1", 9, 'expected a number for ty, found "zwei"'),
         ("1.5 0.1 nan 0.3 0 0 0 1", 9, 'expected a number for ty, found "nan"'),
+        ("1.5 0.1 1e300 0.3 0 0 0 1", 9, 'expected a number for ty, found "1e300"'),
         ("1.5 0.1 0.2 0.3 0 0 0 0", 17, "length 0, a rotation has length 1"),
         ("1.5 0.1 0.2 0.3 90 0 0 1", 17, "length 90"),
     ],
