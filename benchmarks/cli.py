@@ -14,7 +14,7 @@ from netspec.command_line import Commands, WrongUsage, run
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
-TRAINING = ("netspec", "netspec-bf16", "pytorch", "pycaffe")
+TRAINING = ("netspec", "netspec-bf16", "netspec-compile", "pytorch", "pycaffe")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

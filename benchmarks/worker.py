@@ -140,8 +140,13 @@ def netspec_training(task: Task) -> Run:
     import netspec
 
     torch.set_num_threads(task["threads"])
-    precision = task.get("precision", "fp32")
-    solver = netspec.load_solver(task["solver"], task["caffemodel"], device=task["device"], precision=precision)
+    solver = netspec.load_solver(
+        task["solver"],
+        task["caffemodel"],
+        device=task["device"],
+        precision=task.get("precision", "fp32"),
+        compiled=task.get("engine") == "compile",
+    )
 
     def run() -> dict[str, Any]:
         solver.step(1)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+from pygments.lexer import RegexLexer
+from pygments.token import Comment, Name, Text
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -15,7 +18,7 @@ project = "netspec"
 author = "the netspec authors"
 extensions = ["myst_parser", "reference"]
 exclude_patterns = ["_build"]
-highlight_language = "text"
+highlight_language = "commands"
 html_theme = "furo"
 html_title = "netspec: the living Caffe"
 html_copy_source = False
@@ -30,10 +33,23 @@ suppress_warnings = ["myst.header", "misc.highlighting_failure"]  # READMEs begi
 # The README of each folder is a page too.
 ROOMS = {f"{name}/README.md": f"rooms/{name}.md" for name in ("netspec", "loopclosure", "prototxt", "benchmarks")}
 LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]*)(#[^)]*)?\)")
+BLOCK = re.compile(r"^```([^\n`]*)\n.*?^```$", re.M | re.S)
+COMMENTED = re.compile(r"^([^\s#].*?) +(# .*)$", re.M)
+
+
+class CommandLexer(RegexLexer):
+    """Commands of a shell: an option is a token, so that no line breaks within it; so is a comment."""
+
+    name = "commands"
+    tokens: ClassVar = {"root": [(r"(?<!\S)#.*", Comment), (r"(?<!\S)--?\w[\w-]*", Name.Attribute), (r"\s+|\S+", Text)]}
 
 
 def rewrite(text: str, folder: Path) -> str:
-    """Return the text of a file of ``folder``, its links as the site has them; those without a page are text."""
+    """Return the text of a file of ``folder`` as the site has it.
+
+    Links lead to pages; those without one are text. What a command does stands above it, where it fits on a phone.
+    """
+    text = BLOCK.sub(lambda block: block[0] if block[1] else COMMENTED.sub(r"\2\n\1", block[0]), text)
 
     def replaced(found: re.Match[str]) -> str:
         label, target, anchor = found[1], found[2], found[3] or ""
@@ -62,6 +78,7 @@ def _included(app: Any, relative_path: Path, parent: str, content: list[str]) ->
 
 
 def setup(app: Any) -> None:
-    """Have links rewritten."""
+    """Have pages rewritten, and commands told from their comments."""
+    app.add_lexer("commands", CommandLexer)
     app.connect("source-read", _page)
     app.connect("include-read", _included)

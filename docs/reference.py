@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import shapes
 from docutils import nodes
 from sphinx.util.docutils import SphinxDirective
 
@@ -29,7 +30,8 @@ class FromCode(SphinxDirective):
         raise NotImplementedError
 
     def run(self) -> list[nodes.Node]:
-        """Parse the text in place of the directive."""
+        """Parse the text in place of the directive, at each build anew, since code may have changed."""
+        self.env.note_reread()
         return self.parse_text_to_nodes(self.markdown(self.arguments[0]), allow_section_headings=True)
 
 
@@ -58,6 +60,9 @@ class LayerReference(FromCode):
         lines = []
         for kind in layer_types():
             lines += [f"## {kind}", "", *_described(inspect.getdoc(layer_class(kind)) or ""), ""]
+            if example := shapes.examples().get(kind):
+                lines += [f'<figure class="shapes">{shapes.picture(kind, example)}</figure>', ""]
+                lines += ["```prototxt", example.text.rstrip(), "```", ""]
             message = _message_of(kind)
             if message:
                 lines += [f"Its fields, `{message[0]}`:", "", _table(message[1]), ""]

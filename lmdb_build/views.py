@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdb_build.light import change_light
 from lmdb_build.pairs.list_file import write_pair_list
 from lmdb_build.pairs.runs import Indices, Runs
 from lmdb_build.picture import CORNERS, seen_through, write_jpeg
@@ -28,9 +29,7 @@ SHIFT = 0.2  # a pair's views have a common center; each is shifted by up to thi
 STRETCH = 0.15  # the proportions of the part change by a factor of up to e^0.15
 TURN_DEG = 4.0  # standard deviation
 CORNER = 0.08  # each corner is moved by up to this share of the part's size: perspective
-GAMMA = 0.3  # standard deviation of its logarithm
-CONTRAST, BRIGHTNESS, TINT, NOISE = 0.2, 20.0, 0.08, 4.0  # standard deviations; of gray levels, except for logarithms
-BLURRED, BLUR = 0.3, (0.4, 1.5)  # how many views, and by how many pixels
+SMOOTHING = 0.4  # standard deviation of the filter before a part is made smaller, in pixels of the view
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,7 @@ class Batches:
     size       pairs in a batch, all of different places
     per_track  of them at most so many from one run
     apart      places of one run are further apart than this (in units of the stamps)
+    window     and come from a part of the run of this length, at a random position
     max_gap    a pair's second image may be another one, at most so far from the first
     other      in this share of the pairs it is, where there is one
     negatives  in this share of the pairs the second image shows another place of the batch, as ContrastiveLoss wants it
@@ -53,6 +53,7 @@ class Batches:
     max_gap: float = 1.0
     other: float = 0.4
     negatives: float = 0.0
+    window: float = float("inf")
 
     def check(self) -> None:
         """Raise InputError for numbers that cannot make a batch."""
@@ -64,6 +65,8 @@ class Batches:
                 raise InputError(f"--{name} must be 0 to 1, not {getattr(self, name):g}")
         if round(self.size * self.negatives) == 1:
             raise InputError(f"--negatives {self.negatives:g} of --size {self.size} is one pair; expected none or two")
+        if not self.window > 0:
+            raise InputError(f"--window must be more than 0, not {self.window:g}")
         if self.apart < self.max_gap:
             raise InputError(
                 f"--apart {self.apart:g} is less than --max-gap {self.max_gap:g}: a batch could have one place twice"
@@ -73,17 +76,20 @@ class Batches:
 def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     """Return first and second images of all pairs (count * size,), batch after batch, and whether both are one place.
 
-    A batch draws its images from runs in random order. Raises InputError where all runs together have not enough places
-    for a batch.
+    A batch draws its images from runs in random order; a run is as likely to come first as it is long.
+    Raises InputError where all runs together have not enough places for a batch.
     """
     batches.check()
     of_track = [np.flatnonzero(runs.tracks == track) for track in np.unique(runs.tracks)]
+    shares = np.array([len(images) for images in of_track]) / len(runs.tracks)
     first: list[int] = []
     same = np.ones((batches.count, batches.size), bool)
     for _ in range(batches.count):
         batch: list[int] = []
-        for track in rng.permutation(len(of_track)):
-            batch += _different_places(runs.stamps, rng.permutation(of_track[track]), batches)
+        for track in rng.choice(len(of_track), len(of_track), replace=False, p=shares):
+            batch += _different_places(
+                runs.stamps, rng.permutation(_part(runs.stamps, of_track[track], batches, rng)), batches
+            )
             if len(batch) >= batches.size:
                 break
         else:
@@ -98,6 +104,15 @@ def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tupl
         seconds[exchanged] = seconds[np.roll(exchanged, 1)]
         sames[exchanged] = False
     return np.array(first), second, same.ravel()
+
+
+def _part(stamps: NDArray[np.float64], images: Indices, batches: Batches, rng: np.random.Generator) -> Indices:
+    """Return the images of a run that are in a window at a random position."""
+    if not np.isfinite(batches.window):
+        return images
+    of_run = stamps[images]
+    start = rng.uniform(of_run.min() - batches.window / 2, max(of_run.max() - batches.window / 2, of_run.min()))
+    return images[(of_run >= start) & (of_run <= start + batches.window)]
 
 
 def _different_places(stamps: NDArray[np.float64], images: Indices, batches: Batches) -> list[int]:
@@ -123,7 +138,7 @@ def _partner(runs: Runs, image: int, batches: Batches, rng: np.random.Generator)
 def cut_view(
     image: NDArray, size: tuple[int, int], about: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Return a view of the image (H, W, 3) uint8 as a nearby camera might see it in other light: (height, width, 3).
+    """Return a view of the image (H, W, 3) uint8 as a nearby camera might see it: (height, width, 3).
 
     ``about`` (2,) is the position of the visible part: 0 at the left (the top), 1 at the right (the bottom). Views
     about one point overlap at any zoom.
@@ -136,13 +151,9 @@ def cut_view(
     cos, sin = np.cos(np.deg2rad(angle := rng.normal(0, TURN_DEG))), np.sin(np.deg2rad(angle))
     quad = quad @ np.array([[cos, -sin], [sin, cos]]) + part / 2
     quad += np.clip(about + rng.uniform(-SHIFT, SHIFT, 2), 0, 1) * (np.array(image.shape[1::-1]) - part)
-    seen = seen_through(image, quad, CORNERS * size, size)
-    if rng.random() < BLURRED:
-        seen = cv2.GaussianBlur(seen, (0, 0), rng.uniform(*BLUR))
-    light = 255 * (seen.astype(np.float32) / 255) ** np.exp(rng.normal(0, GAMMA))
-    light = (light - light.mean()) * np.exp(rng.normal(0, CONTRAST)) + light.mean() + rng.normal(0, BRIGHTNESS)
-    light = light * np.exp(rng.normal(0, TINT, 3)) + rng.normal(0, NOISE) * rng.standard_normal((height, width, 1))
-    return np.clip(np.round(light), 0, 255).astype(np.uint8)
+    if (shrinks := part_h / height) > 1.5:
+        image = cv2.GaussianBlur(image, (0, 0), SMOOTHING * shrinks)
+    return seen_through(image, quad, CORNERS * size, size)
 
 
 def write_views(
@@ -170,14 +181,15 @@ def write_views(
         names = [f"{folder.name}/{number:06d}_{side}.jpg" for side in "ab"]
         for image, name in zip(pair, names, strict=True):
             picture = read_bgr(root / runs.names[image])
-            view = cut_view(picture[:, ::-1] if mirrored else picture, size, about, rng)
-            write_jpeg(folder.parent / name, view)
+            view = cut_view(np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture, size, about, rng)
+            other = read_bgr(root / runs.names[rng.integers(len(runs.names))])
+            write_jpeg(folder.parent / name, change_light(view, other, rng))
         listed.append((*names, int(same[number])))
     out = folder.with_name(f"{folder.name}.txt")
     settings = {
         "source": f"{len(runs.names)} images of {len(np.unique(runs.tracks))} runs",
         "batches": f"{batches.count} of {batches.size} places, up to {batches.per_track} of one run, "
-        f"more than {batches.apart:g} apart",
+        f"more than {batches.apart:g} apart, in a part of {batches.window:g}",
         "second image": f"a different one in {batches.other:g} of the pairs, up to {batches.max_gap:g} away",
         "negatives": f"{batches.negatives:g} of the pairs",
         "seed": str(seed),

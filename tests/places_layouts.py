@@ -38,9 +38,9 @@ def write_pictures(folder: Path, names: list[str]) -> None:
         assert cv2.imwrite(str(folder / name), picture(number))
 
 
-def tum_rows(poses: np.ndarray) -> str:
+def tum_rows(poses: np.ndarray, start_s: int = 0) -> str:
     rows = zip(poses[:, :3, 3], quaternions(poses), strict=True)
-    return "".join(f"{i}.0 " + " ".join(f"{v:.6f}" for v in (*p, *q)) + "\n" for i, (p, q) in enumerate(rows))
+    return "".join(f"{start_s + i}.0 " + " ".join(f"{v:.6f}" for v in (*p, *q)) + "\n" for i, (p, q) in enumerate(rows))
 
 
 def kitti_rows(poses: np.ndarray) -> str:

@@ -40,11 +40,21 @@ def index_runs(index: Path, root: Path, track: str, time: str) -> Runs:
     )
 
 
-def folder_runs(folders: Sequence[Path], root: Path) -> Runs:
-    """Take each folder (or list) of images as a run, with images one unit of time apart."""
+def folder_runs(folders: Sequence[Path], root: Path, step: float = 1.0) -> Runs:
+    """Take each folder (or list) of images as a run, with images ``step`` apart."""
     runs = [[relative(path, root) for path in image_paths(folder)] for folder in folders]
     return Runs(
         names=[name for run in runs for name in run],
         tracks=np.repeat(np.arange(len(runs)), [len(run) for run in runs]),
-        stamps=np.concatenate([np.arange(len(run), dtype=np.float64) for run in runs]),
+        stamps=np.concatenate([np.arange(len(run), dtype=np.float64) * step for run in runs]),
+    )
+
+
+def join_runs(parts: Sequence[Runs]) -> Runs:
+    """Return the runs of all parts; their names are below the same root."""
+    ends = np.cumsum([len(np.unique(part.tracks)) for part in parts])
+    return Runs(
+        names=[name for part in parts for name in part.names],
+        tracks=np.concatenate([part.tracks + start for part, start in zip(parts, [0, *ends], strict=False)]),
+        stamps=np.concatenate([part.stamps for part in parts]),
     )

@@ -9,6 +9,7 @@ with real images. Every picture follows from the seed.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ Array = NDArray[np.float64]
 
 SPEED_M_S = 1.2
 POSES_PER_IMAGE = 10
+POSE_STEP_S = 0.09  # at most; an image whose nearest pose is more than 0.03 s away counts as one without a pose
 EYE_HEIGHT_M = 1.5
 # On laps after the first: the greatest distance and rotation from the path.
 SIDE_STEP_M, TURN_DEG = 0.25, 5.0
@@ -102,7 +104,8 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     step_s = float(carrier.duration_s) / walk.frames
     times = step_s * np.arange(walk.frames, dtype=np.float64)
     # Poses are more frequent than pictures and never at the same time, as with motion capture.
-    pose_times = step_s * (np.arange(-POSES_PER_IMAGE, (walk.frames + 1) * POSES_PER_IMAGE) + 0.3) / POSES_PER_IMAGE
+    per_image = max(POSES_PER_IMAGE, math.ceil(step_s / POSE_STEP_S))
+    pose_times = step_s * (np.arange(-per_image, (walk.frames + 1) * per_image) + 0.3) / per_image
     poses = carrier.poses(pose_times)
     frames = [Frame(walk.start_s + time, f"rgb/{walk.start_s + time:.6f}.jpg") for time in times]
     depths = [Frame(frame.stamp, f"depth/{frame.stamp:.6f}.png") for frame in frames] if walk.depth else []

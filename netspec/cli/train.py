@@ -52,6 +52,12 @@ def add_to(commands: Commands) -> None:
         help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, fp16 on GPUs; both round "
         "more (default: fp32)",
     )
+    p.add_argument(
+        "--compile",
+        action="store_true",
+        help="make functions of the nets' layers with torch.compile; the first pass takes a minute or more, and needs "
+        "a C++ compiler",
+    )
     add_strict(p)
 
 
@@ -134,6 +140,7 @@ def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | N
         precision=arguments.precision,
         nan=arguments.nan,
         processes=processes,
+        compiled=arguments.compile,
     )
     if arguments.scores and processes.is_root:
         _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))

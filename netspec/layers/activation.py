@@ -28,6 +28,7 @@ class Activation(Layer):
 
     fresh = True
     any_layout = True
+    traceable = True
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:

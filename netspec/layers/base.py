@@ -187,6 +187,7 @@ class Layer(torch.nn.Module):
     gathers: ClassVar[bool] = False  # in a test its top is not averaged over the batches: see ``score``
     solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
     ahead: int = 0  # bytes of batches that it reads before they are asked for
+    traceable: ClassVar[bool] = False  # torch.compile can follow its forward pass: see netspec/net/segments.py
     not_exported: ClassVar[str] = "its class does not define it"  # the reason, where it cannot be exported
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
@@ -215,7 +216,16 @@ class Layer(torch.nn.Module):
     def __init_subclass__(cls, **named: Any) -> None:
         """Where a class replaces ``forward``, do not let it inherit what was said of the forward pass it replaces."""
         super().__init_subclass__(**named)
-        for name in ("prepare", "finishing", "fresh", "any_layout", "absorbs", "absorbs_before", "as_affine"):
+        for name in (
+            "prepare",
+            "finishing",
+            "fresh",
+            "any_layout",
+            "absorbs",
+            "absorbs_before",
+            "as_affine",
+            "traceable",
+        ):
             owner = next(each for each in cls.__mro__ if name in vars(each))
             told_of = getattr(owner, "forward", Layer.forward)
             if owner is not Layer and told_of is not Layer.forward and cls.forward is not told_of:

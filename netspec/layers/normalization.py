@@ -40,6 +40,7 @@ class BatchNorm(Layer):
     """
 
     default_param_lr = 0.0
+    traceable = True
 
     @override
     def setup(self) -> None:
@@ -232,8 +233,15 @@ def _normalize(
 
 
 def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bool:
-    """Whether torch's kernel would lose digits: on a CPU it computes x / std - mean / std, not (x - mean) / std."""
-    return mean.device.type == "cpu" and bool((mean.square() > MAX_OFFSET**2 * (variance + eps)).any())
+    """Whether torch's kernel would lose digits: on a CPU it computes x / std - mean / std, not (x - mean) / std.
+
+    What torch.compile makes of it subtracts the mean first.
+    """
+    return (
+        mean.device.type == "cpu"
+        and not torch.compiler.is_compiling()
+        and bool((mean.square() > MAX_OFFSET**2 * (variance + eps)).any())
+    )
 
 
 def _along(values: torch.Tensor, axis: int, data: torch.Tensor) -> torch.Tensor:
@@ -245,6 +253,7 @@ class _Affine(Layer):
     """What Scale and Bias have in common: an operand that is learned or a second bottom, laid over some axes."""
 
     bottoms = (1, 2)
+    traceable = True
 
     def learned_shape(self, param: Any, field: str) -> Shape:
         """Return the shape of a learned operand: ``num_axes`` axes of the bottom from ``axis`` on (-1: all)."""
@@ -469,6 +478,8 @@ class LRN(Layer):
     top[0]     the same shape
     Caffe: src/caffe/layers/lrn_layer.cpp
     """
+
+    traceable = True
 
     @override
     def setup(self) -> None:

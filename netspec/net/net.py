@@ -34,6 +34,7 @@ from netspec.net.in_place import Memory, is_overwritten, run_overwritten
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.net.options import BuildOptions
 from netspec.net.programs import Programs
+from netspec.net.segments import Segment, find_segments
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
 
@@ -88,7 +89,12 @@ class Net(torch.nn.Module):
         self._overwritten = [
             is_overwritten(layer, node, plan) for layer, node in zip(self.layers, plan.nodes, strict=False)
         ]
-        self._chains = self._find_chains()
+        self._chains: list[list[int]] = [[] for _ in plan.nodes]
+        self._segments: dict[int, Segment] = {}
+        if len(self.layers) == len(plan.nodes):  # otherwise errors were collected: it will not run
+            apart = self._apart()
+            self._chains = chains(plan, list(self.layers), apart)
+            self._segments = find_segments(self, apart) if options.compiled else {}
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
         self._given = [
@@ -99,7 +105,7 @@ class Net(torch.nn.Module):
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what was prepared from it."""
         prepared = self.programs and Programs(self, self.programs.passes)
-        return {**super().__getstate__(), "programs": prepared}
+        return {**super().__getstate__(), "programs": prepared, "_segments": {}}
 
     # Building
 
@@ -201,13 +207,16 @@ class Net(torch.nn.Module):
         with log.silent():
             return Net(self.plan, seen).need
 
-    def _find_chains(self) -> list[list[int]]:
-        if len(self.layers) < len(self.plan.nodes):
-            return [[] for _ in self.plan.nodes]  # errors were collected: it will not run
+    def _apart(self) -> list[bool]:
+        """Return which layers must run by themselves, whatever they compute."""
+        final = self.plan.final
+        read_again = {
+            final[node.tops[0]] for node, is_read in zip(self.plan.nodes, self._overwritten, strict=True) if is_read
+        }
+        overwritten = [any(final[v] in read_again for v in node.tops) for node in self.plan.nodes]
         blocked = [any(node.blocked) for node in self.plan.nodes]
         weighted = [any(weights) for weights in self.loss_weights]
-        apart = [any(flags) for flags in zip(self._overwritten, blocked, weighted, strict=True)]
-        return chains(self.plan, list(self.layers), apart)
+        return [any(flags) for flags in zip(overwritten, blocked, weighted, strict=True)]
 
     def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer, report: Report) -> None:
         """Connect the shared parameters of layer ``i`` to their owners; list the others as learnable."""
@@ -292,7 +301,10 @@ class Net(torch.nn.Module):
         tops: tuple[torch.Tensor, ...] = ()
         end = -1  # the layer whose tops are the last computed
         for i, node in enumerate(self.plan.nodes):
-            if following := self._following(i, kept) if i > end else ():
+            segment = self._segments.get(i) if i > end else None
+            if segment and segment.serves(values, kept):
+                end, tops = segment.last, segment.run(values)
+            elif following := self._following(i, kept) if i > end else ():
                 run, tops = self.layers[i].run_with(following, *(values[v] for v in node.bottoms))
                 end = i + run
             elif i > end:

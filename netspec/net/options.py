@@ -28,6 +28,7 @@ class BuildOptions:
     ``exact`` sets which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
     ``accumulate_in_place`` makes layers add the gradients that they sum up to ``grad`` themselves, like Caffe;
     hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see these gradients.
+    With ``compiled``, torch.compile makes functions of the layers that it can (netspec/net/segments.py).
     ``passes`` are those of netspec/graph/steps.py that a net of phase TEST may use when it runs without gradients.
     """
 
@@ -44,6 +45,7 @@ class BuildOptions:
     exact: str = SMALL
     accumulate_in_place: bool = False
     passes: Collection[str] = PASSES
+    compiled: bool = False
 
     def __post_init__(self) -> None:
         check_choice(self.exact)

@@ -25,6 +25,7 @@ from netspec.graph.filter import with_train_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
+from netspec.net.segments import missing_tool
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, save_weights, too_large
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
@@ -74,14 +75,15 @@ def load_solver(
     precision: str = FP32,
     nan: str = "stop",
     processes: Processes | None = None,
+    compiled: bool = False,
 ) -> Solver:
     """Build the solver of a prototxt and its nets, ready to run.
 
     ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
     ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
     ``stages`` go to the training net. Several devices train side by side, the first being the root. For ``device``,
-    ``action``, ``precision``, ``nan`` and ``processes`` see :class:`Solver`; each of several processes has the GPU of
-    its number on its machine if ``device`` is None. Raises SpecError for every fault of the files.
+    ``action``, ``precision``, ``nan``, ``processes`` and ``compiled`` see :class:`Solver`; each of several processes
+    has the GPU of its number on its machine if ``device`` is None. Raises SpecError for every fault of the files.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
@@ -115,6 +117,7 @@ def load_solver(
         precision=precision,
         nan=nan,
         processes=processes,
+        compiled=compiled,
     )
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
@@ -164,6 +167,7 @@ class Solver:
         clock: Callable[[], float] = time.perf_counter,
         precision: str = FP32,
         processes: Processes | None = None,
+        compiled: bool = False,
     ) -> None:
         """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError.
 
@@ -173,6 +177,7 @@ class Solver:
         raises SpecError, "warn" warns once. ``clock`` gives the seconds for "iter/s". In another ``precision`` than
         "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order. Of several
         ``processes`` each has one training net and calls the same methods; the root tests and writes the snapshots.
+        ``compiled`` nets run through torch.compile (netspec/net/segments.py); they compute no sums in Caffe's order.
         """
         node = node or Place(Where("<solver>"))
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
@@ -208,7 +213,10 @@ class Solver:
         check_precision(precision)
         self._precision = precision
         self._scale, self._overflowed = LossScale(precision), False
-        self._exact = exact if precision == FP32 else NONE
+        self._exact = exact if precision == FP32 and not compiled else NONE
+        self._compiled = compiled
+        if compiled and (lack := missing_tool(self._device)):
+            raise SpecError(f"--compile: {lack}", node.where)
         self._strict = strict
         if seed is None:
             seed = self._processes.seed
@@ -261,6 +269,7 @@ class Solver:
             exact=self._exact,
             accumulate_in_place=True,
             passes=(),
+            compiled=self._compiled,
         )
         net = build_net(described.net, described.source, options)
         files = [path.strip() for paths in self.param.weights for path in paths.split(",")]

@@ -4,7 +4,8 @@ import argparse
 import ast
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
@@ -13,56 +14,28 @@ import lmdb_build.cli
 import loopclosure.cli
 import netspec
 import netspec.cli
+from documents import DOCUMENTS, PROGRAMS, blocks, commands
 from netspec.cli import run_script
 from paths import ROOT
 
-DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("*/README.md")), *sorted((ROOT / "docs").glob("*.md"))]
 PARSERS = {
     "netspec": netspec.cli.parser,
     "lmdb-build": lmdb_build.cli.parser,
     "loopclosure": loopclosure.cli.parser,
-    "benchmarks": benchmarks.cli.parser,
+    "tools/bench": benchmarks.cli.parser,
 }
-OTHERS = {"source", "cd", "pip", "benchmarks/gpu_steps"}  # programs that are not ours
-BLOCKS = {
-    (f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, found.start()) + 2}", found[1]): found[2]
-    for path in DOCUMENTS
-    for text in [path.read_text()]
-    for found in re.finditer(r"^```([^\n`]*)\n(.*?)^```$", text, re.M | re.S)
-}
-SHELL = {where: text for (where, language), text in BLOCKS.items() if language in ("", "bash")}
-PYTHON = {where: text for (where, language), text in BLOCKS.items() if language == "python"}
+BLOCKS = {block.where: block for document in DOCUMENTS for block in blocks(document)}
+SHELL = [where for where, block in BLOCKS.items() if not block.language]
+PYTHON = [where for where, block in BLOCKS.items() if block.language == "python"]
 
 
-def commands(text: str) -> Iterator[list[str]]:
-    """Yield the words of each command of a shell block: variables are replaced, a loop's body is one command."""
-    variables: dict[str, str] = {}
-    for line in text.replace("\\\n", " ").splitlines():
-        line = re.sub(r"(^|\s)#.*", "", line)
-        line = re.sub(r"\bfor (\w+) in (\S+)[^;]*; do (.*); done", r"\1=\2; \3", line)
-        for part in re.split(r"&&|;", line):
-            for _ in range(2):  # a variable may hold another
-                part = re.sub(r"\$\{?(\w+)\}?", lambda found: variables.get(found[1], found[0]), part)
-            words = shlex.split(part)
-            if words and (assigned := re.fullmatch(r"(\w+)=(.*)", words[0])):
-                variables[assigned[1]] = assigned[2]
-            elif words:
-                yield words
-
-
-def parse(words: list[str]) -> argparse.Namespace | None:
+def parse(words: Sequence[str]) -> argparse.Namespace | None:
     """Parse a command with the parser of its program. Raises SystemExit for wrong usage."""
     program, *arguments = words
     if program == "torchrun":
         program, *arguments = arguments[arguments.index("-m") + 1 :]
-    if program in OTHERS:
+    if program not in PARSERS:
         return None
-    if program.startswith("tools/"):
-        script = ROOT / program
-        door = re.search(r'run\("(\w+)\.cli"((?:, "\w+")*)\)', script.read_text())
-        if not door:
-            return None  # a shell script
-        program, arguments = door[1].replace("_", "-"), [*re.findall(r"\w+", door[2]), *arguments]
     if (program, arguments[:1]) == ("netspec", ["run"]):
         arguments, script = run_script.split(arguments)  # whose own words are not parsed here
         assert script
@@ -70,38 +43,99 @@ def parse(words: list[str]) -> argparse.Namespace | None:
 
 
 @pytest.mark.parametrize("where", SHELL)
-def test_every_command_is_one_that_its_parser_takes(where: str) -> None:
-    found = list(commands(SHELL[where]))
+def test_every_command_is_one_that_its_parser_takes(where: str, tmp_path: Path) -> None:
+    found = commands(BLOCKS[where].text, tmp_path)
     assert found, "a block without a language is a list of commands"
-    for words in found:
+    for command in found:
         try:
-            parse(words)
+            parse(command.words)
         except SystemExit as end:
             if end.code:  # --help ends with 0
-                pytest.fail(shlex.join(words))
+                pytest.fail(shlex.join(command.words))
+
+
+def unknown_words(line: str) -> list[str]:
+    """Return the command and the options that a program does not have, of a line that may leave out the rest."""
+    program, *words = line.split()
+    parser = PARSERS[program]()
+    while commands_of := [a.choices for a in parser._actions if isinstance(a, argparse._SubParsersAction)]:
+        if not words or words[0].startswith("-"):
+            break
+        if words[0] not in commands_of[0]:
+            return words[:1]
+        parser = commands_of[0][words.pop(0)]
+    if line.startswith("netspec run"):
+        return []  # what follows are the script's own words
+    known = {option for action in parser._actions for option in action.option_strings}
+    return [word for word in words if word.startswith("--") and word.partition("=")[0] not in known]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_commands_in_sentences_have_commands_and_options_that_exist(document: str) -> None:
+    text = re.sub(r"^```.*?^```$", "", (ROOT / document).read_text(), flags=re.M | re.S)
+    for line in re.findall(r"`([^`]+)`", text):
+        if line.partition(" ")[0] in PARSERS:
+            assert not unknown_words(line), line
 
 
 @pytest.mark.parametrize(
-    "words", [["netspec", "chekc"], ["loopclosure", "detect"], ["tools/train.py", "--no-such-flag"]]
+    ("line", "unknown"),
+    [
+        ("netspec", []),
+        ("netspec sow LMDB", ["sow"]),
+        ("netspec export NET --too onnx", ["--too"]),
+        ("netspec run x.py --any", []),
+        ("lmdb-build walk walk --seed=1", []),
+    ],
 )
+def test_wrong_words_in_sentences_would_be_found(line: str, unknown: list[str]) -> None:
+    assert unknown_words(line) == unknown
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_every_block_says_what_it_is(document: str) -> None:
+    text = (ROOT / document).read_text()
+    assert len(re.findall(r"^\s*(?:```|~~~)", text, re.M)) == 2 * len(blocks(document)), "a block begins a line: ```"
+    for block in blocks(document):
+        assert re.fullmatch(r"|python|prototxt|text|\{\w+\}.*", block.language), block.where
+        if block.language == "text":  # is neither run nor parsed
+            first = [line.split()[0] for line in block.text.splitlines() if line.strip()]
+            assert not PROGRAMS.keys() & set(first), f"{block.where}: commands stand in a block without a language"
+
+
+@pytest.mark.parametrize("words", [["netspec", "chekc"], ["loopclosure", "detect"], ["tools/bench", "--no-such-flag"]])
 def test_a_wrong_command_would_be_found(words: list[str]) -> None:
     with pytest.raises(SystemExit):
         parse(words)
 
 
-def test_shell_blocks_are_read_as_the_shell_reads_them() -> None:
-    text = 'W=a/b\nE="run $W/c"  # why\nfor s in train val; do $E \\\n  --of ${s}; done\nsource x && cd y\n'
-    assert list(commands(text)) == [["run", "a/b/c", "--of", "train"], ["source", "x"], ["cd", "y"]]
+def test_shell_blocks_are_read_by_a_shell(tmp_path: Path) -> None:
+    text = 'W=a/b\nE="netspec $W/c"  # why\nfor s in x y; do $E \\\n  --of ${s}_; done\n'
+    text += 'source z && cd d\nloopclosure " e"\n'
+    found = commands(text, tmp_path)
+    assert [command.words for command in found] == [
+        ("netspec", "a/b/c", "--of", "x_"),
+        ("netspec", "a/b/c", "--of", "y_"),
+        ("loopclosure", " e"),
+    ]
+    assert [command.folder for command in found] == [tmp_path, tmp_path, tmp_path / "d"]
+
+
+@pytest.mark.parametrize("text", ["netspec check $NOT_SET", "netspce check", "netspec check 'a"])
+def test_what_a_shell_does_not_take_is_found(text: str, tmp_path: Path) -> None:
+    with pytest.raises(AssertionError):
+        commands(text, tmp_path)
 
 
 @pytest.mark.parametrize("where", PYTHON)
 def test_python_blocks_use_names_that_exist(where: str) -> None:
-    for node in ast.walk(ast.parse(PYTHON[where])):
+    for node in ast.walk(ast.parse(BLOCKS[where].text)):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "netspec":
             assert hasattr(netspec, node.attr), node.attr
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_links_lead_to_files(document) -> None:
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", document.read_text()):
-        assert "://" in target or (document.parent / target).exists(), target
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_links_lead_to_files(document: str) -> None:
+    path = ROOT / document
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text()):
+        assert "://" in target or (path.parent / target).exists(), target

@@ -46,6 +46,26 @@ def test_the_second_image_is_the_first_or_near_it_in_its_run() -> None:
     np.testing.assert_array_equal(first, second)
 
 
+def test_a_batch_takes_a_run_from_one_part_of_it() -> None:
+    runs = runs_of(tracks=5, images=200)
+    batches = Batches(count=40, size=12, per_track=4, apart=5, window=30)
+    first, _, _ = choose_views(runs, batches, np.random.default_rng(0))
+    starts = []
+    for batch in first.reshape(40, 12):
+        for track in np.unique(runs.tracks[batch]):
+            stamps = runs.stamps[batch[runs.tracks[batch] == track]]
+            assert np.ptp(stamps) <= 30
+            starts.append(stamps.min())
+    assert np.ptp(starts) > 100
+
+
+def test_long_runs_are_drawn_more_often() -> None:
+    names = [f"{number}.jpg" for number in range(100)]
+    runs = Runs(names, np.repeat([0, 1, 2], [80, 10, 10]), np.arange(100.0))
+    first, _, _ = choose_views(runs, Batches(count=300, size=1), np.random.default_rng(0))
+    assert 0.7 < np.mean(runs.tracks[first] == 0) < 0.9
+
+
 def test_negatives_are_other_places_of_the_batch() -> None:
     runs = runs_of()
     batches = Batches(count=30, size=12, apart=5, other=0, negatives=0.5)
@@ -62,6 +82,7 @@ def test_negatives_are_other_places_of_the_batch() -> None:
         ({"size": 100}, "a batch of 100 different places cannot be made: the 5 runs gave 3[0-5]; lower --size"),
         ({"size": 0}, "--size must be at least 1, not 0"),
         ({"apart": 1.0, "max_gap": 2.0}, "--apart 1 is less than --max-gap 2"),
+        ({"window": 0.0}, "--window must be more than 0, not 0"),
         ({"other": 1.5}, "--other must be 0 to 1"),
         ({"negatives": -0.5}, "--negatives must be 0 to 1"),
         ({"size": 10, "negatives": 0.1}, "is one pair; expected none or two"),
@@ -120,6 +141,11 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
     assert main([*command, *folders, "--out", str(tmp_path / "two")]) == 0
     assert len(read_pair_list(tmp_path / "two.txt")) == 12
 
+    both = [*by_index, folders[0], "--step", "0.5", "--out", str(tmp_path / "both")]
+    assert main(both) == 0
+    assert len(read_pair_list(tmp_path / "both.txt")) == 12
+    assert "source: 36 images of 3 runs" in (tmp_path / "both.txt").read_text()
+
     assert main([*command, *folders, "--negatives", "0.5", "--out", str(tmp_path / "v1.2")]) == 0
     assert sorted(pair.label for pair in read_pair_list(tmp_path / "v1.2.txt")) == [0] * 6 + [1] * 6
 
@@ -132,6 +158,6 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
     assert 'index.csv:5:1: expected a number in column second, found "x"' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("more", [[], ["folder", "--index", "x.csv"], ["--index", "x.csv"]])
-def test_the_source_is_named_once_and_whole(more: list[str]) -> None:
+@pytest.mark.parametrize("more", [[], ["folder", "--index", "x.csv"], ["--index", "x.csv"], ["folder", "--step", "0"]])
+def test_the_source_is_named_whole(more: list[str]) -> None:
     assert main(["views", "--out", "out", *more]) == 2

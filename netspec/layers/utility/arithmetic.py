@@ -30,6 +30,8 @@ class Eltwise(Layer):
     Caffe: src/caffe/layers/eltwise_layer.cpp
     """
 
+    traceable = True
+
     PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
     bottoms = (2, None)
 
@@ -257,6 +259,7 @@ class Softmax(Layer):
 
     gradient_reads = frozenset({"top"})
     fresh = True
+    traceable = True
     any_layout = True
 
     @override

@@ -29,6 +29,7 @@ class _OtherShape(Layer):
     """A layer whose top has its bottom's numbers in another shape."""
 
     shares = frozenset({"data", "diff"})
+    traceable = True
 
     @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -118,6 +119,7 @@ class Concat(Layer):
     """
 
     bottoms = (1, None)
+    traceable = True
 
     @override
     def setup(self) -> None:
@@ -167,6 +169,7 @@ class Slice(Layer):
     """
 
     tops = (1, None)
+    traceable = True
 
     @override
     def setup(self) -> None:
@@ -237,6 +240,7 @@ class Split(Layer):
     """
 
     tops = (1, None)
+    traceable = True
     shares = frozenset({"data"})
 
     @override

@@ -162,6 +162,7 @@ class Convolution(_SlidingFilter):
     bottoms = (1, None)
     tops = (1, None)
     same_tops = True
+    traceable = True
 
     @override
     def setup(self) -> None:

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact.sums import Copies
+from netspec.exact.switch import is_recorded
 from netspec.layers.base import Kernel, Layer, Preparation, Shape, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
@@ -97,6 +98,9 @@ def max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.
     The first of equal pixels gets the gradient, padding and NaN never win, and a window without a pixel above
     -FLT_MAX (all NaN, all -inf, or empty) yields -FLT_MAX, index -1 and no gradient.
     """
+    if is_recorded():  # without the branch
+        values, indices = _native_max_pool(torch.where(maps > LOWEST, maps, LOWEST), windows)
+        return values, torch.where(values > LOWEST, indices, -1)
     values, indices = _native_max_pool(maps, windows)
     # torch lets NaN win, so the maxima betray whether any window needs Caffe's rule; maps without one pay only for
     # this look at the smaller output.
@@ -123,7 +127,7 @@ def average_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
 
     A window without a pixel divides zero by what is left of its area, at times zero: NaN, as in Caffe.
     """
-    if windows.known_to_torch:
+    if windows.known_to_torch and not is_recorded():  # torch 2.13 compiles its gradient wrong at the rim, in ceil mode
         ceil = windows.round_mode == CEIL
         return F.avg_pool2d(maps, windows.kernel, windows.stride, windows.pad, ceil_mode=ceil, count_include_pad=True)
     return _sum_pool(maps, windows) / windows.areas(maps)
@@ -302,6 +306,11 @@ class Pooling(_PoolingBase):
             message = f"no window of {kernel} at stride {self.stride}, pad {self.pad}, fits a map of {size}"
             raise self.error(message, "pooling_param")
         return [(*shape[:2], *self.windows.count)] * self.num_tops
+
+    @property
+    def traceable(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether it draws nothing."""
+        return self.method != STOCHASTIC
 
     @override
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:

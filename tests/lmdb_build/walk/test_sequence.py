@@ -62,6 +62,11 @@ def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence:
     assert picture.shape == (SMALL.height, SMALL.width, 3)
 
 
+def test_a_walk_of_few_frames_has_a_pose_for_each_of_them(tmp_path: Path) -> None:
+    list(write_walk(tmp_path / "few", replace(SMALL, frames=6)))
+    assert read_posed(tmp_path / "few", "tum").dropped == 0
+
+
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_house(folder: Path, tmp_path: Path) -> None:
     short = replace(SMALL, frames=4, laps=1)
