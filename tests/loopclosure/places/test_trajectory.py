@@ -120,8 +120,10 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     quaternions = rng.normal(size=(20, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     written = Trajectory(1e9 + np.arange(20) / 97, rng.normal(size=(20, 3)), quaternions)
-    write_groundtruth(tmp_path / "groundtruth.txt", written)
-    back = read_groundtruth(tmp_path / "groundtruth.txt")
+    folder = tmp_path / "caf\udce9"  # a name that is not UTF-8
+    folder.mkdir()
+    write_groundtruth(folder / "groundtruth.txt", written)
+    back = read_groundtruth(folder / "groundtruth.txt")
     np.testing.assert_allclose(back.stamps, written.stamps, atol=1e-6)
     np.testing.assert_allclose(back.positions, written.positions, atol=1e-6)
     np.testing.assert_allclose(back.quaternions, written.quaternions, atol=2e-6)
