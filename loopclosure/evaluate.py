@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from loopclosure.errors import InputError
+from loopclosure.errors import InputError, printable
 from loopclosure.methods.base import Images, Method, MethodContext, make_method
 from loopclosure.places.datasets import DataSet
 from loopclosure.places.truth import Truth
@@ -131,7 +131,7 @@ def named_method(text: str, context: MethodContext) -> tuple[str, Method]:
     if not equals or ":" in label:  # the = of a setting, which follows the colon of its method
         method = make_method(text, context)
         return method.name, method
-    return label.strip(), make_method(spec, context)
+    return printable(label.strip()), make_method(spec, context)
 
 
 def evaluate(

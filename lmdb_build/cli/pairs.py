@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-from lmdb_build.cli.arguments import next_command
+from lmdb_build.cli.arguments import above_zero, next_command, seed
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_list import (
@@ -81,8 +81,8 @@ def add_to(commands: Commands) -> None:
     )
 
     rule = parser.add_argument_group("what is the same place")
-    rule.add_argument("--max-distance", type=float, default=MAX_DISTANCE_M, help="meters; less is a positive (2)")
-    rule.add_argument("--max-angle", type=float, default=MAX_ANGLE_DEG, help="degrees; less is a positive (15)")
+    rule.add_argument("--max-distance", type=above_zero, default=MAX_DISTANCE_M, help="meters; less is a positive (2)")
+    rule.add_argument("--max-angle", type=above_zero, default=MAX_ANGLE_DEG, help="degrees; less is a positive (15)")
     rule.add_argument("--min-gap", type=float, help="leave out pairs nearer in time: seconds (--mask: images) (0)")
     rule.add_argument("--negatives", choices=NEGATIVES, default="both", help="where negatives come from (both)")
     rule.add_argument("--clear-distance", type=float, metavar="M", help="negatives by pose are at least this far apart")
@@ -117,7 +117,7 @@ def add_to(commands: Commands) -> None:
     choice.add_argument(
         "--warp-share", type=float, default=0.0, help="share of pairs in which one image is a warped copy (0)"
     )
-    choice.add_argument("--seed", type=int, default=1, help="seed of the random choice (1)")
+    choice.add_argument("--seed", type=seed, default=1, help="seed of the random choice (1)")
 
 
 def _pairs(arguments: argparse.Namespace) -> None:

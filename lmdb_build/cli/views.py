@@ -6,7 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
-from lmdb_build.cli.arguments import next_command, size
+from lmdb_build.cli.arguments import next_command, seed, size
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
 from lmdb_build.views import Batches, write_views
@@ -31,7 +31,7 @@ def add_to(commands: Commands) -> None:
     add("--other", type=float, default=0.4, help="share of pairs that use two images of a place (0.4)")
     add("--negatives", type=float, default=0.0, help="share of pairs of two places, for ContrastiveLoss (0)")
     add("--view-size", type=size, default=(128, 96), help="size of a view (128x96)")
-    add("--seed", type=int, default=1, help="random seed (1)")
+    add("--seed", type=seed, default=1, help="random seed (1)")
 
 
 def _views(arguments: argparse.Namespace) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lmdb_build.cli.arguments import size
+from lmdb_build.cli.arguments import seed, size
 from lmdb_build.cli.bar import bar
 from lmdb_build.walk.sequence import Walk, write_walk
 from netspec.command_line import Commands, WrongUsage
@@ -23,15 +23,13 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--laps", type=int, default=3, help="laps through the house (3)")
     p.add_argument("--depth", action="store_true", help="write depth images too, in TUM's form")
     p.add_argument("--rooms", type=int, default=4, help="rooms per house, an even number (4)")
-    p.add_argument("--seed", type=int, default=1, help="random seed (1)")
+    p.add_argument("--seed", type=seed, default=1, help="random seed (1)")
     p.add_argument(
         "--season", type=int, default=1, metavar="N", help="the same houses, repainted, in other light and weather (1)"
     )
 
 
 def _walk(arguments: argparse.Namespace) -> None:
-    if arguments.seed < 0:
-        raise WrongUsage("--seed must be 0 or more")
     if not 1 <= arguments.sequences <= 999:
         raise WrongUsage("--sequences must be 1 to 999")
     for number in range(1, arguments.sequences + 1):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.cli.data_set import add_poses, add_topics, sequence
-from loopclosure.cli.run import Commands, WrongUsage, show_progress, warn
+from loopclosure.cli.run import Commands, WrongUsage, seed, show_progress, warn
 from loopclosure.closing.close import close, summary, write_closed
 from loopclosure.closing.drift import drifted
 from loopclosure.closing.measure import measure, read_loops
@@ -31,7 +31,7 @@ def add_to(commands: Commands) -> None:
         "--drift", type=float, metavar="PERCENT", help="simulate odometry that drifts, from the true poses"
     )
     p.add_argument("--odometry-form", metavar="WORDS", help="how --odometry is written, as --pose-form")
-    p.add_argument("--seed", type=int, metavar="N", help="of --drift (default: 1)")
+    p.add_argument("--seed", type=seed, metavar="N", help="of --drift (default: 1)")
     add_poses(p)
     add_topics(p)
     p.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source does not say")

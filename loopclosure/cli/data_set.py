@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loopclosure.cli.run import WrongUsage, show_progress, warn
+from loopclosure.cli.run import WrongUsage, above_zero, show_progress, warn
 from loopclosure.places import datasets
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
@@ -60,10 +60,10 @@ def add_data_set(p: argparse.ArgumentParser) -> None:
     p.add_argument("--coordinates", metavar="FILE", help="of --fabmap, if not in the folder")
     p.add_argument("--tolerance", type=int, metavar="FRAMES", help="of --traverses (default: 0)")
     p.add_argument("--soft-tolerance", type=int, metavar="FRAMES", help="a match up to here is ignored, not wrong")
-    p.add_argument("--max-distance", type=float, metavar="M", help=f"of poses (default: {MAX_DISTANCE_M:g})")
-    p.add_argument("--max-angle", type=float, metavar="DEG", help=f"of poses (default: {MAX_ANGLE_DEG:g})")
-    p.add_argument("--soft-distance", type=float, metavar="M", help="a match up to here is ignored, not wrong")
-    p.add_argument("--soft-angle", type=float, metavar="DEG", help="the same, for the angle")
+    p.add_argument("--max-distance", type=above_zero, metavar="M", help=f"of poses (default: {MAX_DISTANCE_M:g})")
+    p.add_argument("--max-angle", type=above_zero, metavar="DEG", help=f"of poses (default: {MAX_ANGLE_DEG:g})")
+    p.add_argument("--soft-distance", type=above_zero, metavar="M", help="a match up to here is ignored, not wrong")
+    p.add_argument("--soft-angle", type=above_zero, metavar="DEG", help="the same, for the angle")
     p.add_argument(
         "--fov", type=float, metavar="DEG", help=f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"
     )

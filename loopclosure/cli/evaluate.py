@@ -7,7 +7,7 @@ from pathlib import Path
 
 from loopclosure import evaluate
 from loopclosure.cli.data_set import add_data_set, add_selection, data_set, selection
-from loopclosure.cli.run import Commands, show_progress
+from loopclosure.cli.run import Commands, seed, show_progress
 from loopclosure.methods.base import METHODS, MethodContext
 from loopclosure.places.frames import image_paths
 
@@ -34,7 +34,7 @@ def add_to(commands: Commands) -> None:
     add_selection(p, "--train-", "of each --train: ")
     p.add_argument("--out", required=True, metavar="FOLDER", help="where the report and its parts go")
     p.add_argument("--title", default="", help="heading of the report")
-    p.add_argument("--seed", type=int, default=0, help="of the methods' random numbers (default: 0)")
+    p.add_argument("--seed", type=seed, default=0, help="of the methods' random numbers (default: 0)")
 
 
 def _evaluate(a: argparse.Namespace) -> None:

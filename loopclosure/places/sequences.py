@@ -211,7 +211,7 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     stamps, images = [], []
     for line_number, line in content_lines(listing, 'a list of images, "timestamp [ns],filename" per line'):
         row = next(csv.reader([line]))
-        if len(row) < 2 or not row[0].strip().isdigit():
+        if len(row) < 2 or not re.fullmatch(r"\s*[0-9]{1,19}\s*", row[0]):
             found = line.strip()[:60]
             raise InputError(f'expected "timestamp [ns],filename", found "{found}"', listing, line_number, 1)
         stamps.append(int(row[0]) * 1e-9)

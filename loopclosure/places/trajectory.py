@@ -182,7 +182,7 @@ def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what:
     ):
         lines.append(f"{stamp:.6f} " + " ".join(f"{value:.6f}" for value in (*position, *quaternion)))
     with whole_file(Path(path)) as unfinished:
-        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def associate(
@@ -223,12 +223,15 @@ def content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple
 
 
 def number(field: re.Match[str], name: str, path: str | os.PathLike[str], line: int) -> float:
-    """Return a matched field as a finite number; InputError (file:line:column), which calls it ``name``, otherwise."""
+    """Return a matched field as a number; InputError (file:line:column), which calls it ``name``, for what is none.
+
+    What is too great for distances to be numbers is none either.
+    """
     try:
         value = float(field.group())
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
+    if not math.isfinite(16 * value * value):
         raise InputError(f'expected a number for {name}, found "{field.group()}"', path, line, field.start() + 1)
     return value
 

@@ -20,7 +20,7 @@ class Exclusion:
     seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.frames < 0 or self.seconds < 0:
+        if self.frames < 0 or not self.seconds >= 0:
             raise InputError(f"cannot exclude {self.frames} frames, {self.seconds:g} s; expected 0 or more")
 
     def excludes(

@@ -16,7 +16,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from loopclosure.errors import InputError
+from loopclosure.errors import InputError, printable
 from loopclosure.evaluate import RECALL_AT, SOFT_ZONE
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report.files import SOFT_MEASURES, share
@@ -90,7 +90,7 @@ def _read(path: Path, label: str) -> Report:
         methods = {str(method["name"]): method for method in found["methods"]}
         figures = {name: _figures(method["figures"]) for name, method in methods.items()}
         curves = {name: _curves(method.get("curves", {})) for name, method in methods.items()}
-        return Report(label, str(found["data_set"]), str(found["truth_and_exclusion"]), figures, curves)
+        return Report(printable(label), str(found["data_set"]), str(found["truth_and_exclusion"]), figures, curves)
     except (LookupError, TypeError, ValueError, AttributeError):
         raise InputError(f"is not {EXPECTED}", path) from None
 
@@ -200,4 +200,4 @@ def write_comparison(reports: Sequence[Report], path: str | Path, command: str =
     )
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with whole_file(Path(path)) as unfinished:
-        unfinished.write_text(page, "utf-8")
+        unfinished.write_text(page, "utf-8", "backslashreplace")

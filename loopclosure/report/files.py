@@ -36,7 +36,7 @@ def write_files(evaluation: Evaluation, folder: Path, command: str = "") -> None
         _write_matches_csv(evaluation, outcome, folder / f"matches_{slug}.csv")
     text = json.dumps(summary(evaluation, command), indent=2, ensure_ascii=False, allow_nan=False)
     with whole_file(folder / "report.json") as unfinished:
-        unfinished.write_text(text + "\n", "utf-8")
+        unfinished.write_text(text + "\n", "utf-8", "backslashreplace")
 
 
 def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
@@ -180,7 +180,10 @@ def verdict(matches: BestMatches, query: int | np.intp) -> str:
 
 
 def _write_csv(path: Path, rows: list[list[str]]) -> None:
-    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as stream:
+    with (
+        whole_file(path) as unfinished,
+        unfinished.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream,
+    ):
         csv.writer(stream).writerows(rows)
 
 

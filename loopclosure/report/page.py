@@ -68,7 +68,7 @@ def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", co
     page = folder / "report.html"
     text = _page(evaluation, encoded, title or f"Loop closure on {evaluation.data.name}", command)
     with whole_file(page) as unfinished:
-        unfinished.write_text(text, "utf-8")
+        unfinished.write_text(text, "utf-8", "backslashreplace")
     write_files(evaluation, folder, command)
     return page
 

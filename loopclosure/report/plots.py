@@ -20,6 +20,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
+from loopclosure.errors import printable
 from loopclosure.evaluate import SOFT_ZONE, Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
@@ -294,6 +295,7 @@ def _loop_legend(figure: Figure, evaluation: Evaluation) -> None:
 def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -> None:
     """Print the description of the truth below the figure, so that it can be used by itself."""
     text = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.description}"
+    text = printable(text)
     width = int(figure.get_figwidth() * 22)  # characters of this size that fit into the width
     figure.supxlabel(textwrap.fill(text, width), fontsize=6.5, color="#777777", parse_math=False)
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -203,6 +204,10 @@ def expanded(line: str, **names: object) -> list[str]:
         ("similarity NOWHERE.npz --out OUT", "no such file"),
         ("similarity FEATURES --out OUT/no/folder.npy", "cannot be written"),
         ("detect LAPS --threshold 0.5 --out FEATURES", "FEATURES: File exists"),
+        (
+            "evaluate --tum LAPS --exclude-seconds nan --method thumbnails --out OUT",
+            "cannot exclude 0 frames, nan s; expected 0 or more",
+        ),
     ],
 )
 def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_features, tmp_path, capsys):
@@ -241,10 +246,41 @@ def test_options_that_do_not_go_together_are_one_line_and_status_2(
     assert sentence in printed
 
 
+def test_names_that_are_not_utf8_are_escaped(two_laps, tmp_path):
+    source, out = tmp_path / "caf\udce9", tmp_path / "out\udce9"
+    shutil.copytree(two_laps, source)
+    (source / "rgb.txt").unlink()
+    poses = "\n".join(f"{k} {5 * (k % 20)} 0 0 0 0 0 1" for k in range(40))
+    (tmp_path / "poses.txt").write_text(poses)
+    words = ["--images", str(source / "rgb"), "--poses", str(tmp_path / "poses.txt"), "--exclude-frames", "5"]
+    words += ["--method", "\udce9=thumbnails", "--title", "\udce9", "--out", str(out)]
+    assert main(["evaluate", *words]) == 0
+    assert "out\\udce9" in (out / "report.html").read_text()
+    shutil.copytree(out, tmp_path / "out")
+    reports = [str(folder / "report.json") for folder in (out, tmp_path / "out")]
+    assert main(["compare", *reports, "--out", str(out / "page\udce9.html")]) == 0
+
+
 @pytest.mark.parametrize("line", ["", "evaluate", "detect x --out y", "evaluate --camera front"])
 def test_wrong_usage_is_status_2(line, capsys):
     assert main(line.split()) == 2
     assert "usage: loopclosure" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("evaluate --seed -1", "argument --seed: found -1, expected a number from 0 to 2147483647"),
+        ("close x --seed 99999999999", "argument --seed: found 99999999999, expected a number from 0 to"),
+        ("evaluate --max-distance nan", "argument --max-distance: found nan, expected a number above 0"),
+        ("evaluate --max-angle nan", "argument --max-angle: found nan, expected a number above 0"),
+        ("evaluate --soft-distance -1", "argument --soft-distance: found -1, expected a number above 0"),
+        ("evaluate --soft-angle 0", "argument --soft-angle: found 0, expected a number above 0"),
+    ],
+)
+def test_numbers_that_mean_nothing_are_wrong_usage(words, said, capsys):
+    assert main(words.split()) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_control_c_is_one_line_and_status_130(tmp_path):

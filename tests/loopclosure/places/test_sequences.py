@@ -55,6 +55,10 @@ def test_euroc_without_its_truth_or_with_a_missing_image(tmp_path: Path) -> None
         read_sequence(folder)
     with pytest.raises(InputError, match="expected an EuRoC sequence, a folder with mav0/cam0"):
         read_sequence(tmp_path, "euroc")
+    for stamp in ("9" * 400, "\u00b2"):
+        (folder / "mav0/cam0/data.csv").write_text(f"{stamp},1.png\n")
+        with pytest.raises(InputError, match=r'data\.csv:1:1: expected "timestamp \[ns\],filename", found'):
+            read_sequence(folder)
 
 
 def test_a_distortion_that_is_not_known_is_refused(tmp_path: Path) -> None:

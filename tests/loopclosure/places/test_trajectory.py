@@ -48,6 +48,7 @@ def test_groundtruth_is_sorted_and_its_quaternions_are_normalized(tmp_path: Path
         ("1.5 0.1 0.2 0.3 0 0 0 1 9", 25, "found 9"),
         ("1.5 0.1 zwei 0.3 0 0 0 1", 9, 'expected a number for ty, found "zwei"'),
         ("1.5 0.1 nan 0.3 0 0 0 1", 9, 'expected a number for ty, found "nan"'),
+        ("1.5 0.1 1e300 0.3 0 0 0 1", 9, 'expected a number for ty, found "1e300"'),
         ("1.5 0.1 0.2 0.3 0 0 0 0", 17, "length 0, a rotation has length 1"),
         ("1.5 0.1 0.2 0.3 90 0 0 1", 17, "length 90"),
     ],
@@ -119,8 +120,10 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     quaternions = rng.normal(size=(20, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     written = Trajectory(1e9 + np.arange(20) / 97, rng.normal(size=(20, 3)), quaternions)
-    write_groundtruth(tmp_path / "groundtruth.txt", written)
-    back = read_groundtruth(tmp_path / "groundtruth.txt")
+    folder = tmp_path / "caf\udce9"  # a name that is not UTF-8
+    folder.mkdir()
+    write_groundtruth(folder / "groundtruth.txt", written)
+    back = read_groundtruth(folder / "groundtruth.txt")
     np.testing.assert_allclose(back.stamps, written.stamps, atol=1e-6)
     np.testing.assert_allclose(back.positions, written.positions, atol=1e-6)
     np.testing.assert_allclose(back.quaternions, written.quaternions, atol=2e-6)
