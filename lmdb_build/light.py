@@ -26,22 +26,28 @@ NOISE = 4 / 255  # mean of an exponential distribution of standard deviations
 GRAY = np.array([0.114, 0.587, 0.299], np.float32)  # of blue, green, red: Rec. 601
 
 
-def change_light(view: NDArray[np.uint8], other: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Return the view (H, W, 3), BGR, as it could look at another time; parts of ``other`` may be in front of it."""
+def change_light(
+    view: NDArray[np.uint8], other: NDArray[np.uint8], rng: np.random.Generator, calm: float = 0.0
+) -> NDArray[np.uint8]:
+    """Return the view (H, W, 3), BGR, as it could look at another time; parts of ``other`` may be in front of it.
+
+    With the probability ``calm`` it keeps its colors and tones, nothing comes in front of it, and there is no fog.
+    """
     x = view.astype(np.float32) / 255
-    if rng.random() < OCCLUDED:
+    changes = not (calm and rng.random() < calm)
+    if changes and rng.random() < OCCLUDED:
         _occlude(x, other, rng)
-    if rng.random() < FADED:
+    if changes and rng.random() < FADED:
         x = _other_colors(x, rng)
     if rng.random() < GAMMA_DRAWN:
         x = np.clip(x, 0, 1) ** np.float32(np.exp(rng.normal(0, GAMMA)))
-    if rng.random() < TONED:
+    if changes and rng.random() < TONED:
         x = _other_tones(x, rng)
     if rng.random() < UNEVEN:
         x = x * np.exp(UNEVEN_LIGHT * _clouds(x, 3, rng))
     if rng.random() < SHADED:
         x = x * (1 - rng.uniform(*SHADE) * _shadow(x, rng))
-    if rng.random() < FOGGED:
+    if changes and rng.random() < FOGGED:
         fog = np.clip(rng.uniform(*FOG) + 0.2 * _clouds(x, 2, rng), 0, 0.9)
         x = x * (1 - fog) + fog * rng.uniform(*FOG_LIGHT)
     mean = x.mean()

@@ -163,15 +163,19 @@ def write_views(
     root: Path,
     folder: Path,
     seed: int,
+    calm: float = 0.0,
     progress: Progress = silent,
 ) -> Path:
     """Write two views of ``size`` (width, height) for each pair below ``folder``, and the list ``folder``.txt.
 
-    Both views of a pair are mirrored, or neither is. Raises InputError if batches cannot be made, or an image cannot be
+    Both views of a pair are mirrored, or neither is. The share ``calm`` of all views changes less
+    (:func:`lmdb_build.light.change_light`). Raises InputError if batches cannot be made, or an image cannot be
     read or written.
     """
     if seed < 0:
         raise InputError(f"a seed must be 0 or more, not {seed}")
+    if not 0 <= calm <= 1:
+        raise InputError(f"--calm must be 0 to 1, not {calm:g}")
     first, second, same = choose_views(runs, batches, np.random.default_rng([seed, 0]))
     folder.mkdir(parents=True, exist_ok=True)
     listed = []
@@ -183,7 +187,7 @@ def write_views(
             picture = read_bgr(root / runs.names[image])
             view = cut_view(np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture, size, about, rng)
             other = read_bgr(root / runs.names[rng.integers(len(runs.names))])
-            write_jpeg(folder.parent / name, change_light(view, other, rng))
+            write_jpeg(folder.parent / name, change_light(view, other, rng, calm))
         listed.append((*names, int(same[number])))
     out = folder.with_name(f"{folder.name}.txt")
     settings = {
@@ -191,6 +195,7 @@ def write_views(
         "batches": f"{batches.count} of {batches.size} places, up to {batches.per_track} of one run, "
         f"more than {batches.apart:g} apart, in a part of {batches.window:g}",
         "second image": f"a different one in {batches.other:g} of the pairs, up to {batches.max_gap:g} away",
+        "calm": f"{calm:g} of the views",
         "negatives": f"{batches.negatives:g} of the pairs",
         "seed": str(seed),
     }

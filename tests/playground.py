@@ -61,6 +61,16 @@ SCRIPT = """import caffe
 net = caffe.Net("deploy.prototxt", "x.caffemodel", caffe.TEST)
 print(net.forward()["prob"].shape)
 """
+# Sequences that siamese_words_256 is trained on.
+SEQUENCES = (
+    "bridge_highway",
+    "city_drive",
+    "maker_lab_robot",
+    "office_handheld_loop",
+    "rc_turquoise_track",
+    "rc_exhibition_hall",
+    "rc_warehouse_dim",
+)
 # A training of the project's solvers takes two iterations.
 LESS = (
     (r"^max_iter: \d+", "max_iter: 2"),
@@ -136,12 +146,13 @@ def _sequences(folder: Path) -> None:
         shutil.copy(image, samples / f"{number}.png")
     apart = np.abs(np.subtract.outer(np.arange(FRAMES), np.arange(FRAMES)))
     cv2.imwrite(f"{samples}_GT.bmp", np.where(apart % (FRAMES // 3) < 2, 255, 0).astype(np.uint8))
-    for name in ("tower.txt", "train.txt"):
-        (folder / name).write_text("".join(f"{image}\n" for image in sorted((second / "rgb").iterdir())))
+    (folder / "train.txt").write_text("".join(f"{image}\n" for image in sorted((second / "rgb").iterdir())))
 
     source = folder / "src"
     source.mkdir()
     (source / "tum").symlink_to(tum)
+    for name in SEQUENCES:
+        (source / name).symlink_to(first / "rgb")
     tower = source / "ie_tower"
     tower.mkdir()
     with open(tower / "index.csv", "w", newline="") as file:

@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(MISSING), reason=f"not i
 SUPPOSED = {
     "README.md": "prototxt out data deploy.prototxt x.caffemodel solver.prototxt train_val.prototxt train_lmdb",
     "loopclosure/README.md": "prototxt FOLDER SEQUENCE OTHER_IMAGES others.npz odometry.txt corridor_loop "
-    "tower.txt train.txt rgbd_dataset_freiburg1_xyz",
+    "train.txt rgbd_dataset_freiburg1_xyz",
     "netspec/README.md": "train_val.prototxt deploy.prototxt solver.prototxt a.prototxt b.prototxt x.caffemodel "
     "train_lmdb FOLDER train.log old_caffe.log script.py",
     "prototxt/README.md": "prototxt tum src",
@@ -53,7 +53,9 @@ LESS = {
         "--train 9000 --val 0 --test 1000": "--train 20 --val 0 --test 4",
         "--frames 250 --size 160x120": "--frames 30 --size 64x48",
         "--train 6000 --val 600": "--train 20 --val 4",
-        "--batches 600": "--batches 1",
+        "--batches 1000": "--batches 1",
+        "--batches 500": "--batches 1",
+        "siamese_words_256_iter_4000": "siamese_words_256_iter_2",
     },
     "docs/closing.md": {"--frames 250": "--frames 60"},
     "docs/datasets.md": {

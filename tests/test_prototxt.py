@@ -171,26 +171,30 @@ def test_one_iteration_and_back_into_the_deploy_net(
 WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
 
 
-def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines(
+def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     with Writer("pairs") as writer:
         for k in range(48):
-            pixels = rng.integers(0, 256, (6, 24, 32), dtype=np.uint8)
+            pixels = rng.integers(0, 256, (6, 48, 64), dtype=np.uint8)
             writer.put(b"%08d" % k, array_to_datum(pixels, 1).SerializeToString())
     text = re.sub(r'source: "[^"]*"', 'source: "pairs"', (WORDS / "train_val.prototxt").read_text())
     Path("net.prototxt").write_text(text)
     net = load_net("net.prototxt", phase="TRAIN")
     net.keep = "all"
     loss, _ = net.forward_loss()
-    first, second = (net.blobs[name].detach().double() for name in ("feat", "feat_p"))
-    np.testing.assert_allclose(first.square().sum(1), 1, rtol=1e-4)
-    expected = torch.nn.functional.cross_entropy(10 * first @ second.T, torch.arange(48))
-    np.testing.assert_allclose(loss.item(), expected.item(), rtol=1e-4)
+    expected = 0.0
+    for kind in ("whole", "parts"):
+        first, second = (net.blobs[name].detach().double() for name in (kind, f"{kind}_p"))
+        np.testing.assert_allclose(first.square().sum(1), 1, rtol=1e-4)
+        cosines, own = 15 * first @ second.T, torch.arange(48)
+        both_ways = [torch.nn.functional.cross_entropy(scores, own).item() for scores in (cosines, cosines.T)]
+        expected += np.mean(both_ways)
+    np.testing.assert_allclose(loss.item(), expected, rtol=1e-4)
     loss.backward()
-    for name in ("conv1", "res6b", "words"):
+    for name in ("conv1", "res6b", "words", "layout"):
         grad = net.params[name][0].grad
         assert grad is not None, name
         assert grad.abs().max() > 0, name
@@ -200,15 +204,16 @@ def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
     train = {layer.name: layer for layer in read_net(WORDS / "train_val.prototxt").layer}
     deploy = {layer.name: layer for layer in read_net(WORDS / "deploy.prototxt").layer}
     learned = [name for name, layer in train.items() if layer.param and not name.endswith("_p")]
-    assert len(learned) == 3 * 8
+    assert len(learned) == 3 * 9 + 2
     for name in learned:
         assert [p.name for p in train[name].param] == [p.name for p in train[f"{name}_p"].param]
         assert all(p.name for p in train[name].param)
-        assert deploy[name] == train[name]
+        if not name.startswith("bn_flat_"):  # they center the descriptors in training alone
+            assert deploy[name] == train[name]
     (checked,) = check_file(WORDS / "deploy.prototxt", TEST)
     assert checked.net is not None
     shapes = {name: checked.net.shapes[name] for name in checked.net.plan.outputs}
-    assert shapes == {"feat": (1, 256 + 6 * 256)}
+    assert shapes == {"feat": (1, 256 + 25 * 64)}
 
 
 @pytest.mark.slow

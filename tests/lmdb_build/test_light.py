@@ -35,3 +35,12 @@ def test_most_views_can_still_be_recognized(view: np.ndarray) -> None:
 def test_a_small_picture_in_front_is_cut_to_its_size(view: np.ndarray) -> None:
     dark = np.zeros((5, 7, 3), np.uint8)
     assert any((change_light(view, dark, np.random.default_rng(seed)) == 0).any() for seed in range(40))
+
+
+def test_calm_views_keep_their_colors(view: np.ndarray) -> None:
+    gray = np.repeat(view[..., :1], 3, axis=2)
+    other = np.dstack([np.full((48, 64), 255), np.zeros((48, 64)), np.zeros((48, 64))]).astype(np.uint8)
+    for calm, most, least in ((1.0, 0, 0), (0.0, 200, 30)):
+        found = [change_light(gray, other, np.random.default_rng(seed), calm) for seed in range(100)]
+        colored = sum(bool(np.ptp(each.astype(int), axis=2).any()) for each in found)
+        assert least <= colored <= most

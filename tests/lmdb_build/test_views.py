@@ -141,6 +141,9 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
     assert main([*command, *folders, "--out", str(tmp_path / "two")]) == 0
     assert len(read_pair_list(tmp_path / "two.txt")) == 12
 
+    assert main([*by_index, "--calm", "2", "--out", str(tmp_path / "five")]) == 1
+    assert "--calm must be 0 to 1, not 2" in capsys.readouterr().err
+
     both = [*by_index, folders[0], "--step", "0.5", "--out", str(tmp_path / "both")]
     assert main(both) == 0
     assert len(read_pair_list(tmp_path / "both.txt")) == 12
