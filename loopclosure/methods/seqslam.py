@@ -23,6 +23,7 @@ DIRECTIONS = ("forward", "both")
 ANCHORS = ("center", "start")
 EDGES = ("shorten", "drop")
 STANDARDIZE = ("no", "yes", "traverses")
+LONGEST = 10_000  # frames in a sequence; memory grows with it
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,9 @@ class SequenceSettings:
         ):
             if value not in choices:
                 raise InputError(f'{name} of SeqSLAM is "{value}"; expected {" or ".join(choices)}')
-        if self.length < 1 or self.contrast < 0:
-            raise InputError(f"SeqSLAM needs length >= 1 and contrast >= 0, got {self.length} and {self.contrast}")
+        if not 1 <= self.length <= LONGEST or self.contrast < 0:
+            expected = f"length 1 to {LONGEST} and contrast >= 0"
+            raise InputError(f"SeqSLAM needs {expected}, got {self.length} and {self.contrast}")
         if not 0.0 < self.slowest <= self.fastest or self.velocity_step <= 0.0:
             raise InputError(
                 f"SeqSLAM needs 0 < slowest <= fastest and a positive step, got {self.slowest:g}, {self.fastest:g}, "

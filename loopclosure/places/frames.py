@@ -97,6 +97,8 @@ def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     """Yield (seconds from the start, image (H, W, 3) uint8 BGR) for each frame of a video file."""
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
+        if Path(path).is_dir():
+            raise InputError("is a folder, and neither a video nor a ROS bag (which has a metadata.yaml)", path)
         raise InputError("is not a readable video" if Path(path).is_file() else "no such video", path)
     rate = capture.get(cv2.CAP_PROP_FPS)
     number = 0

@@ -253,7 +253,8 @@ def test_standardized_distances() -> None:
         ({"directions": "backward"}, 'directions of SeqSLAM is "backward"; expected forward or both'),
         ({"anchor": "end"}, "anchor of SeqSLAM"),
         ({"edges": "pad"}, "edges of SeqSLAM"),
-        ({"length": 0}, "length >= 1"),
+        ({"length": 0}, "length 1 to 10000"),
+        ({"length": 10**20}, "length 1 to 10000"),
         ({"slowest": 2.0}, "slowest <= fastest"),
     ],
 )

@@ -87,3 +87,5 @@ def test_video(tmp_path):
     assert video_length(path) == 5
     with pytest.raises(InputError, match="no such video"):
         next(iter(video_frames(tmp_path / "none.avi")))
+    with pytest.raises(InputError, match="is a folder, and neither a video nor a ROS bag"):
+        list(video_frames(tmp_path))
