@@ -33,11 +33,13 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
 
 def _written(status: int) -> int:
     """Write what stdout still holds, and return the status. At its own end Python would print a traceback."""
+    out = sys.stdout
+    if out is None:  # the caller has closed it
+        return status
     try:
-        if sys.stdout is not None:  # a caller may have closed it
-            sys.stdout.flush()
+        out.flush()
     except OSError as fault:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # it is written once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())  # it is written once more
         if not isinstance(fault, BrokenPipeError):
             print(f"standard output: {fault.strerror}", file=sys.stderr)
         return status or 1
