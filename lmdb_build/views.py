@@ -9,6 +9,7 @@ places of few runs.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -186,7 +187,7 @@ def write_views(
         for image, name in zip(pair, names, strict=True):
             picture = read_bgr(root / runs.names[image])
             view = cut_view(np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture, size, about, rng)
-            other = read_bgr(root / runs.names[rng.integers(len(runs.names))])
+            other = partial(read_bgr, root / runs.names[rng.integers(len(runs.names))])  # few views need it
             write_jpeg(folder.parent / name, change_light(view, other, rng, calm))
         listed.append((*names, int(same[number])))
     out = folder.with_name(f"{folder.name}.txt")

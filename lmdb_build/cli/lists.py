@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lmdb_build.cli.arguments import seed
 from lmdb_build.pairs.contact_sheet import write_contact_sheet
 from lmdb_build.pairs.list_file import join_lists, root_of
+from loopclosure.options import seed
 from netspec.command_line import Commands
 
 

@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-from lmdb_build.cli.arguments import above_zero, next_command, seed
+from lmdb_build.cli.arguments import next_command
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_list import (
@@ -22,6 +22,7 @@ from lmdb_build.pairs.by_list import (
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
 from loopclosure.descriptors.feature_file import read_features
+from loopclosure.options import above_zero, seed
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
 from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M

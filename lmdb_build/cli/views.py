@@ -6,10 +6,11 @@ import argparse
 import os
 from pathlib import Path
 
-from lmdb_build.cli.arguments import next_command, seed, size
+from lmdb_build.cli.arguments import next_command, size
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
 from lmdb_build.views import Batches, write_views
+from loopclosure.options import above_zero, seed
 from netspec.command_line import Commands, WrongUsage
 
 
@@ -21,7 +22,7 @@ def add_to(commands: Commands) -> None:
     add("--index", type=Path, metavar="CSV", help="a table of frames, with --track and --time")
     add("--track", metavar="COLUMN", help="column of --index that names the run")
     add("--time", metavar="COLUMN", help="column of --index with the position in the run")
-    add("--step", type=float, default=1.0, help="seconds between two images of a FOLDER (1)")
+    add("--step", type=above_zero, default=1.0, help="seconds between two images of a FOLDER (1)")
     add("--batches", type=int, default=400, help="how many batches (400)")
     add("--size", type=int, default=48, help="pairs per batch, each of a different place (48)")
     add("--per-track", type=int, default=8, help="at most this many of them from one run (8)")
@@ -40,8 +41,6 @@ def _views(arguments: argparse.Namespace) -> None:
         raise WrongUsage("name folders, or --index, or both")
     if arguments.index and not (arguments.track and arguments.time):
         raise WrongUsage("--index needs --track and --time")
-    if arguments.step <= 0:
-        raise WrongUsage(f"--step must be more than 0, not {arguments.step:g}")
     tables = [arguments.index.parent] if arguments.index else []
     root = Path(os.path.commonpath([folder.resolve() for folder in arguments.folders + tables]))
     parts = [folder_runs(arguments.folders, root, arguments.step)] if arguments.folders else []

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lmdb_build.cli.arguments import seed, size
+from lmdb_build.cli.arguments import size
 from lmdb_build.cli.bar import bar
 from lmdb_build.walk.sequence import Walk, write_walk
+from loopclosure.options import seed
 from netspec.command_line import Commands, WrongUsage
 
 SEASON_S = 1_000_000.0  # between the time stamps of two seasons of one walk

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loopclosure.cli.run import WrongUsage, above_zero, show_progress, warn
+from loopclosure.cli.run import WrongUsage, show_progress, warn
+from loopclosure.options import above_zero
 from loopclosure.places import datasets
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from loopclosure import evaluate
 from loopclosure.cli.data_set import add_data_set, add_selection, data_set, selection
-from loopclosure.cli.run import Commands, seed, show_progress
+from loopclosure.cli.run import Commands, show_progress
 from loopclosure.methods.base import METHODS, MethodContext
+from loopclosure.options import seed
 from loopclosure.places.frames import image_paths
 
 

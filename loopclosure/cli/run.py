@@ -1,4 +1,4 @@
-"""What commands share: numbers of options, progress bars, one line and an exit status for each way to end."""
+"""What every command shares: progress bars, and one line and an exit status for each way in which it can end."""
 
 from __future__ import annotations
 
@@ -90,22 +90,6 @@ def interruptible() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def seed(text: str) -> int:
-    """Read a seed of random numbers, from 0."""
-    value = int(text)
-    if not 0 <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"found {text}, expected a number from 0 to {2**31 - 1}")
-    return value
-
-
-def above_zero(text: str) -> float:
-    """Read a number above 0."""
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"found {text}, expected a number above 0")
-    return value
 
 
 def warn(doubt: str) -> None:
