@@ -47,7 +47,8 @@ def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Grou
     except SpecError as fault:
         raise fault if fault.where else SpecError(named + fault.message, place) from None
     except LIBRARY_FAULTS as fault:
-        reason = pointer_fault_at(path) or f"cannot be read: {_one_line(fault)}"
+        missing = "does not exist" if isinstance(fault, FileNotFoundError) else None
+        reason = missing or pointer_fault_at(path) or f"cannot be read: {_one_line(fault)}"
         raise SpecError(named + reason, place) from None
 
 

@@ -7,7 +7,6 @@ nets of ``prototxt/`` are all there, with fewer iterations.
 import csv
 import re
 import shutil
-import warnings
 from pathlib import Path
 
 import cv2
@@ -215,6 +214,4 @@ def _layouts(folder: Path) -> None:
     rows = places_layouts.tum_rows(places_layouts.path(), places_bags.START_S)
     (folder / "wheels.txt").write_text(rows)
     net = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(4), torch.nn.Flatten())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # old, and what many nets are saved with
-        torch.jit.save(torch.jit.trace(net, torch.rand(1, 3, 120, 160)), folder / "net.pt")
+    torch.export.save(torch.export.export(net.eval(), (torch.rand(1, 3, 120, 160),)), folder / "net.pt2")

@@ -30,7 +30,7 @@ SUPPOSED = {
     "docs/datasets.md": "MH_01_easy dataset drive.bag drive.mp4 slam.txt Nordland",
     "docs/engines.md": "net.prototxt net.caffemodel deploy.prototxt train_lmdb photos",
     "docs/inference.md": "prototxt deploy.prototxt net.caffemodel",
-    "docs/methods.md": "SEQUENCE net.pt A B",
+    "docs/methods.md": "SEQUENCE net.pt2 A B",
     "docs/nets.md": "prototxt a.caffemodel b.caffemodel",
     "docs/paper.md": "prototxt",
     "docs/seeing.md": "train.log old_caffe.log solver.prototxt train_val.prototxt train_lmdb deploy.prototxt "

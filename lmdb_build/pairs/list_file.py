@@ -48,7 +48,7 @@ def write_pair_list(path: Path, pairs: Iterable[tuple[str, str, int]], settings:
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", path) from error
     with whole_file(path) as unfinished:
-        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
 
 def read_pair_list(path: Path) -> list[ListedPair]:
@@ -125,8 +125,11 @@ def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = 
 
 
 def _read_lines(path: Path) -> list[str]:
+    expected = 'expected lines such as "a.png b.png 1"'
     try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise InputError(f'cannot be read ({reason}); expected lines such as "a.png b.png 1"', path) from error
+        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")  # names of files can be any bytes
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror}); {expected}", path) from error
+    if "\0" in text:
+        raise InputError(f"cannot be read (not a text file); {expected}", path)
+    return text.splitlines()

@@ -129,7 +129,10 @@ def write_closed(out: Path, closed: Closed, stamps: np.ndarray | None, names: Se
     kept = [edge for edge, accepted in zip(closed.edges, closed.accepted, strict=True) if accepted]
     edges = [(numbers[e.first], numbers[e.second], e.pose, e.information) for e in [*closed.steps, *kept]]
     write_pose_graph(out / "closed.g2o", dict(zip(numbers, closed.poses, strict=True)), edges)
-    with whole_file(out / "loops.csv") as unfinished, unfinished.open("w", newline="", encoding="utf-8") as stream:
+    with (
+        whole_file(out / "loops.csv") as unfinished,
+        unfinished.open("w", newline="", encoding="utf-8", errors="surrogateescape") as stream,
+    ):
         writer = csv.writer(stream)
         writer.writerow(["query_id", "match_id", "query_name", "match_name", "measured", "inliers", "used"])
         for loop, accepted in zip(closed.loops, closed.accepted, strict=True):

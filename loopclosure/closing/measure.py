@@ -43,7 +43,7 @@ def read_loops(path: Path, names: Sequence[str]) -> list[Loop]:
     numbers = {name: number for number, name in enumerate(names)}
     loops = []
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
+        with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as stream:
             reader = csv.DictReader(stream, restval="")
             missing = {"query_id", "match_id"} - set(reader.fieldnames or ())
             if missing:

@@ -55,7 +55,10 @@ def write_loops_csv(
     """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as stream:
+    with (
+        whole_file(path) as unfinished,
+        unfinished.open("w", newline="", encoding="utf-8", errors="surrogateescape") as stream,
+    ):
         writer = csv.writer(stream)
         writer.writerow(
             ["query_id", "match_id", "score", "inliers", "query_stamp", "match_stamp", "query_name", "match_name"]

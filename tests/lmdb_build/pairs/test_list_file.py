@@ -1,5 +1,6 @@
 """Lists of pairs: as files, warped, with hard negatives, joined, reported and drawn."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -78,6 +79,18 @@ class TestFile:
         write_pair_list(path, [("my photo.png", "#b.png", 1)], {})
         (pair,) = read_pair_list(path)
         assert (pair.first, pair.second) == ("my photo.png", "#b.png")
+
+    def test_a_name_can_be_any_bytes(self, tmp_path: Path) -> None:
+        path = tmp_path / "list.txt"
+        write_pair_list(path, [(os.fsdecode(b"caf\xe9.png"), "b.png", 1)], {})
+        assert b"caf\xe9.png b.png 1\n" in path.read_bytes()
+        assert os.fsencode(read_pair_list(path)[0].first) == b"caf\xe9.png"
+
+    def test_a_file_that_is_no_text(self, tmp_path: Path) -> None:
+        path = tmp_path / "list.txt"
+        path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0")
+        with pytest.raises(InputError, match="not a text file"):
+            read_pair_list(path)
 
     def test_a_name_that_a_list_cannot_hold_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="cannot list the image"):

@@ -1,11 +1,13 @@
 """Loops as CSV and g2o: frames of reference, order of quaternions, and nothing invented."""
 
 import csv
+import os
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from loopclosure.closing.measure import read_loops
 from loopclosure.detector.detector import LoopResult
 from loopclosure.detector.export import Sigmas, relative_pose, write_g2o, write_loops_csv
 from loopclosure.errors import InputError
@@ -88,3 +90,11 @@ def test_csv(tmp_path):
         "match_name": "a.png",
     }
     assert (rows[1]["inliers"], rows[1]["match_stamp"], rows[1]["match_name"]) == ("", "", "b.png")
+
+
+def test_a_name_can_be_any_bytes(tmp_path):
+    names = [os.fsdecode(name) for name in (b"a.png", b"caf\xe9.png")]
+    write_loops_csv(tmp_path / "loops.csv", [loop(1, 0)], names=names)
+    assert b"caf\xe9.png,a.png" in (tmp_path / "loops.csv").read_bytes()
+    (found,) = read_loops(tmp_path / "loops.csv", names)
+    assert (found.query, found.match) == (1, 0)

@@ -178,6 +178,9 @@ def test_weights_of_both_formats_and_odd_values() -> None:
     Path("d.caffemodel").write_bytes(net.SerializeToString())
     with pytest.raises(SpecError, match=r'd\.caffemodel: layer "z": found 1 numbers'):
         list(compare_files("a.caffemodel", "d.caffemodel"))
+    Path("cut.caffemodel").write_bytes(Path("a.caffemodel").read_bytes()[:-5])
+    with pytest.raises(SpecError, match=r"cut\.caffemodel: expected .*, or a truncated file"):
+        list(compare_files("a.caffemodel", "cut.caffemodel"))
 
 
 def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
