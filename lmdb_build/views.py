@@ -30,6 +30,7 @@ SHIFT = 0.2  # a pair's views have a common center; each is shifted by up to thi
 STRETCH = 0.15  # the proportions of the part change by a factor of up to e^0.15
 TURN_DEG = 4.0  # standard deviation
 CORNER = 0.08  # each corner is moved by up to this share of the part's size: perspective
+MOST_VIEWPOINT = 3  # beyond, corners cross
 SMOOTHING = 0.4  # standard deviation of the filter before a part is made smaller, in pixels of the view
 
 
@@ -72,6 +73,25 @@ class Batches:
             raise InputError(
                 f"--apart {self.apart:g} is less than --max-gap {self.max_gap:g}: a batch could have one place twice"
             )
+
+
+@dataclass(frozen=True)
+class Changes:
+    """How the two views of a place differ.
+
+    viewpoint  how strongly the point of view does: zoom, turn and perspective are this many times as strong
+    calm       this share of the views keeps its colors, and what it shows (:func:`lmdb_build.light.change_light`)
+    """
+
+    viewpoint: float = 1.0
+    calm: float = 0.0
+
+    def check(self) -> None:
+        """Raise InputError for numbers that mean nothing."""
+        if not 0 <= self.viewpoint <= MOST_VIEWPOINT:
+            raise InputError(f"--viewpoint must be 0 to {MOST_VIEWPOINT}, not {self.viewpoint:g}")
+        if not 0 <= self.calm <= 1:
+            raise InputError(f"--calm must be 0 to 1, not {self.calm:g}")
 
 
 def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tuple[Indices, Indices, NDArray[np.bool_]]:
@@ -137,19 +157,19 @@ def _partner(runs: Runs, image: int, batches: Batches, rng: np.random.Generator)
 
 
 def cut_view(
-    image: NDArray, size: tuple[int, int], about: NDArray[np.float64], rng: np.random.Generator
+    image: NDArray, size: tuple[int, int], about: NDArray[np.float64], rng: np.random.Generator, viewpoint: float = 1.0
 ) -> NDArray[np.uint8]:
     """Return a view of the image (H, W, 3) uint8 as a nearby camera might see it: (height, width, 3).
 
     ``about`` (2,) is the position of the visible part: 0 at the left (the top), 1 at the right (the bottom). Views
-    about one point overlap at any zoom.
+    about one point overlap at any zoom. ``viewpoint`` is that of :class:`Changes`.
     """
     width, height = size
-    part_h = image.shape[0] * np.exp(rng.uniform(-np.log(ZOOM), 0))
+    part_h = image.shape[0] * np.exp(rng.uniform(-np.log(ZOOM) * viewpoint, 0))
     part_w = min(image.shape[1], part_h * width / height * np.exp(rng.uniform(-STRETCH, STRETCH)))
     part = np.array([part_w, part_h])
-    quad = (CORNERS - 0.5 + rng.uniform(-CORNER, CORNER, (4, 2))) * part
-    cos, sin = np.cos(np.deg2rad(angle := rng.normal(0, TURN_DEG))), np.sin(np.deg2rad(angle))
+    quad = (CORNERS - 0.5 + rng.uniform(-CORNER, CORNER, (4, 2)) * viewpoint) * part
+    cos, sin = np.cos(np.deg2rad(angle := rng.normal(0, TURN_DEG * viewpoint))), np.sin(np.deg2rad(angle))
     quad = quad @ np.array([[cos, -sin], [sin, cos]]) + part / 2
     quad += np.clip(about + rng.uniform(-SHIFT, SHIFT, 2), 0, 1) * (np.array(image.shape[1::-1]) - part)
     if (shrinks := part_h / height) > 1.5:
@@ -160,23 +180,21 @@ def cut_view(
 def write_views(
     runs: Runs,
     batches: Batches,
+    changes: Changes,
     size: tuple[int, int],
     root: Path,
     folder: Path,
     seed: int,
-    calm: float = 0.0,
     progress: Progress = silent,
 ) -> Path:
     """Write two views of ``size`` (width, height) for each pair below ``folder``, and the list ``folder``.txt.
 
-    Both views of a pair are mirrored, or neither is. The share ``calm`` of all views changes less
-    (:func:`lmdb_build.light.change_light`). Raises InputError if batches cannot be made, or an image cannot be
-    read or written.
+    Both views of a pair are mirrored, or neither is. Raises InputError if batches cannot be made, or an image cannot
+    be read or written.
     """
     if seed < 0:
         raise InputError(f"a seed must be 0 or more, not {seed}")
-    if not 0 <= calm <= 1:
-        raise InputError(f"--calm must be 0 to 1, not {calm:g}")
+    changes.check()
     first, second, same = choose_views(runs, batches, np.random.default_rng([seed, 0]))
     folder.mkdir(parents=True, exist_ok=True)
     listed = []
@@ -186,9 +204,11 @@ def write_views(
         names = [f"{folder.name}/{number:06d}_{side}.jpg" for side in "ab"]
         for image, name in zip(pair, names, strict=True):
             picture = read_bgr(root / runs.names[image])
-            view = cut_view(np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture, size, about, rng)
+            view = cut_view(
+                np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture, size, about, rng, changes.viewpoint
+            )
             other = partial(read_bgr, root / runs.names[rng.integers(len(runs.names))])  # few views need it
-            write_jpeg(folder.parent / name, change_light(view, other, rng, calm))
+            write_jpeg(folder.parent / name, change_light(view, other, rng, changes.calm))
         listed.append((*names, int(same[number])))
     out = folder.with_name(f"{folder.name}.txt")
     settings = {
@@ -196,7 +216,8 @@ def write_views(
         "batches": f"{batches.count} of {batches.size} places, up to {batches.per_track} of one run, "
         f"more than {batches.apart:g} apart, in a part of {batches.window:g}",
         "second image": f"a different one in {batches.other:g} of the pairs, up to {batches.max_gap:g} away",
-        "calm": f"{calm:g} of the views",
+        "point of view": f"{changes.viewpoint:g} times as different",
+        "calm": f"{changes.calm:g} of the views",
         "negatives": f"{batches.negatives:g} of the pairs",
         "seed": str(seed),
     }

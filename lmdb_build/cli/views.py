@@ -9,7 +9,7 @@ from pathlib import Path
 from lmdb_build.cli.arguments import next_command, size
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
-from lmdb_build.views import Batches, write_views
+from lmdb_build.views import Batches, Changes, write_views
 from loopclosure.options import above_zero, seed
 from netspec.command_line import Commands, WrongUsage
 
@@ -31,6 +31,7 @@ def add_to(commands: Commands) -> None:
     add("--max-gap", type=float, default=1.0, help="largest distance of the two images of a place, in seconds (1)")
     add("--other", type=float, default=0.4, help="share of pairs that use two images of a place (0.4)")
     add("--negatives", type=float, default=0.0, help="share of pairs of two places, for ContrastiveLoss (0)")
+    add("--viewpoint", type=float, default=1.0, help="how many times as strong zoom, turn and perspective are (1)")
     add("--calm", type=float, default=0.0, help="share of views that keep their colors and what they show (0)")
     add("--view-size", type=size, default=(128, 96), help="size of a view (128x96)")
     add("--seed", type=seed, default=1, help="random seed (1)")
@@ -57,6 +58,7 @@ def _views(arguments: argparse.Namespace) -> None:
         arguments.negatives,
         arguments.window,
     )
-    path = write_views(runs, batches, arguments.view_size, root, arguments.out, arguments.seed, arguments.calm, bar)
+    changes = Changes(arguments.viewpoint, arguments.calm)
+    path = write_views(runs, batches, changes, arguments.view_size, root, arguments.out, arguments.seed, bar)
     print(f"{path}: {arguments.batches} batches of {arguments.size} pairs")
     print(next_command("convert", f"{path.parent}/", path, f"{arguments.out}_lmdb"))

@@ -108,6 +108,18 @@ def test_two_views_about_one_point_overlap() -> None:
     assert centres[1] > centres[0] + 20
 
 
+def test_the_points_of_view_of_a_place_differ_as_strongly_as_asked() -> None:
+    image = cv2.resize(np.random.default_rng(2).integers(0, 255, (12, 16, 3), np.uint8), (320, 240))
+
+    def spread(viewpoint: float) -> float:
+        rng = np.random.default_rng(3)
+        views = [cut_view(image, (64, 48), np.array([0.5, 0.5]), rng, viewpoint) for _ in range(40)]
+        return float(np.std(views, axis=0).mean())
+
+    weak, usual, strong = (spread(viewpoint) for viewpoint in (0.0, 1.0, 2.0))
+    assert weak < 0.7 * usual < 0.7 * strong
+
+
 def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     lines = ["image,run,second"]
@@ -143,6 +155,9 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
 
     assert main([*by_index, "--calm", "2", "--out", str(tmp_path / "five")]) == 1
     assert "--calm must be 0 to 1, not 2" in capsys.readouterr().err
+
+    assert main([*by_index, "--viewpoint", "4", "--out", str(tmp_path / "five")]) == 1
+    assert "--viewpoint must be 0 to 3, not 4" in capsys.readouterr().err
 
     both = [*by_index, folders[0], "--step", "0.5", "--out", str(tmp_path / "both")]
     assert main(both) == 0
