@@ -18,6 +18,11 @@ from torch import Tensor, nn
 from benchmarks.zoo import GOOGLENET, MOBILENET, RESNET50, SQUEEZENET
 
 
+def unit(feat: Tensor) -> Tensor:
+    """Return descriptors (N, neurons) with length 1, as Reduction, Power and Scale make them."""
+    return feat * (feat.square().sum(1, keepdim=True) + 1e-8).rsqrt()
+
+
 class Siamese(nn.Module):
     """One tower of the paper's LeNet-like net, for images (N, 3, size, size)."""
 
@@ -28,10 +33,10 @@ class Siamese(nn.Module):
         self.feat = nn.Linear(500, neurons)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the descriptors (N, neurons)."""
+        """Return the descriptors (N, neurons), of length 1."""
         x = F.max_pool2d(self.conv1(x), 2)
         x = F.max_pool2d(self.conv2(x), 2)
-        return self.feat(F.relu(self.ip1(x.flatten(1))))
+        return unit(self.feat(F.relu(self.ip1(x.flatten(1)))))
 
 
 def conv_bn(inputs: int, outputs: int, size: int = 1, bias: bool = False, **others: Any) -> nn.Sequential:
@@ -67,8 +72,7 @@ class Resnet27(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the descriptors (N, neurons), of length 1."""
-        feat = self.feat(self.stages(x).flatten(1))
-        return feat * (feat.square().sum(1, keepdim=True) + 1e-8).rsqrt()
+        return unit(self.feat(self.stages(x).flatten(1)))
 
 
 class LeNet(nn.Module):

@@ -14,7 +14,7 @@ from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.net.build import load_net
 from netspec.net.weights import load_weights, save_weights
-from netspec.proto.schema import TEST, TRAIN
+from netspec.proto.schema import TEST, TRAIN, LayerParameter
 from netspec.proto.text import parse_net_text, read_net, read_solver
 from paths import ROOT
 
@@ -43,6 +43,10 @@ def bring_here(folder: Path, batch: int, seed: int = 1) -> None:
     Path("solver.prototxt").write_text(solver + "test_initialization: false\n")
 
 
+def layers_of(path: Path) -> dict[str, LayerParameter]:
+    return {layer.name: layer for layer in read_net(path).layer}
+
+
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_the_second_tower_is_the_first_under_other_names(folder: Path) -> None:
     net = read_net(folder / "train_val.prototxt")
@@ -64,7 +68,7 @@ def test_the_second_tower_is_the_first_under_other_names(folder: Path) -> None:
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_deploy_is_the_first_tower(folder: Path) -> None:
-    train = {layer.name: layer for layer in read_net(folder / "train_val.prototxt").layer}
+    train = layers_of(folder / "train_val.prototxt")
     deploy = read_net(folder / "deploy.prototxt")
     assert list(deploy.layer[0].input_param.shape[0].dim) == [1, 3, side(folder), side(folder)]
     assert len(deploy.layer) > 5
@@ -96,15 +100,11 @@ def test_the_residual_net_has_27_convolutions_and_7x7x512_reach_the_features() -
 
 @pytest.mark.parametrize("part", ["", "small/"])
 def test_what_keeps_trainings_from_diverging(part: str) -> None:
-    """Distances start below the margin: a small filler. Those of descriptors of length 1 stay below 2."""
+    """Distances of descriptors of length 1 stay below 2."""
     for name in NETS:
-        layers = {layer.name: layer for layer in read_net(ROOT / f"prototxt/{part}{name}/train_val.prototxt").layer}
-        if "resnet" in name:
-            assert list(layers["feat"].bottom) == ["ip_feat", "feat_inverse"]
-            assert layers["feat_inverse"].power_param.power == -0.5
-        else:
-            filler = layers["feat"].inner_product_param.weight_filler
-            assert (filler.type, filler.std) == ("gaussian", pytest.approx(0.01))
+        layers = layers_of(ROOT / f"prototxt/{part}{name}/train_val.prototxt")
+        assert list(layers["feat"].bottom) == ["ip_feat", "feat_inverse"]
+        assert layers["feat_inverse"].power_param.power == -0.5
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -169,10 +169,23 @@ def test_one_iteration_and_back_into_the_deploy_net(
 
 
 WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
+MORE_WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_768"
 
 
+@pytest.mark.parametrize(
+    ("folder", "descriptors", "layers"),
+    [
+        (WORDS, ("whole", "parts"), ("conv1", "res6b", "words", "layout")),
+        (MORE_WORDS, ("view_whole",), ("view_conv1", "view_res6b", "view_words")),
+    ],
+    ids=["256", "768"],
+)
 def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    descriptors: tuple[str, ...],
+    layers: tuple[str, ...],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
@@ -180,13 +193,13 @@ def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
         for k in range(48):
             pixels = rng.integers(0, 256, (6, 48, 64), dtype=np.uint8)
             writer.put(b"%08d" % k, array_to_datum(pixels, 1).SerializeToString())
-    text = re.sub(r'source: "[^"]*"', 'source: "pairs"', (WORDS / "train_val.prototxt").read_text())
+    text = re.sub(r'source: "[^"]*"', 'source: "pairs"', (folder / "train_val.prototxt").read_text())
     Path("net.prototxt").write_text(text)
     net = load_net("net.prototxt", phase="TRAIN")
     net.keep = "all"
     loss, _ = net.forward_loss()
     expected = 0.0
-    for kind in ("whole", "parts"):
+    for kind in descriptors:
         first, second = (net.blobs[name].detach().double() for name in (kind, f"{kind}_p"))
         np.testing.assert_allclose(first.square().sum(1), 1, rtol=1e-4)
         cosines, own = 15 * first @ second.T, torch.arange(48)
@@ -194,26 +207,42 @@ def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
         expected += np.mean(both_ways)
     np.testing.assert_allclose(loss.item(), expected, rtol=1e-4)
     loss.backward()
-    for name in ("conv1", "res6b", "words", "layout"):
+    for name in layers:
         grad = net.params[name][0].grad
         assert grad is not None, name
         assert grad.abs().max() > 0, name
 
 
-def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
-    train = {layer.name: layer for layer in read_net(WORDS / "train_val.prototxt").layer}
-    deploy = {layer.name: layer for layer in read_net(WORDS / "deploy.prototxt").layer}
-    learned = [name for name, layer in train.items() if layer.param and not name.endswith("_p")]
-    assert len(learned) == 3 * 9 + 2
-    for name in learned:
+@pytest.mark.parametrize(
+    ("folder", "learned", "centering", "length"),
+    [
+        (WORDS, 3 * 9 + 2, ("bn_flat_whole", "bn_flat_parts"), 256 + 25 * 64),
+        (MORE_WORDS, 3 * 10 + 1, ("bn_view_flat",), 256 + 25 * 64 + 512),
+    ],
+    ids=["256", "768"],
+)
+def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too(
+    folder: Path, learned: int, centering: tuple[str, ...], length: int
+) -> None:
+    train, deploy = (layers_of(folder / f"{name}.prototxt") for name in ("train_val", "deploy"))
+    names = [name for name, layer in train.items() if layer.param and not name.endswith("_p")]
+    assert len(names) == learned
+    for name in names:
         assert [p.name for p in train[name].param] == [p.name for p in train[f"{name}_p"].param]
         assert all(p.name for p in train[name].param)
-        if not name.startswith("bn_flat_"):  # they center the descriptors in training alone
+        if name not in centering:  # they center the descriptors in training alone
             assert deploy[name] == train[name]
-    (checked,) = check_file(WORDS / "deploy.prototxt", TEST)
+    (checked,) = check_file(folder / "deploy.prototxt", TEST)
     assert checked.net is not None
     shapes = {name: checked.net.shapes[name] for name in checked.net.plan.outputs}
-    assert shapes == {"feat": (1, 256 + 25 * 64)}
+    assert shapes == {"feat": (1, length)}
+
+
+def test_the_net_of_768_words_contains_the_net_of_256() -> None:
+    small, large = (layers_of(folder / "deploy.prototxt") for folder in (WORDS, MORE_WORDS))
+    for name, layer in small.items():
+        if name != "feat":
+            assert large[name] == layer
 
 
 @pytest.mark.slow
