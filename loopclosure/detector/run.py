@@ -200,7 +200,7 @@ def load_describe(specification: str, options: dict[str, str]) -> Describe:
     if options or isinstance(target, type):
         try:
             target = target(**{key: _value(text) for key, text in options.items()})
-        except TypeError as error:
+        except (TypeError, ValueError, OSError) as error:
             raise InputError(f"--describe {specification}: {error}") from error
     if not callable(target):
         raise InputError(f"--describe {specification} is a {type(target).__name__}, which cannot be called")

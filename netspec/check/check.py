@@ -26,7 +26,7 @@ from netspec.net.net import Net
 from netspec.net.options import BuildOptions, not_to_be_given
 from netspec.net.recovered import recover_net
 from netspec.net.weights import load_weights
-from netspec.proto.binary import is_net_binary
+from netspec.proto.binary import is_net_binary, split_paths
 from netspec.proto.schema import TEST, NetParameter, PhaseValue, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import parse_net, parse_solver
@@ -139,7 +139,7 @@ def _check_net(
     built = build_net(net, source, options)
     if fault := built.need.fault(most()):
         faults.append(fault)
-    if files := [path.strip() for paths in weights for path in paths.split(",")]:
+    if files := [path for paths in weights for path in split_paths(paths)]:
         load_weights(built, files, manner.strict, report=faults.append)
     advice = [*findings(TEXT, net, source), *findings(PLAN, net, source, built.plan)]
     advice += [] if faults else findings(NET, built)

@@ -13,6 +13,7 @@ from netspec.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
 from netspec.graph.steps import PASSES
+from netspec.proto.binary import split_paths
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -218,8 +219,3 @@ def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:
 
     paths = split_paths(weights) if weights else []
     return with_engine(net, chosen, arguments.model, paths, arguments.level, arguments.stage.split(","))
-
-
-def split_paths(paths: str) -> list[str]:
-    """Return the paths of ``--weights``, which commas separate."""
-    return [path.strip() for path in paths.split(",")]

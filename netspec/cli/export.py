@@ -11,6 +11,7 @@ from netspec import log
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
+from netspec.proto.binary import split_paths
 
 EXPORT = """Write a net in another form, with its weights.
 
@@ -63,7 +64,7 @@ def _add_source(p: argparse.ArgumentParser) -> None:
 def _source(arguments: argparse.Namespace, labels: bool) -> Any:
     from netspec.export.convert import Source
 
-    weights = [Path(path.strip()) for path in arguments.weights.split(",")] if arguments.weights else []
+    weights = [Path(path) for path in split_paths(arguments.weights)] if arguments.weights else []
     if not weights:
         log.logger.warning("no --weights given: the weights are random")
     return Source(

@@ -24,13 +24,13 @@ from netspec.cli.arguments import (
     positive,
     run_by,
     shape,
-    split_paths,
     stages,
 )
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
 from netspec.errors import SpecError
 from netspec.features.views import read_zooms
+from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
 from netspec.whole_file import whole_file, why_unwritable
 

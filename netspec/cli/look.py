@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from netspec.cli.arguments import add_steps, positive, shape, split_paths
+from netspec.cli.arguments import add_steps, positive, shape
 from netspec.cli.run import Commands
 from netspec.command_line import WrongUsage
 from netspec.errors import SpecError, Where, did_you_mean
+from netspec.proto.binary import split_paths
 
 if TYPE_CHECKING:
     from netspec.features.images import ImageNet

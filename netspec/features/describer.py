@@ -11,14 +11,16 @@ from netspec.engines.choice import Choice
 from netspec.features.images import ImageNet
 from netspec.features.scaling import Steps
 from netspec.features.views import read_zooms
+from netspec.proto.binary import split_paths
 
 
 class Describer:
     """A callable that returns blob ``blob`` of a net for an image given as its blob ``input``.
 
-    The net is the prototxt ``model`` in phase TEST, cut down to what computes the blob; the pixels are scaled as its
-    data layer's transform_param says or, where any of these is given, by ``swap``, ``raw_scale``, ``mean`` and
-    ``scale``, in this order (:class:`netspec.features.scaling.Steps`); each may be text, as on the command line.
+    The net is the prototxt ``model`` in phase TEST, cut down to what computes the blob. ``weights`` are one file, or
+    several with commas between them. The pixels are scaled as its data layer's transform_param says or, where any of
+    these is given, by ``swap``, ``raw_scale``, ``mean`` and ``scale``, in this order
+    (:class:`netspec.features.scaling.Steps`); each may be text, as on the command line.
     ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how many. ``engine`` and ``precision`` say
     what runs the net (docs/engines.md), ``cache`` which folder keeps its model. Raises SpecError for faults of the
     files.
@@ -43,7 +45,9 @@ class Describer:
         steps = Steps.of(mean, scale, raw_scale, swap)
         choice = Choice.of(engine, precision, cache)
         views = read_zooms(zooms)
-        self.image_net = ImageNet(model, [weights], blob, input, device, zooms=views, steps=steps, choice=choice)
+        self.image_net = ImageNet(
+            model, split_paths(weights), blob, input, device, zooms=views, steps=steps, choice=choice
+        )
         self.views = len(self.image_net.zooms)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:

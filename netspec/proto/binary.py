@@ -80,6 +80,11 @@ def parse_net_binary(path: str | Path, upgrade: bool = True) -> tuple[NetParamet
     return upgrade_net(net, source) if upgrade else (net, source)
 
 
+def split_paths(paths: str | Path) -> list[str]:
+    """Return the files of weights that commas separate, as in Caffe's ``--weights``."""
+    return [path.strip() for path in str(paths).split(",")]
+
+
 def is_net_binary(path: str | Path) -> bool:
     """Say whether a file is a .caffemodel, by what it holds: the layers of a net in protobuf's binary form."""
     try:

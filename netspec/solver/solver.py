@@ -27,6 +27,7 @@ from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.segments import missing_tool
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, save_weights, too_large
+from netspec.proto.binary import split_paths
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
@@ -272,7 +273,7 @@ class Solver:
             compiled=self._compiled,
         )
         net = build_net(described.net, described.source, options)
-        files = [path.strip() for paths in self.param.weights for path in paths.split(",")]
+        files = [path for paths in self.param.weights for path in split_paths(paths)]
         for path in files:
             log.info("solver.cpp:72", f"Finetuning from {path}")
         if files:

@@ -96,7 +96,9 @@ def test_describe_by_name(tmp_path, monkeypatch):
         "def make(power, name='x'):\n    return lambda image: image.mean(axis=(0, 1)) ** power\n\n\n"
         "class Row:\n    def __init__(self, row=0):\n        self.row = row\n\n"
         "    def __call__(self, image):\n        return image[self.row, 0]\n\n\n"
-        "number = 3\n"
+        "number = 3\n\n\n"
+        "def refuse(power):\n    raise ValueError(f'{power} is not a power')\n\n\n"
+        "def absent(file):\n    return open(file)\n"
     )
     monkeypatch.chdir(tmp_path)
     image = np.full((4, 4, 3), 3, np.uint8)
@@ -117,6 +119,8 @@ def test_describe_by_name(tmp_path, monkeypatch):
         ("my_describe.py:g", {}, 'has no "g"'),
         ("my_describe.py:number", {}, "cannot be called"),
         ("my_describe.py:make", {"power": "2", "x": "1"}, "unexpected keyword"),
+        ("my_describe.py:refuse", {"power": "2"}, r"--describe my_describe.py:refuse: 2 is not a power"),
+        ("my_describe.py:absent", {"file": "gone"}, r"--describe my_describe.py:absent: .*No such file.*gone"),
     ):
         with pytest.raises(InputError, match=sentence):
             load_describe(specification, options)

@@ -35,6 +35,14 @@ def test_an_image_gets_the_descriptor_that_the_whole_net_gives_it(describe: Desc
         assert np.allclose(describe(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)), expected[k], atol=1e-2)
 
 
+def test_weights_come_from_several_files(describe: Describer) -> None:
+    image = np.random.default_rng(2).integers(0, 256, (28, 28), dtype=np.uint8)
+    both = Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel,sgd_step/init.caffemodel")
+    assert np.array_equal(both(image), describe(image))
+    with pytest.raises(SpecError, match=r"^gone\.caffemodel: cannot be read: No such file"):
+        Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel, gone.caffemodel")
+
+
 def test_images_of_any_size_are_resized(describe: Describer) -> None:
     image = np.random.default_rng(0).integers(0, 256, (60, 90, 3), dtype=np.uint8)
     small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (28, 28))
