@@ -24,7 +24,7 @@ SUPPOSED = {
     "train.txt rgbd_dataset_freiburg1_xyz",
     "netspec/README.md": "train_val.prototxt deploy.prototxt solver.prototxt a.prototxt b.prototxt x.caffemodel "
     "train_lmdb FOLDER train.log old_caffe.log script.py",
-    "prototxt/README.md": "prototxt tum src",
+    "prototxt/README.md": "prototxt tum src FOLDER",
     "docs/closing.md": "prototxt drive.bag wheels.txt",
     "docs/coming-from-opencv.md": "deploy.prototxt face.caffemodel",
     "docs/datasets.md": "MH_01_easy dataset drive.bag drive.mp4 slam.txt Nordland",

@@ -1,4 +1,4 @@
-"""The trained net that the project brings closes the loops of a walk it never saw, better than the simple baselines."""
+"""The trained nets that the project brings close the loops of a walk they never saw, better than a simple baseline."""
 
 import json
 from pathlib import Path
@@ -12,14 +12,19 @@ from paths import ROOT
 
 pytestmark = pytest.mark.slow
 
-WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
+NETS = ROOT / "prototxt" / "many_negatives"
 
 
-def test_the_words_net_is_ahead_of_thumbnails_on_an_unseen_walk(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    [("siamese_words_256", ["siamese_words_256"]), ("siamese_words_768", ["siamese_words_256", "siamese_words_768"])],
+)
+def test_the_words_net_is_ahead_of_thumbnails_on_an_unseen_walk(tmp_path: Path, name: str, weights: list[str]) -> None:
     walk, features, out = tmp_path / "walk_1", tmp_path / "features.npz", tmp_path / "report"
     command = ["walk", str(tmp_path), "--frames", "120", "--laps", "2", "--size", "160x120", "--seed", "77"]
     assert lmdb_build(command) == 0
-    net = ["--model", str(WORDS / "deploy.prototxt"), "--weights", str(WORDS / "siamese_words_256.caffemodel")]
+    files = ",".join(str(NETS / each / f"{each}.caffemodel") for each in weights)
+    net = ["--model", str(NETS / name / "deploy.prototxt"), "--weights", files, "--strict"]
     assert netspec(["extract", *net, "--blob", "feat", "--images", str(walk), "--out", str(features)]) == 0
     methods = ["--method", "thumbnails", "--method", f"words=features:{features}"]
     assert loopclosure(["evaluate", "--tum", str(walk), "--exclude-seconds", "5", *methods, "--out", str(out)]) == 0
