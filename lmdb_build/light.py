@@ -30,10 +30,10 @@ GRAY = np.array([0.114, 0.587, 0.299], np.float32)  # of blue, green, red: Rec. 
 def change_light(
     view: NDArray[np.uint8], other: Callable[[], NDArray], rng: np.random.Generator, calm: float = 0.0
 ) -> NDArray[np.uint8]:
-    """Return the view (H, W, 3), BGR, as it could look at another time; parts of the picture that
-    ``other`` returns may be in front of it.
+    """Return the view (H, W, 3), BGR, as it could look at another time.
 
-    With the probability ``calm`` it keeps its colors and tones, nothing comes in front of it, and there is no fog.
+    Parts of the picture that ``other`` returns may be in front of it. With the probability ``calm`` it keeps its colors
+    and tones, nothing comes in front of it, and there is no fog.
     """
     x = view.astype(np.float32) / 255
     changes = not (calm and rng.random() < calm)

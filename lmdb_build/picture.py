@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from loopclosure.errors import InputError
+from loopclosure.places.frames import write_picture
 
 JPEG_QUALITY = 95
 DEPTH_PER_M = 5000
@@ -29,8 +29,7 @@ def seen_through(
 
 def write_jpeg(path: Path, picture: NDArray) -> None:
     """Write a picture (H, W, 3) uint8, BGR, as JPEG. Raises InputError where it cannot be written."""
-    if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
-        raise InputError("cannot be written", path)
+    write_picture(path, picture, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
 
 
 def write_depth(path: Path, depth: NDArray) -> None:
@@ -39,5 +38,4 @@ def write_depth(path: Path, depth: NDArray) -> None:
     Raises InputError where it cannot be written.
     """
     steps = np.rint(depth * DEPTH_PER_M)
-    if not cv2.imwrite(str(path), np.where(steps < 1 << 16, steps, 0).astype(np.uint16)):
-        raise InputError("cannot be written", path)
+    write_picture(path, np.where(steps < 1 << 16, steps, 0).astype(np.uint16))

@@ -30,7 +30,7 @@ SHIFT = 0.2  # a pair's views have a common center; each is shifted by up to thi
 STRETCH = 0.15  # the proportions of the part change by a factor of up to e^0.15
 TURN_DEG = 4.0  # standard deviation
 CORNER = 0.08  # each corner is moved by up to this share of the part's size: perspective
-MOST_VIEWPOINT = 3  # beyond, corners cross
+MOST_VIEWPOINT = 3  # a part of an eighth of the height; beyond, two views may have little in common
 SMOOTHING = 0.4  # standard deviation of the filter before a part is made smaller, in pixels of the view
 
 

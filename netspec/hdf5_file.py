@@ -47,8 +47,7 @@ def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Grou
     except SpecError as fault:
         raise fault if fault.where else SpecError(named + fault.message, place) from None
     except LIBRARY_FAULTS as fault:
-        missing = "does not exist" if isinstance(fault, FileNotFoundError) else None
-        reason = missing or pointer_fault_at(path) or f"cannot be read: {_one_line(fault)}"
+        reason = pointer_fault_at(path) or f"cannot be read: {_one_line(fault)}"
         raise SpecError(named + reason, place) from None
 
 
@@ -158,6 +157,8 @@ def _parts(path: str) -> list[str]:
 
 
 def _one_line(fault: BaseException) -> str:
+    if isinstance(fault, OSError) and fault.errno:  # HDF5's sentence would have the number three times
+        return os.strerror(fault.errno)
     return " ".join(str(fault).split()) or type(fault).__name__
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from loopclosure.closing.relative import LEAST_INLIERS, Relative, View, relative_view
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_bgr
+from loopclosure.places.frames import read_bgr, read_pixels
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.sequences import ImageSequence
 from loopclosure.progress import Progress, silent
@@ -82,10 +82,8 @@ def measure(
 
 def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     """Read a depth image of TUM's form as meters (height, width), 0 where not known, at the size of its color image."""
-    if not path.is_file():
-        raise InputError("no such image, though depth.txt lists it", path)
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2 or image.dtype != np.uint16:
+    image = read_pixels(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint16:
         raise InputError("is no depth image; expected one channel of 16 bits, 5000 per meter, as of TUM RGB-D", path)
     if image.shape != (height, width):
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST)

@@ -10,7 +10,7 @@ import numpy as np
 
 from loopclosure.errors import InputError
 from loopclosure.places.bags import is_bag, open_bag
-from loopclosure.places.frames import VIDEO_SUFFIXES, video_frames, video_length
+from loopclosure.places.frames import VIDEO_SUFFIXES, video_frames, video_length, write_picture
 from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.pose_files import DIRECTIONS, FORMS, ORDERS
 from loopclosure.places.trajectory import Frame, Trajectory, write_groundtruth, write_rgb_list
@@ -94,7 +94,6 @@ def _write_images(folder: Path, images: Iterable[tuple[float, np.ndarray]]) -> l
     frames = []
     for number, (stamp, image) in enumerate(images):
         frame = Frame(stamp, f"rgb/{number:06d}.png")
-        if not cv2.imwrite(str(folder / frame.path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise InputError("cannot be written", folder / frame.path)
+        write_picture(folder / frame.path, image, cv2.IMWRITE_PNG_COMPRESSION, 1)
         frames.append(frame)
     return frames

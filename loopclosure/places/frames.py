@@ -82,6 +82,16 @@ def read_pixels(path: str | Path, mode: int) -> np.ndarray:
     return image
 
 
+def write_picture(path: Path, image: np.ndarray, *settings: int) -> None:
+    """Write an image in the form that its name's ending says, with OpenCV's settings. Raises InputError."""
+    # Encoded by OpenCV, written by Python: imwrite ends the process where a path is not UTF-8.
+    _, data = cv2.imencode(path.suffix, image, settings)
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", path) from None
+
+
 def is_cut_png(data: bytes) -> bool:
     """Return whether data is that of a PNG file with a part that announces more than there is.
 
@@ -93,9 +103,17 @@ def is_cut_png(data: bytes) -> bool:
     return at > len(data)
 
 
+def _capture(path: str | Path) -> cv2.VideoCapture:
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:  # it would end the process
+        raise InputError("OpenCV opens no video whose path is not UTF-8; rename it", path) from None
+    return cv2.VideoCapture(str(path))
+
+
 def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     """Yield (seconds from the start, image (H, W, 3) uint8 BGR) for each frame of a video file."""
-    capture = cv2.VideoCapture(str(path))
+    capture = _capture(path)
     if not capture.isOpened():
         if Path(path).is_dir():
             raise InputError("is a folder, and neither a video nor a ROS bag (which has a metadata.yaml)", path)
@@ -117,7 +135,7 @@ def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
 
 def video_length(path: str | Path) -> int | None:
     """Return the number of frames that a video file says it has, None if it does not say."""
-    capture = cv2.VideoCapture(str(path))
+    capture = _capture(path)
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
     capture.release()
     return count if count > 0 else None

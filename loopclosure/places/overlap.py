@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopclosure.errors import InputError
+from loopclosure.places.frames import read_pixels
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.same_place import distances_m, view_angles_deg
 from loopclosure.places.trajectory import Poses, rotation_matrices
@@ -90,8 +91,8 @@ def views(poses: Poses, depth_images: Sequence[Path | None] = ()) -> Views:
     for i, path in enumerate(depth_images):
         if path is None:
             continue
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
+        depth = read_pixels(path, cv2.IMREAD_UNCHANGED)
+        if depth.dtype != np.uint16 or depth.ndim != 2:
             raise InputError("is not a depth image; expected one channel of 16 bits, 5000 per meter", path)
         y = ((np.arange(rows) + 0.5) / rows * depth.shape[0]).astype(int)
         x = ((np.arange(columns) + 0.5) / columns * depth.shape[1]).astype(int)

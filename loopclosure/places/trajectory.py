@@ -162,7 +162,7 @@ def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame], what: 
     lines = [f"# {what}", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
     lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
     with whole_file(Path(path)) as unfinished:
-        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="surrogateescape")
+        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> None:

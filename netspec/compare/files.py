@@ -38,7 +38,7 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
 def _read(path: str | Path) -> tuple[Any, ...]:
     """Return the kind of a file; of a net and a solver also the message and its places."""
     named = Path(path).suffix in (".caffemodel", ".h5")  # a damaged one too: its own reader says what is wrong
-    if named or is_net_binary(path) or (Path(path).is_file() and h5py.is_hdf5(path)):
+    if Path(path).is_file() and (named or is_net_binary(path) or h5py.is_hdf5(path)):
         return (WEIGHTS,)
     try:
         return (NET, *parse_net(path))

@@ -1,11 +1,13 @@
 """Sources of frames: order, selection, and what is said of broken ones."""
 
+import os
+
 import cv2
 import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import Selection, image_paths, read_bgr, video_frames, video_length
+from loopclosure.places.frames import Selection, image_paths, read_bgr, video_frames, video_length, write_picture
 
 
 @pytest.mark.parametrize(
@@ -89,3 +91,19 @@ def test_video(tmp_path):
         next(iter(video_frames(tmp_path / "none.avi")))
     with pytest.raises(InputError, match="is a folder, and neither a video nor a ROS bag"):
         list(video_frames(tmp_path))
+
+
+def test_a_video_whose_name_is_not_utf8_is_refused(tmp_path):
+    for read in (video_length, lambda path: next(video_frames(path))):
+        with pytest.raises(InputError, match="no video whose path is not UTF-8; rename it"):
+            read(tmp_path / os.fsdecode(b"caf\xe9.mp4"))
+
+
+def test_pictures_are_written_into_a_folder_of_any_name(tmp_path):
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    folder.mkdir()
+    image = np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8)
+    write_picture(folder / "a.png", image, cv2.IMWRITE_PNG_COMPRESSION, 1)
+    assert np.array_equal(read_bgr(folder / "a.png"), image)
+    with pytest.raises(InputError, match="cannot be written: No such file or directory"):
+        write_picture(folder / "nowhere" / "a.png", image)
