@@ -81,10 +81,11 @@ class GeometricCheck:
         points = a.points[matches[:, 0]], b.points[matches[:, 1]]
         if self.focal_px:
             camera = np.array([[self.focal_px, 0, self.center_x_px], [0, self.focal_px, self.center_y_px], [0, 0, 1]])
-            _, mask = cv2.findEssentialMat(*points, camera, cv2.RANSAC, self.confidence, self.max_error_px)
+            matrix, mask = cv2.findEssentialMat(*points, camera, cv2.RANSAC, self.confidence, self.max_error_px)
         else:
-            _, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, self.max_error_px, self.confidence)
-        return 0 if mask is None else int(np.count_nonzero(mask))
+            matrix, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, self.max_error_px, self.confidence)
+        # Without a matrix OpenCV 5.0.0 does not fill in the mask. Of several solutions the mask says nothing.
+        return 0 if matrix is None or matrix.shape != (3, 3) else int(np.count_nonzero(mask))
 
     def accepts(self, inliers: int) -> bool:
         """Return whether this many inliers are enough."""

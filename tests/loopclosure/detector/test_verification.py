@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.verification import GeometricCheck
+from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 
 
@@ -93,3 +93,23 @@ def test_the_detector_asks_for_geometry_last(tmp_path, check):
         assert right.inliers > 3 * check.min_inliers
     with pytest.raises(InputError, match="needs the images"):
         detector.add_descriptor(np.ones(2))
+
+
+@pytest.mark.parametrize("camera", [{}, {"focal_px": 260.0, "center_x_px": 160.0, "center_y_px": 120.0}])
+@pytest.mark.parametrize("count", [8, 9, 10, 30])
+def test_without_a_matrix_nothing_agrees(monkeypatch, camera, count):
+    """OpenCV may return no matrix, and then a mask that it has not filled in."""
+    for name in ("findFundamentalMat", "findEssentialMat"):
+        monkeypatch.setattr(cv2, name, lambda a, *_: (None, np.full((len(a), 1), 205, np.uint8)))
+    points = np.random.default_rng(0).uniform(0, 200, (count, 2)).astype(np.float32)
+    local = LocalFeatures(points, np.eye(count, 128, dtype=np.uint8) * 200)
+    check = GeometricCheck(**camera)
+    assert len(check.matches(local, local)) == count
+    assert check.inliers(local, local) == 0
+
+
+def test_eight_points_on_a_line_do_not_agree(check):
+    along = np.linspace(10, 200, 8)
+    line = LocalFeatures(np.column_stack([along, along]).astype(np.float32), np.eye(8, 128, dtype=np.uint8) * 200)
+    assert cv2.findFundamentalMat(line.points, line.points, cv2.FM_RANSAC, 2.0, 0.985)[0] is None
+    assert check.inliers(line, line) == 0
