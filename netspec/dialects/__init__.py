@@ -58,6 +58,7 @@ from netspec.errors import SpecError, Where
 from netspec.proto.dialect.files import DialectFile, announce_known, find_file, read_dialect
 from netspec.proto.dialect.registry import activate, active, deactivate, known
 from netspec.proto.lexer import NAME, STRING, Lexer
+from netspec.proto.schema import caffe_names
 
 __all__ = ["use_dialect", "use_dialects_of"]
 
@@ -89,10 +90,11 @@ def use_dialect(name: str | Path) -> None:
 def use_dialects_of(text: str, file: str) -> list[str]:
     """Switch on the dialects whose fields or layer types a prototxt has; return their names.
 
-    The dialect that has most of them comes first; what it has is not looked for in others. ``file`` is what errors call
-    the text. Raises SpecError for text that is no prototxt at all.
+    The dialect that has most of them comes first; what it has is not looked for in others. A name that Caffe has too,
+    in whichever message (``bias_filler``), switches nothing on. ``file`` is what errors call the text. Raises SpecError
+    for text that is no prototxt at all.
     """
-    words = _words(text, file)
+    words = _words(text, file) - caffe_names()
     announce_known()
     own = {d.name: {field for _, field in d.fields()} | set(d.layer_types) for d in known()}
     for name in active():

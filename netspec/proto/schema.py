@@ -8,6 +8,7 @@ how to compile it; ``caffe_pb2.pyi`` is made with it and gives the fields to typ
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +59,13 @@ def message(name: str) -> type[CaffeMessage]:
     """
     found: Any = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))
     return found
+
+
+@cache
+def caffe_names() -> frozenset[str]:
+    """Return the names of the fields of Caffe's own messages."""
+    messages = pool.FindFileByName("caffe.proto").message_types_by_name.values()
+    return frozenset(field.name for found in messages for field in found.fields)
 
 
 if TYPE_CHECKING:

@@ -18,6 +18,7 @@ from netspec.layers import layer_class, layer_types
 from netspec.proto.dialect import files as dialect_files
 from netspec.proto.dialect import registry as dialect
 from netspec.proto.dialect.files import find_file, known_files, read_dialect
+from netspec.proto.schema import caffe_names
 from netspec.proto.text import parse_net_text
 from paths import ROOT
 
@@ -276,6 +277,18 @@ def test_a_prototxt_switches_on_what_it_needs(files_afresh: None) -> None:
 def test_a_prototxt_of_caffes_own_layers_switches_on_nothing(files_afresh: None) -> None:
     text = 'layer { name: "Normalize" type: "ReLU" bottom: "Permute" top: "Swish" }'  # names, not types
     assert use_dialects_of(text, "x.prototxt") == []
+
+
+def test_a_name_that_caffe_has_too_switches_on_nothing(files_afresh: None) -> None:
+    before = layer_class("BatchNorm")
+    text = 'layer { type: "Convolution" convolution_param { num_output: 1 bias_filler { type: "constant" } } }'
+    assert use_dialects_of(text, "x.prototxt") == []
+    dialect_files.announce_known()
+    for each in dialect.known():
+        words = " ".join(f"{name}: 1" for _, name in each.fields() if name in caffe_names())
+        assert use_dialects_of(f"some_param {{ {words} }}", "x.prototxt") == [], each.name
+    assert layer_class("BatchNorm") is before
+    assert use_dialects_of(text.replace("num_output", "scale_bias: true num_output"), "x.prototxt") == ["nvidia"]
 
 
 def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None:
