@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from loopclosure.report.table_one import read_runs, text_table, write_report
+from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.graph.filter import filter_net, with_state
 from netspec.proto.schema import TEST, TRAIN
@@ -74,15 +75,24 @@ def read_entry(path: str) -> Entry:
             f'its ContrastiveLoss "{losses[0].name}" has no top; name one, so that tests show the loss',
             Where(solver.net),
         )
-    sources = {}
+    sources: dict[str, dict[str, str]] = {}
     for kind, phase in PHASES.items():
-        filtered, _ = filter_net(with_state(net, phase), source)
-        sources[kind] = {
-            layer.name: layer.data_param.source for layer in filtered.layer if layer.HasField("data_param")
-        }
+        with log.silent():  # about the layers that belong to the other phase
+            filtered, places = filter_net(with_state(net, phase), source)
+        readers = [i for i, layer in enumerate(filtered.layer) if layer.HasField("data_param")]
+        sources[kind] = {filtered.layer[i].name: filtered.layer[i].data_param.source for i in readers}
     if len(sources["train"]) != len(sources["validation"]):
         found = " and ".join(f"{len(layers)} in {kind}" for kind, layers in sources.items())
         raise SpecError(f"found data layers: {found}; expected the same number in both phases", Where(solver.net))
+    trained = {os.path.realpath(database) for database in sources["train"].values()}
+    for i in readers:  # of the last kind, validation
+        layer = filtered.layer[i]
+        if os.path.realpath(layer.data_param.source) in trained:
+            message = (
+                f'phase TEST reads "{layer.data_param.source}", which the net is trained on: its pairs are no '
+                "validation pairs; give phase TEST a data layer with another database"
+            )
+            raise SpecError(message, places.at(i, "data_param", "source", layer=layer.name, type=layer.type))
     return Entry(
         solver=path,
         net=solver.net,

@@ -94,7 +94,7 @@ def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
     makers = {v: i for i, node in enumerate(plan.nodes) for v in node.tops}
     for node in plan.nodes if _is_training(plan) else ():
         i = makers.get(node.bottoms[0], -1) if node.type == "BatchNorm" and node.bottoms else -1
-        for name, param in _own_settings(plan.net.layer[i]) if i >= 0 else ():
+        for name, param in own_settings(plan.net.layer[i]) if i >= 0 else ():
             fields = fields_of(param.DESCRIPTOR)
             if "weight_filler" in fields and "bias_term" in fields and param.bias_term:
                 message = f'its bias is subtracted again by BatchNorm "{node.name}"; set bias_term: false'
@@ -132,7 +132,7 @@ def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
     for i, node in enumerate(plan.nodes if _is_training(plan) else ()):
         if node.params and (node.params[0].owner or not node.params[0].lr_mult):
             continue
-        for name, param in _own_settings(plan.net.layer[i]):
+        for name, param in own_settings(plan.net.layer[i]):
             fields = fields_of(param.DESCRIPTOR)
             if "weight_filler" in fields and not fields["weight_filler"].present(param):
                 yield _place(plan, i, name), 'its weights begin at 0; add weight_filler { type: "xavier" } or another'
@@ -232,7 +232,7 @@ def _is_training(plan: Plan) -> bool:
     return plan.net.state.phase == TRAIN and has_loss
 
 
-def _own_settings(layer: Any) -> Iterator[tuple[str, Any]]:
+def own_settings(layer: Any) -> Iterator[tuple[str, Any]]:
     """Yield a layer's settings of its own: the names of its fields and their messages."""
     for name, field in fields_of(layer.DESCRIPTOR).items():
         if name.endswith("_param") and not field.repeated and field.present(layer):

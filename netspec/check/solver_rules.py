@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from netspec.check.findings import SETTINGS, SOLVER, Said, rule
+from netspec.check.net_rules import own_settings
 from netspec.net.net import Net
 from netspec.proto.source_map import Place
 
@@ -81,6 +83,34 @@ def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
                     message = f"{found} {records} records; set test_iter: {-(-records // batch)}"
                     yield node.find("test_iter", k), message
                 break
+
+
+@rule("tested-on-training-data", SOLVER)
+def _same_data(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+    """A test over what the net learns from does not say how good it is on anything else.
+
+    A data layer without a phase is read in phase TEST too: by `netspec test`, or by `lmdb-build compare`.
+    """
+    trained = {os.path.realpath(source): layer for _, layer, _, source in _sources(nets[0])} if nets else {}
+    for net in nets[1:]:
+        for i, layer, field, source in _sources(net):
+            if os.path.realpath(source) in trained:
+                place = net.plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
+                yield place, f'the test reads "{source}", which the net is trained on; name another database'
+    if len(nets) == 1 and (solver.net or solver.HasField("net_param")):
+        for i, layer, field, source in _sources(nets[0]):
+            if not layer.include and not layer.exclude:
+                place = nets[0].plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
+                message = f'a test would read "{source}" too, which the net is trained on; give phase TEST a data layer'
+                yield place, message
+
+
+def _sources(net: Net) -> Iterator[tuple[int, Any, str, str]]:
+    """Yield number, layer, settings and source of the layers that read a database or a list."""
+    for i, layer in enumerate(net.plan.net.layer):
+        for name, param in own_settings(layer) if not layer.bottom else ():
+            if source := getattr(param, "source", ""):
+                yield i, layer, name, source
 
 
 @rule("untrained-in-test", SOLVER)

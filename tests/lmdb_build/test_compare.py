@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -154,6 +155,24 @@ def test_a_net_that_is_not_siamese(folder: Path) -> None:
     net.write_text(text.replace('top: "loss"', ""))
     with pytest.raises(SpecError, match='its ContrastiveLoss "loss" has no top'):
         read_entry(SOLVER)
+
+
+def test_pairs_of_the_training_are_no_validation_pairs(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    net = Path("sgd_step/train_val.prototxt")
+    text = net.read_text()
+    train, test = re.findall(r'source: "(.*?)"', text)
+    line = text[: text.rindex("source:")].count("\n") + 1
+    for same in (train, f"./{train}/"):
+        net.write_text(text.replace(f'"{test}"', f'"{same}"'))
+        for words in ([], ["--no-train"]):
+            said = fault(capfd, *words)
+            assert said.startswith(f"{net}:{line}:")
+            assert f'phase TEST reads "{same}", which the net is trained on' in said
+    first, second, rest = text.split('name: "pair_data"\n')
+    both = second.replace("include { phase: TRAIN }", "").rpartition("layer {")[0]
+    net.write_text(f'{first}name: "pair_data"\n{both}{rest[rest.index("layer {") :]}')
+    assert f'phase TEST reads "{train}"' in fault(capfd)
+    assert "NetState" not in capfd.readouterr().err
 
 
 def test_an_interrupt_lets_the_training_end_with_a_snapshot(edited: Callable[..., None]) -> None:

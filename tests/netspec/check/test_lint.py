@@ -1,5 +1,6 @@
 """What ``check`` warns of, rule by rule: said where it stands, and not said where all is well."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +24,17 @@ SHARED = ('param { name: "w" } param { name: "b" }',) * 2
 def siamese(params: tuple[str, ...] = SHARED, extra: str = "", source: str = "nowhere") -> str:
     towers = "".join(TOWER % {"k": k, "in": blob, "param": p} for k, blob, p in zip("12", "ab", params, strict=True))
     return DATA % source + towers + LOSS + extra
+
+
+def in_phases(net: str) -> str:
+    """A net with its data layer twice: one for TRAIN, from another database, and as it is for TEST."""
+    data, cut, rest = net.partition('layer { name: "cut"')
+    source = re.search('source: "(.*)"', data)
+    other = data.replace(source[1], str(GOLDEN / "pairs" / "train_lmdb")) if source else data
+    both = (
+        f"{each.rstrip()[:-1]}include {{ phase: {phase} }} }}" for each, phase in ((data, "TEST"), (other, "TRAIN"))
+    )
+    return " ".join(both).replace("\n", " ") + f"\n\n{cut}{rest}"
 
 
 @pytest.fixture
@@ -116,21 +128,34 @@ SOLVER = 'base_lr: 0.1 lr_policy: "fixed" max_iter: 100 snapshot_prefix: "s"\n'
 
 
 def test_nothing_is_said_of_a_sound_solver(advice: Callable[..., list[str]]) -> None:
-    assert advice(siamese(), SOLVER + "snapshot: 50") == []
+    assert advice(in_phases(siamese()), SOLVER + "snapshot: 50") == []
+
+
+def test_a_test_on_what_the_net_is_trained_on(advice: Callable[..., list[str]]) -> None:
+    source = str(GOLDEN / "pairs" / "train_lmdb")
+    tested = SOLVER + "test_interval: 10\ntest_iter: 30\n"
+    told = 'layer "d" (Data): the test reads "%s", which the net is trained on; name another database'
+    assert [line.partition(": ")[2] for line in advice(in_phases(siamese(source=source)), tested)] == [told % source]
+    same = siamese(source=source)
+    assert f"net.prototxt:2:16: {told % source}" in advice(same, tested, open_data=True)
+    assert advice(same, SOLVER) == [
+        f'net.prototxt:2:16: layer "d" (Data): a test would read "{source}" too, which the net is trained on; '
+        "give phase TEST a data layer"
+    ]
 
 
 def test_no_snapshot_is_ever_taken(advice: Callable[..., list[str]]) -> None:
     without = SOLVER + "snapshot_after_train: false\n"
-    assert advice(siamese(), without + "snapshot: 101") == [
+    assert advice(in_phases(siamese()), without + "snapshot: 101") == [
         "solver.prototxt:4:1: snapshot 101 is more than max_iter 100: no effect; make it smaller"
     ]
-    assert advice(siamese(), SOLVER + "snapshot: 101") == [
+    assert advice(in_phases(siamese()), SOLVER + "snapshot: 101") == [
         "solver.prototxt:3:1: snapshot 101 is more than max_iter 100: no effect; make it smaller"
     ]
-    assert advice(siamese(), without) == [
+    assert advice(in_phases(siamese()), without) == [
         "solver.prototxt: no snapshot is taken; set snapshot, or snapshot_after_train: true"
     ]
-    assert advice(siamese(), without + "snapshot: 100") == []
+    assert advice(in_phases(siamese()), without + "snapshot: 100") == []
 
 
 @pytest.mark.parametrize(
@@ -147,7 +172,7 @@ def test_no_snapshot_is_ever_taken(advice: Callable[..., list[str]]) -> None:
 def test_settings_that_the_policy_and_the_rule_do_not_read(
     advice: Callable[..., list[str]], settings: str, said: list[str]
 ) -> None:
-    assert advice(siamese(), SOLVER + settings) == [f"solver.prototxt:{line}" for line in said]
+    assert advice(in_phases(siamese()), SOLVER + settings) == [f"solver.prototxt:{line}" for line in said]
 
 
 def test_every_policy_and_rule_finds_its_own_settings_sound(advice: Callable[..., list[str]]) -> None:
@@ -156,7 +181,7 @@ def test_every_policy_and_rule_finds_its_own_settings_sound(advice: Callable[...
         'lr_policy: "inv" gamma: 0.1 power: 1', 'lr_policy: "multistep" gamma: 0.1 stepvalue: 9',
         'lr_policy: "sigmoid" gamma: 0.1 stepsize: 50',
     ):  # fmt: skip
-        assert advice(siamese(), SOLVER.replace('lr_policy: "fixed"', policy)) == []
+        assert advice(in_phases(siamese()), SOLVER.replace('lr_policy: "fixed"', policy)) == []
 
 
 @pytest.mark.parametrize(("iterations", "far"), [(20, False), (19, False), (22, False), (4, True), (64, True)])
@@ -167,5 +192,5 @@ def test_a_test_that_reads_far_more_or_less_than_there_is(
     solver = SOLVER + f"test_interval: 10\ntest_iter: {iterations}"
     read = f"test_iter {iterations} x batch 10 = {10 * iterations}"
     expected = [f'solver.prototxt:4:1: {read}, but layer "d" has 200 records; set test_iter: 20'] if far else []
-    assert advice(siamese(source=source), solver, open_data=True) == expected
-    assert advice(siamese(source=source), solver) == []
+    assert advice(in_phases(siamese(source=source)), solver, open_data=True) == expected
+    assert advice(in_phases(siamese(source=source)), solver) == []
