@@ -153,6 +153,59 @@ def suppress(boxes: Array, threshold: float, eta: float = 1.0) -> list[int]:
     return kept
 
 
+def highest(scores: Array, count: int) -> Array:
+    """Return the indices of the ``count`` highest of scores (n,), in the order in which the fork has them.
+
+    It sorts with libstdc++'s std::sort, which is not stable: which of equal scores come first follows from its
+    partitions. They are repeated where equal scores stand among the highest, or at the cut.
+    """
+    order = np.argsort(-scores, kind="stable")
+    top = scores[order[: count + 1]]
+    if (top[1:] == top[:-1]).any() and not np.isnan(scores).any():
+        order = np.array(_introsorted((-scores).tolist()))
+    return order[:count]
+
+
+def _introsorted(keys: list[float]) -> list[int]:
+    """Return the order of keys that introsort gives, ascending.
+
+    Ranges of more than 16 are partitioned around the median of three; insertion, which is stable, does the rest. The
+    heap sort that follows on 2 log2(n) bad partitions in a row is left out.
+    """
+    order, ranges = list(range(len(keys))), [(0, len(keys))]
+    while ranges:
+        first, last = ranges.pop()
+        while last - first > 16:
+            cut = _partition(keys, order, first, last)
+            ranges.append((cut, last))
+            last = cut
+    return sorted(order, key=keys.__getitem__)
+
+
+def _partition(keys: list[float], order: list[int], first: int, last: int) -> int:
+    """Move what is less than the median of three to the front of a range; return where the rest begins."""
+    middle = first + (last - first) // 2
+    # Which of equal keys is the median decides, as in std::__move_median_to_first.
+    a, b, c = first + 1, middle, last - 1
+    ka, kb, kc = keys[order[a]], keys[order[b]], keys[order[c]]
+    if ka < kb:
+        median = b if kb < kc else c if ka < kc else a
+    else:
+        median = a if ka < kc else c if kb < kc else b
+    order[first], order[median] = order[median], order[first]
+    pivot, low, high = keys[order[first]], first + 1, last
+    while True:
+        while keys[order[low]] < pivot:
+            low += 1
+        high -= 1
+        while pivot < keys[order[high]]:
+            high -= 1
+        if low >= high:
+            return low
+        order[low], order[high] = order[high], order[low]
+        low += 1
+
+
 def suppress_all(boxes: Array, scores: Array, threshold: float, top_k: int) -> Array:
     """Return the indices of the boxes that :func:`suppress` keeps among the ``top_k`` (-1: all) of highest score."""
     order = np.argsort(-scores, kind="stable")

@@ -6,7 +6,7 @@ ComputeAP (src/caffe/util/bbox_util.cpp)
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import torch
 from typing_extensions import override
 
 from netspec import log
-from netspec.dialects._boxes import Array, as_array, overlaps
+from netspec.dialects._boxes import Array, as_array, highest, overlaps
 from netspec.errors import SpecError, Where
 from netspec.layers.base import Layer, Shape
 from netspec.proto.schema import value
@@ -106,7 +106,7 @@ class DetectionEvaluate(Layer):
 
     def _judged(self, found: Array, true: Array, param: Any) -> Iterator[tuple[float, ...]]:
         """Yield the rows of detections of one label in one image, the most confident first."""
-        found = found[np.argsort(-found[:, CONFIDENCE], kind="stable")]
+        found = found[highest(found[:, CONFIDENCE], len(found))]
         table = self._overlaps(found[:, 3:7], true[:, 3:7])
         taken = set[int]()
         for row, own in zip(found, table, strict=True):
@@ -151,10 +151,21 @@ def average_precision(found: Array, true: float, version: str = INTEGRAL) -> flo
     """
     if not len(found) or not true:
         return 0.0
-    right, wrong = found[np.argsort(-found[:, 0], kind="stable")][:, 1:].cumsum(axis=0).T
-    precision, recall = right / (right + wrong), right / true
+    right, wrong = found[np.argsort(-found[:, 0], kind="stable")][:, 1:].cumsum(axis=0, dtype=np.float32).T
+    precision, recall = right / (right + wrong), right / np.float32(true)
     if version == "11point":
-        return float(np.mean([precision[recall >= k / 10].max(initial=0) for k in range(11)]))
+        best = [precision[recall >= k / 10].max(initial=0) for k in range(11)]
+        return _sum([share / np.float32(11) for share in reversed(best)])
     if version == "MaxIntegral":
-        precision = np.maximum.accumulate(precision[::-1])[::-1]
-    return float((np.diff(recall, prepend=0) * precision).sum())
+        # The fork begins at the end, and sums up in that order.
+        precision, steps = np.maximum.accumulate(precision[::-1]), np.diff(recall, prepend=np.float32(0))[::-1]
+        return _sum(steps * precision)
+    return _sum(np.diff(recall, prepend=np.float32(0)) * precision)
+
+
+def _sum(terms: Iterable[np.float32]) -> float:
+    """Return the sum in float32, one term after the other, without the rounding beyond 1."""
+    total = np.float32(0)
+    for term in terms:
+        total += term
+    return min(float(total), 1.0)

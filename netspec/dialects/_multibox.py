@@ -25,6 +25,7 @@ from netspec.dialects._boxes import (
     check_predictions,
     decode,
     encode,
+    highest,
     match,
     outside,
     suppress_all,
@@ -112,11 +113,11 @@ def mine(
         loss = losses[i, eligible]
         if param.HasField("nms_param") and param.nms_param.nms_threshold > 0:
             nms = param.nms_param
-            order = suppress_all(boxes(i)[eligible], loss, nms.nms_threshold, nms.top_k)
+            order = suppress_all(boxes(i)[eligible], loss, nms.nms_threshold, nms.top_k)[:count]
         else:
-            order = np.argsort(-loss, kind="stable")
+            order = highest(loss, count)
         chosen = np.zeros(found.shape[1], bool)
-        chosen[eligible[order[:count]]] = True
+        chosen[eligible[order]] = True
         negative[i] = chosen & (found[i] == NO_MATCH)
         if param.mining_type == HARD_EXAMPLE:
             kept[i, positive & ~chosen] = LEFT_OUT
@@ -234,6 +235,8 @@ class MultiBoxLoss(Layer):
         """Return each prior's label (n, p), and 1 for each of its labels, else 0 (n, p, num_classes).
 
         A prior without a match is the background; but where there is no mining, it has no label at all in the second.
+        There the fork also advances the second by p an image, not by p num_classes: the labels of all images but the
+        first stand at other priors (bbox_util.cpp, the end of EncodeConfPrediction).
         """
         p = self.settings
         labels = np.full((len(truth), self.priors), p.background_label_id)
@@ -244,7 +247,8 @@ class MultiBoxLoss(Layer):
             matched = np.flatnonzero(found[image, kind] > NO_MATCH)
             of_box = truth[image].labels[found[image, kind, matched]]
             labels[image, matched] = p.background_label_id + 1 if p.map_object_to_agnostic else of_box
-            hot[image, matched, labels[image, matched]] = 1
+            start = image * self.priors * (p.num_classes if self.mining else 1)
+            hot.reshape(-1)[start + matched * p.num_classes + labels[image, matched]] = 1
         return labels, hot
 
     def _confidence_losses(self, scores: torch.Tensor, labels: Array, hot: Array) -> torch.Tensor:

@@ -124,6 +124,8 @@ class Oracle:
         mining, background = self.s["mining_type"], self.s["background_label_id"]
         box_total = confidence_total = 0.0
         matches = 0
+        displaced = mining == "NONE" and self.s["conf_loss_type"] == "LOGISTIC"
+        hot_at: set[int] = set()  # without mining the fork lets image i begin at i p, instead of at i p num_classes
         for i in range(len(loc)):
             own = [t for t in truth if t[0] == i and (self.s["use_difficult_gt"] or not t[7])]
             labels: dict[int, set[int]] = {}
@@ -159,7 +161,14 @@ class Oracle:
                 trained = chosen & (set(labels) | set(eligible))
             matches += len(pairs)
             box_total += sum(self.box_loss(loc[i][p][k], own[g], priors[p], variances[p]) for k, p, g in pairs)
+            if displaced:
+                start = i * len(priors)
+                hot_at |= {start + p * CLASSES + label for p, own_labels in labels.items() for label in own_labels}
+                continue
             confidence_total += sum(self.confidence_loss(conf[i][p], hot[p]) for p in trained)
+        for i, p in np.ndindex(len(loc), len(priors)) if displaced else ():
+            first = (i * len(priors) + p) * CLASSES
+            confidence_total += self.confidence_loss(conf[i][p], {c for c in range(CLASSES) if first + c in hot_at})
         count = {"VALID": matches, "FULL": len(loc) * len(priors), "BATCH_SIZE": len(loc), "NONE": 1}[divide]
         return (self.s["loc_weight"] * box_total + confidence_total) / max(1, count)
 
