@@ -15,12 +15,13 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from itertools import takewhile
 from typing import Any
 
 from netspec import log
-from netspec.errors import SpecError
+from netspec.errors import SpecError, did_you_mean
 from netspec.limits import amount, is_out_of_memory, memory
 
 DONE, FAULT, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130  # exit statuses
@@ -32,6 +33,20 @@ TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 
 class WrongUsage(Exception):
     """Arguments that contradict each other."""
+
+
+def refuse(arguments: argparse.Namespace, options: Iterable[str], reason: str) -> None:
+    """Raise WrongUsage if one of the options, named as in the namespace, was typed; ``reason`` ends the sentence."""
+    for name in options:
+        if name in arguments.given:
+            raise WrongUsage(f"--{arguments.given[name]} {reason}")
+
+
+def program(name: str, description: str) -> argparse.ArgumentParser:
+    """Return the parser of a program, which has ``--version``; its commands are added with :class:`Commands`."""
+    made = _Parser(prog=name, description=description)
+    made.add_argument("--version", "-version", nargs=0, action=_Version, help="show the version and exit")
+    return made
 
 
 class Commands:
@@ -50,7 +65,7 @@ class Commands:
         An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. A command that shows no
         log itself sets the default ``log_form`` to None, one whose faults are no FAULT sets ``fault_status``.
         """
-        added = self._parsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        added = self._parsers.add_parser(name, help=summary, description=summary)
         added.set_defaults(run=function, log_level=logging.INFO, log_form=log.GlogFormatter(), fault_status=FAULT)
         added.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
         for name in ("--logtostderr", "--alsologtostderr"):  # it always does
@@ -119,15 +134,44 @@ def interruptible() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-class _GflagsParser(argparse.ArgumentParser):
-    """A parser that also accepts the spellings of gflags."""
+class _Parser(argparse.ArgumentParser):
+    """A parser that knows no abbreviations, and says what a mistyped command was meant to be."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, allow_abbrev=False, **options)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
+            hint = did_you_mean(value, list(action.choices)) or f"; see {self.prog} --help"
+            self.error(f'there is no command "{value}"{hint}')
+        super()._check_value(action, value)
+
+
+class _GflagsParser(_Parser):
+    """The parser of a command: it accepts the spellings of gflags, and keeps in ``given`` which options were typed."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.register("action", "store_true", _Switch)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        return super().parse_known_args([self._translated(word) for word in args or ()], namespace)
+        words = [self._translated(word) for word in args or ()]
+        found, unknown = super().parse_known_args(words, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{self._meant(unknown)}")
+        found.given = {
+            action.dest: word.partition("=")[0].lstrip("-")
+            for word in takewhile(lambda word: word != "--", words)
+            if (action := self._option_string_actions.get(word.partition("=")[0]))
+        }
+        return found, unknown
+
+    def _meant(self, unknown: Sequence[str]) -> str:
+        """Return a hint at the option that is most like the first unknown one."""
+        wrong = next((word for word in unknown if word.startswith("-")), "").partition("=")[0].lstrip("-")
+        names = [name[2:] for name in self._option_string_actions if name.startswith("--")]
+        meant = did_you_mean(wrong, names)
+        return meant.replace('mean "', 'mean "--') if wrong else ""
 
     def _translated(self, word: str) -> str:
         """Return ``-flag`` as ``--flag``, and a Boolean flag as ``--flag`` or ``--noflag``."""
@@ -144,6 +188,16 @@ class _GflagsParser(argparse.ArgumentParser):
         if name.startswith("no-") and name[3:] in switches and not equals:
             return switches[name[3:]].off
         return "--" + word
+
+
+class _Version(argparse.Action):
+    """Show the version, which takes a while to find."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object, **__: object) -> None:
+        from netspec.version import version
+
+        print(f"{parser.prog} {version()}")
+        parser.exit()
 
 
 class _Switch(argparse.Action):

@@ -10,7 +10,7 @@ import cv2
 
 from lmdb_build.cli import compare, convert, lists, pairs, views, walk
 from loopclosure.errors import InputError
-from netspec.command_line import Commands, run
+from netspec.command_line import Commands, program, run
 
 _FAMILIES = (walk, pairs, views, lists, convert, compare)
 
@@ -23,10 +23,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
-    made = argparse.ArgumentParser(
-        prog="lmdb-build",
-        description="From image sequences to labeled pairs, to databases that Caffe reads, to a table of nets.",
-        allow_abbrev=False,
+    made = program(
+        "lmdb-build", "From image sequences to labeled pairs, to databases that Caffe reads, to a table of nets."
     )
     commands = Commands(made)
     for family in _FAMILIES:

@@ -21,7 +21,7 @@ from lmdb_build.databases import (
 )
 from lmdb_build.datasets import convert_cifar, convert_mnist
 from netspec import log
-from netspec.command_line import Commands, WrongUsage
+from netspec.command_line import Commands, WrongUsage, refuse
 from netspec.data.database import BACKENDS, open_reader
 from netspec.data.mean import channel_means, compute_mean, write_mean
 from netspec.errors import Where
@@ -98,6 +98,8 @@ def _convert(
     key: Callable[[int, Entry], str],
     what: str,
 ) -> None:
+    if not arguments.shuffle:
+        refuse(arguments, ("seed",), "is for --shuffle")
     width, height = arguments.resize_width, arguments.resize_height
     if (width > 0) != (height > 0) or min(width, height) < 0:
         raise WrongUsage("-resize_width and -resize_height must both be given, and be above 0")

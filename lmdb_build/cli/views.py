@@ -11,7 +11,7 @@ from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
 from lmdb_build.views import Batches, Changes, write_views
 from loopclosure.options import above_zero, seed
-from netspec.command_line import Commands, WrongUsage
+from netspec.command_line import Commands, WrongUsage, refuse
 
 
 def add_to(commands: Commands) -> None:
@@ -40,7 +40,11 @@ def add_to(commands: Commands) -> None:
 def _views(arguments: argparse.Namespace) -> None:
     if not (arguments.folders or arguments.index):
         raise WrongUsage("name folders, or --index, or both")
-    if arguments.index and not (arguments.track and arguments.time):
+    if not arguments.folders:
+        refuse(arguments, ("step",), "is for folders; --time says when the images of --index were taken")
+    if not arguments.index:
+        refuse(arguments, ("track", "time"), "is a column of --index")
+    elif not (arguments.track and arguments.time):
         raise WrongUsage("--index needs --track and --time")
     tables = [arguments.index.parent] if arguments.index else []
     root = Path(os.path.commonpath([folder.resolve() for folder in arguments.folders + tables]))

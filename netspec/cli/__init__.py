@@ -27,7 +27,7 @@ from netspec.cli import (
     watch,
 )
 from netspec.cli.run import Commands
-from netspec.command_line import run
+from netspec.command_line import program, run
 
 _FAMILIES = (
     *(train, measure, check, draw, diff, fmt, lint, lsp, extract, plot, watch, data, look, export),
@@ -37,32 +37,19 @@ _FAMILIES = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return 0 when done, 1 for an error in the user's files, 2 for wrong usage."""
-    words, program = list(sys.argv[1:] if argv is None else argv), []
+    words, script = list(sys.argv[1:] if argv is None else argv), []
     if words[:1] == [run_script.NAME]:
-        words, program = run_script.split(words)
+        words, script = run_script.split(words)
     made = parser()
-    made.set_defaults(program=program)
+    made.set_defaults(program=script)
     return run(made, words)
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
-    made = argparse.ArgumentParser(
-        prog="netspec", description="Run Caffe's prototxt in PyTorch, with Caffe's numbers.", allow_abbrev=False
-    )
-    made.add_argument("--version", nargs=0, action=_Version, help="show the version and exit")
+    made = program("netspec", "Run Caffe's prototxt in PyTorch, with Caffe's numbers.")
     commands = Commands(made)
     for family in _FAMILIES:
         family.add_to(commands)
     completion.add_to(commands, parser)
     return made
-
-
-class _Version(argparse.Action):
-    """Show the version, which takes a while to find."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object, **__: object) -> None:
-        from netspec.version import version
-
-        print(f"{parser.prog} {version()}")
-        parser.exit()

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from netspec import log
+from netspec.command_line import refuse
 from netspec.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
@@ -74,6 +75,10 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
 
 def choice(arguments: argparse.Namespace) -> Choice:
     """Return the engine that is asked for."""
+    if arguments.engine == TORCH:
+        refuse(arguments, ("cache", "no_cache"), f"is for engines that run exported nets; {TORCH} does not")
+    elif arguments.no_cache:
+        refuse(arguments, ("cache",), "and --no-cache contradict each other")
     return Choice.of(arguments.engine, arguments.precision, False if arguments.no_cache else arguments.cache)
 
 

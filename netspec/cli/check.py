@@ -8,8 +8,10 @@ import sys
 
 from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, stages
 from netspec.cli.run import Commands
+from netspec.command_line import refuse
 from netspec.errors import printable
 from netspec.garbage import no_collection
+from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import PHASES
 
 
@@ -41,6 +43,10 @@ def _check(arguments: argparse.Namespace) -> int:
     from netspec.check.plan import plan_text
     from netspec.net.table import as_json, table
 
+    if not arguments.plan:
+        refuse(arguments, ("passes",), "needs --plan, which prints what they do")
+    elif arguments.json:
+        refuse(arguments, ("plan",), "is not part of the JSON; leave out --json")
     checked = check_file(
         arguments.file,
         phase=PHASES[arguments.phase],
@@ -53,6 +59,12 @@ def _check(arguments: argparse.Namespace) -> int:
         allow_python=arguments.allow_python_layers,
         passes=arguments.passes if arguments.plan else None,
     )
+    if len(checked) > 1:
+        refuse(arguments, ("phase",), "is for a net; of a solver the nets of both phases are checked")
+    elif is_net_binary(arguments.file):
+        refuse(arguments, ("phase", "level", "stage", "weights", "strict"), f"is for a prototxt, not {arguments.file}")
+    elif checked[0].net is not None and not arguments.weights:
+        refuse(arguments, ("strict",), "needs --weights")
     advice = {str(found): found for part in checked for found in part.advice}
     for line in advice:
         print(f"warning: {line}", file=sys.stderr)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from netspec.cli.arguments import bar, positive
 from netspec.cli.run import Commands
-from netspec.command_line import DONE, FAULT, WrongUsage
+from netspec.command_line import DONE, FAULT, WrongUsage, refuse
 from netspec.errors import printable
 
 if TYPE_CHECKING:
@@ -42,8 +42,12 @@ def _data(arguments: argparse.Namespace) -> int:
     from netspec.data.records import open_records, spread
     from netspec.data.survey import survey
 
-    if (arguments.what == SHOW) != bool(arguments.out):
-        raise WrongUsage("`data show` needs --out F.png" if arguments.what == SHOW else "--out is of `data show`")
+    if arguments.what == SHOW:
+        refuse(arguments, ("json",), "is for `data stat`")
+        if not arguments.out:
+            raise WrongUsage("`data show` needs --out F.png")
+    else:
+        refuse(arguments, ("out", "count", "start", "images"), "is for `data show`")
     records = open_records(arguments.source)
     if arguments.start is not None and not 0 <= arguments.start < len(records):
         raise WrongUsage(f"found --start {arguments.start}, expected 0 to {len(records) - 1}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage
+from netspec.command_line import WrongUsage, refuse
 from netspec.proto.schema import PHASES, TEST, TRAIN
 
 FORMATS = (".svg", ".png", ".html")
@@ -30,6 +30,8 @@ def add_to(commands: Commands) -> None:
 def _draw(arguments: argparse.Namespace) -> None:
     if arguments.out.suffix not in FORMATS:
         raise WrongUsage(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
+    if arguments.out.suffix == ".html":
+        refuse(arguments, ("unfold",), "is for .svg and .png; a page shows both")
     from netspec.draw.files import write_picture
 
     faults = write_picture(

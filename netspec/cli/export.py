@@ -10,7 +10,7 @@ from typing import Any
 from netspec import log
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage
+from netspec.command_line import refuse
 from netspec.proto.binary import split_paths
 
 EXPORT = """Write a net in another form, with its weights.
@@ -94,8 +94,12 @@ def _export(arguments: argparse.Namespace) -> None:
         arguments.crop,
         arguments.uint8,
     )
-    if steps.changes_images and arguments.to != "onnx":
-        raise WrongUsage("--crop, --swap, --raw-scale, --mean, --scale and --uint8 need --to onnx")
+    if arguments.to != "onnx":
+        refuse(arguments, ("input", "crop", "swap", "raw_scale", "mean", "scale", "uint8"), "needs --to onnx")
+    elif not steps.changes_images:
+        refuse(
+            arguments, ("input",), "says which input --crop, --swap, --raw-scale, --mean, --scale and --uint8 change"
+        )
     source = _source(arguments, not arguments.no_labels)
     for line in export_net(source, arguments.to, arguments.out, steps if steps.changes_images else None):
         print(f"note: {line}", file=sys.stderr)

@@ -27,7 +27,7 @@ from netspec.cli.arguments import (
     stages,
 )
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage
+from netspec.command_line import WrongUsage, refuse
 from netspec.errors import SpecError
 from netspec.features.views import read_zooms
 from netspec.proto.binary import split_paths
@@ -93,6 +93,8 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.features.images import ImageNet, extract_images
     from netspec.features.scaling import Steps
 
+    records = ("source", "iterations", "phase", "level", "stage", "allow_python_layers")
+    refuse(arguments, records, "is for records; --images are read, and run in phase TEST")
     if len(arguments.blob) != 1:
         raise WrongUsage(f"--images needs exactly one --blob, found {len(arguments.blob)}")
     if arguments.shape and arguments.shape[0] != arguments.input:
@@ -130,10 +132,8 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.net.options import BuildOptions
     from netspec.proto.text import parse_net
 
-    if arguments.swap or arguments.mean is not None or (arguments.scale, arguments.raw_scale) != (1, 1):
-        raise WrongUsage("--swap, --raw-scale, --mean and --scale are of --images; records have a transform_param")
-    if arguments.zooms:
-        raise WrongUsage("--zooms needs --images; the records of a data layer are transformed by its transform_param")
+    images = ("input", "shape", "zooms", "swap", "raw_scale", "mean", "scale")
+    refuse(arguments, images, "is for --images; a data layer's records have its shape and its transform_param")
     message, source = parse_net(arguments.model)
     stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
     stated = with_sources(stated, source, dict(arguments.source))

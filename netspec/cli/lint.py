@@ -8,7 +8,7 @@ import sys
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import Commands
-from netspec.command_line import DONE, SOMETHING, UNREADABLE, WrongUsage
+from netspec.command_line import DONE, SOMETHING, UNREADABLE, WrongUsage, refuse
 
 
 def add_to(commands: Commands) -> None:
@@ -26,6 +26,10 @@ def add_to(commands: Commands) -> None:
 def _lint(arguments: argparse.Namespace) -> int:
     if arguments.rules == bool(arguments.files):
         raise WrongUsage("give files, or --rules")
+    if arguments.rules:
+        refuse(
+            arguments, ("json", "level", "stage", "shape", "data", "allow_python_layers"), "is for files, not --rules"
+        )
     from netspec.check.findings import RULES, said_as_json
     from netspec.check.lint import lint_file
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from netspec.cli.arguments import add_steps, positive, shape
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage
+from netspec.command_line import WrongUsage, refuse
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto.binary import split_paths
 
@@ -104,8 +104,8 @@ def _saliency(arguments: argparse.Namespace) -> None:
     from netspec.pictures.nets import saliency_figure
     from netspec.pictures.style import ending_of, write_figure
 
-    if arguments.to and arguments.unit is not None:
-        raise WrongUsage("give --unit or --to, not both")
+    if arguments.to:
+        refuse(arguments, ("unit",), "and --to exclude each other: a number of the blob, or a distance")
     ending_of(arguments.out, PICTURES)
     net = _net(arguments)
     images = [_image(net, path) for path in (arguments.image, arguments.to) if path]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from netspec.cli.run import Commands
-from netspec.command_line import VARIABLE, WrongUsage
+from netspec.command_line import VARIABLE, WrongUsage, refuse
 
 NAME = "run"
 _WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel", "--limit")
@@ -62,6 +62,8 @@ def _run(arguments: argparse.Namespace) -> None:
 def _install(arguments: argparse.Namespace) -> None:
     from netspec.scripts.environment import install_caffe, make_build_folder
 
+    if arguments.build:
+        refuse(arguments, ("replace",), "is for this Python environment, not for --build")
     for path in make_build_folder(arguments.build) if arguments.build else install_caffe(arguments.replace):
         print(path)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec.cli.run import Commands
-from netspec.command_line import DONE, WrongUsage
+from netspec.command_line import DONE, WrongUsage, refuse
 
 if TYPE_CHECKING:
     from netspec.runs.run import Follower
@@ -39,8 +39,11 @@ def _watch(arguments: argparse.Namespace) -> int:
         raise WrongUsage("give the log of a training, or --solver to start one")
     if not 0 < arguments.every < math.inf:
         raise WrongUsage(f"found --every {arguments.every:g}, expected a number above 0")
+    if arguments.once:
+        refuse(arguments, ("solver", "every"), "is for following a training, not for --once")
     if arguments.solver:
         return _train(arguments)
+    refuse(arguments, ("plugin",), "is for --solver; a log is read as it is")
     follower = Follower(arguments.log)
     follower.poll()
     if arguments.once or not sys.stdout.isatty():

@@ -2,12 +2,14 @@
 
 import argparse
 import logging
+import re
 from collections.abc import Callable
+from importlib import import_module
 
 import pytest
 
 from netspec import cli, log
-from netspec.command_line import Commands, WrongUsage, run
+from netspec.command_line import Commands, WrongUsage, refuse, run
 from netspec.errors import SpecError, Where
 
 
@@ -69,7 +71,7 @@ def test_numbers_may_be_negative() -> None:
     [
         (["-gray=maybe"], "argument --gray: found 'maybe', expected true or false"),
         (["-no-gray=true"], "unrecognized arguments: --no-gray=true"),
-        (["-resize", "64"], "unrecognized arguments: --resize"),
+        (["-resize", "64"], 'unrecognized arguments: --resize; did you mean "--resize_width"?'),
         (["-resize_width=x"], "argument --resize_width: invalid int value: 'x'"),
         (["-color"], "unrecognized arguments: --color"),
     ],
@@ -99,6 +101,38 @@ def test_the_commands_of_netspec_read_boolean_flags_so(name: str, words: list[st
         "extract": ["--model=m", "-blob", "b", "-out", "o"],
     }
     assert cli.parser().parse_args([name, *words, *needed.get(name, [])]).allow_python_layers is value
+
+
+@pytest.mark.parametrize("module", ["netspec.cli", "lmdb_build.cli"])
+def test_a_program_says_its_version_and_what_a_mistyped_command_was_meant_to_be(
+    module: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = import_module(module).parser()
+    for spelling in ("--version", "-version"):
+        assert run(made, [spelling]) == 0
+        assert re.fullmatch(rf"{made.prog} [\w.+]+\n", capsys.readouterr().out)
+    (commands,) = (a for a in made._actions if isinstance(a, argparse._SubParsersAction))
+    for name in commands.choices:
+        assert run(made, [f"{name[:-1]}_{name[-1]}"]) == 2
+        assert capsys.readouterr().err.endswith(
+            f'there is no command "{name[:-1]}_{name[-1]}"; did you mean "{name}"?\n'
+        )
+    assert run(made, ["xyzzy"]) == 2
+    assert capsys.readouterr().err.endswith(f'there is no command "xyzzy"; see {made.prog} --help\n')
+
+
+def test_the_usage_that_is_shown_is_that_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(command(lambda arguments: None), ["convert", "--gary"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("usage: program convert [-h]")
+    assert said.endswith('program convert: error: unrecognized arguments: --gary; did you mean "--gray"?\n')
+
+
+def test_an_option_that_was_typed_can_be_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    made = command(lambda arguments: refuse(arguments, ("gray", "shift"), "is for others"))
+    for words, status in ((["-shift=0"], 2), (["-nogray"], 2), (["--", "--shift"], 0), (["-resize_width", "3"], 0)):
+        assert run(made, ["convert", *words]) == status
+    assert "program convert: error: --shift is for others\n" in capsys.readouterr().err
 
 
 # The log

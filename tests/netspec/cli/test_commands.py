@@ -298,7 +298,7 @@ def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
     ("words", "said"),
     [
         ([], "the following arguments are required: COMMAND"),
-        (["fit"], "invalid choice: 'fit'"),
+        (["fit"], 'there is no command "fit"'),
         (["train"], "netspec train: error: need one solver definition: netspec train solver.prototxt"),
         (["train", "a", "--solver", "b"], "need one solver definition"),
         (

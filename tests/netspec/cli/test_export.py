@@ -201,4 +201,7 @@ def test_folding_needs_weights(net: Net, run: Run) -> None:
 def test_steps_for_images_are_for_onnx(net: Net, run: Run) -> None:
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "n.pt2", "--swap")
     assert result.status == 2
-    assert "need --to onnx" in result.err
+    assert "--swap needs --to onnx" in result.err
+    result = run("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "n.onnx", "--input", "data")
+    assert result.status == 2
+    assert "--input says which input --crop, --swap" in result.err

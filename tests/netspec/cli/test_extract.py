@@ -185,13 +185,31 @@ def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: l
         (["--images", "walk/rgb", "--zooms", "1,x"], 'found zooms "1,x", expected numbers separated by commas'),
         (["--images", "walk/rgb", "--blob", "sim"], "--images needs exactly one --blob, found 2"),
         (["--images", "walk/rgb", "--shape", "x=1,1,9,9"], "--shape names x, expected the input blob data"),
-        (["--zooms", "1,0.5"], "--zooms needs --images"),
+        (
+            ["--zooms", "1,0.5"],
+            "--zooms is for --images; a data layer's records have its shape and its transform_param",
+        ),
+        (["--input", "x"], "--input is for --images"),
+        (["--shape", "data=1,1,9,9"], "--shape is for --images"),
+        (["--mean", "1"], "--mean is for --images"),
+        *(
+            (["--images", "walk/rgb", *words], f"{words[0]} is for records; --images are read, and run in phase TEST")
+            for words in (
+                ["--phase", "TRAIN"],
+                ["--level", "7"],
+                ["--stage", "x"],
+                ["--iterations", "99"],
+                ["--source", "no=/nowhere"],
+                ["--allow-python-layers"],
+            )
+        ),
     ],
 )
 def test_extract_refuses_words_that_do_not_go_together(run: Run, images: Path, words: list[str], fault: str) -> None:
     result = run("extract", *IMAGES, *words)
     assert result.status == 2
     assert fault in result.err.splitlines()[-1]
+    assert not Path("f.npz").exists()
 
 
 def test_extract_knows_no_such_blob(run: Run) -> None:
