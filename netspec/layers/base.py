@@ -274,16 +274,18 @@ class Layer(torch.nn.Module):
     def restart(self) -> None:
         """Return to the first record, where the layer reads any."""
 
-    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
         """Return what the layer remembers from one pass to the next, besides its blobs."""
         return {}
 
     def resume(self, state: Mapping[str, Any]) -> None:
         """Remember what :meth:`running_state` returned. Raises SpecError if that does not fit."""
-        if set(state) != set(self.running_state()):
-            raise self.error(
-                f"found {', '.join(state)} to remember, expected {', '.join(self.running_state()) or 'nothing'}"
-            )
+        found, mine = (
+            ", ".join(f"{name} ({type(value).__name__})" for name, value in sorted(each.items()))
+            for each in (state, self.running_state())
+        )
+        if found != mine:
+            raise self.error(f"found {found} to remember, expected {mine or 'nothing'}")
 
     def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
         """Return what the tops of all batches of a test say together; for layers that gather.

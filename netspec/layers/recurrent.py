@@ -156,7 +156,7 @@ class Recurrent(Layer):
         return (torch.stack(outputs),)
 
     @override
-    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
         return {"state": self.state}
 
     @override

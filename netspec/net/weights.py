@@ -23,6 +23,7 @@ from netspec.graph import Report, raise_fault
 from netspec.hdf5_file import layer_groups, new_hdf5, open_hdf5
 from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
+from netspec.net.stamp import check_weights
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import NetParameter
 from netspec.whole_file import whole_file
@@ -45,7 +46,7 @@ def load_weights(
     Of several files each is loaded in turn, the last one winning. Layers that only a file has are ignored, and named
     in the log. One warning names the layers that no file has, which stay as they were filled; with ``strict`` that is a
     SpecError, and with ``some`` it is one where nothing fits. ``report`` gets the SpecErrors: those, and those for a
-    file that cannot be read, and for blobs of other number or shape than the net's.
+    file that cannot be read, or is not what its snapshot wrote, and for blobs of other number or shape than the net's.
     """
     paths = [Path(path)] if isinstance(path, (str, Path)) else [Path(each) for each in path]
     loaded: set[int] = set()
@@ -53,6 +54,7 @@ def load_weights(
     for each in paths:
         faults: list[SpecError] = []
         try:
+            check_weights(each)
             if h5py.is_hdf5(each):
                 loaded |= _copy(partial(_from_hdf5, net, each), faults.append)
             else:

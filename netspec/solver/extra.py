@@ -2,15 +2,13 @@
 
 Caffe keeps neither its place in the data nor its random numbers. Here all draws of an iteration follow from the seed
 and the iteration alone, so the file has the seeds, the places in the data, what layers remember from pass to pass, and
-the losses that ``average_loss`` still needs. It also has the sizes and hashes of the weights and of the state that
-belong together. It is JSON; Caffe never reads it.
+the losses that ``average_loss`` still needs. It also has the settings that the numbers follow from, and the sizes and
+hashes of the weights and of the state that belong together (netspec/net/stamp.py). Caffe never reads it.
 """
 
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -23,19 +21,13 @@ import torch
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.net.net import Net
+from netspec.net.stamp import FAULTS, Stamp, damaged, sealed, shown, unsealed, whole_number
+from netspec.solver.settings import Settings
 from netspec.solver.snapshot import find_learned_net, read_state
 from netspec.whole_file import whole_file
 
-FORMAT = 1
-_BLOCK = 1 << 20  # bytes
-
-
-@dataclass(frozen=True)
-class Stamp:
-    """The size and the hash of a file."""
-
-    size: int
-    hash: str
+_MOST_LAYERS = 1 << 24
+Remembered = dict[str, dict[str, Any]]  # by the layer's number, then by name: what JSON has of it
 
 
 @dataclass(frozen=True)
@@ -43,13 +35,13 @@ class Extra:
     """What the file has.
 
     ``seed`` is the solver's; ``losses`` are the last ``average_loss`` ones; ``nets`` has, for the training nets of all
-    ranks and the test nets, in this order, what each of their layers remembers (``Layer.running_state``), by the
-    layer's number.
+    ranks and the test nets, in this order, what each of their layers remembers (``Layer.running_state``).
     """
 
     seed: int
     losses: list[float]
-    nets: list[dict[str, dict[str, Any]]]
+    nets: list[Remembered]
+    settings: Settings
     weights: Stamp
     state: Stamp
 
@@ -59,26 +51,16 @@ def path_beside(state: str | Path) -> Path:
     return Path(f"{state}.extra")
 
 
-def stamp_of(path: str | Path) -> Stamp:
-    """Return the stamp of a file. Raises OSError if it cannot be read."""
-    size, hashed = 0, hashlib.blake2b(digest_size=16)
-    with open(path, "rb") as file:
-        while block := file.read(_BLOCK):
-            size += len(block)
-            hashed.update(block)
-    return Stamp(size, hashed.hexdigest())
-
-
-def running_state(net: Net) -> dict[str, dict[str, Any]]:
+def running_state(net: Net) -> Remembered:
     """Return what the layers of a net remember, as JSON has it."""
     states = {str(i): layer.running_state() for i, layer in enumerate(net.layers)}
     return {i: {name: _packed(value) for name, value in state.items()} for i, state in states.items() if state}
 
 
-def resume(net: Net, states: dict[str, dict[str, Any]]) -> None:
+def resume(net: Net, states: Remembered) -> None:
     """Make the layers of a net remember what :func:`running_state` returned. Raises SpecError if it does not fit."""
     for i, state in states.items():
-        if not 0 <= int(i) < len(net.layers):
+        if int(i) >= len(net.layers):
             raise SpecError(f"remembers layer {i} of a net of {len(net.layers)} layers")
         net.layers[int(i)].resume({name: _unpacked(value) for name, value in state.items()})
 
@@ -86,44 +68,44 @@ def resume(net: Net, states: dict[str, dict[str, Any]]) -> None:
 def write_extra(path: str | Path, extra: Extra) -> None:
     """Write the file. Raises SpecError if it cannot be written."""
     with whole_file(path) as unfinished:
-        unfinished.write_text(json.dumps({"format": FORMAT, **asdict(extra)}, indent=1) + "\n")
+        unfinished.write_text(sealed(asdict(extra)), "utf-8")
 
 
 def read_extra(state: str | Path) -> Extra | None:
     """Return what lies beside a state; None if nothing does: it is Caffe's. Raises SpecError for any other file."""
     path = path_beside(state)
     try:
-        found = json.loads(path.read_text())
-        if found.pop("format") != FORMAT:
-            raise ValueError(f"format {FORMAT} is known")
-        stamps = {name: Stamp(int(found[name]["size"]), str(found[name]["hash"])) for name in ("weights", "state")}
-        losses = [float(loss) for loss in found["losses"]]
-        nets = [{str(int(i)): dict(state) for i, state in net.items()} for net in found["nets"]]
-        return Extra(int(found["seed"]), losses, nets, **stamps)
+        found = unsealed(path)
+        return Extra(
+            whole_number(found["seed"], "seed"),
+            [_loss(loss) for loss in _list(found["losses"])],
+            [_remembered(net) for net in _list(found["nets"])],
+            {str(name): dict(settings) for name, settings in found["settings"].items()},
+            Stamp.read(found["weights"]),
+            Stamp.read(found["state"]),
+        )
     except FileNotFoundError:
         return None
-    except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as fault:
-        reason = " ".join(str(fault).split())
-        raise SpecError(
-            f"is damaged ({reason}); without it the training resumes as Caffe's", Where(str(path))
-        ) from None
+    except SpecError:
+        raise
+    except FAULTS as fault:
+        raise damaged(path, fault) from None
 
 
 def check_pair(state: str | Path, weights: Path | None, extra: Extra) -> None:
     """Raise SpecError where the weights or the state are not those that were written together."""
     for path, stamp in ((weights, extra.weights), (Path(state), extra.state)):
-        if path is not None and stamp_of(path) != stamp:
-            message = f"is not the file that was written with {path_beside(state).name}: it was cut or replaced"
-            raise SpecError(message, Where(str(path)))
+        if path is not None:
+            stamp.check(path, path_beside(state))
 
 
 def newest_pair(prefix: str) -> Path | None:
     """Return the state, of the snapshots with a prefix, of the latest iteration that is whole with its weights.
 
-    Those that are not whole are named in the log.
+    Those that are not whole are named in the log. None if there is no snapshot at all; raises SpecError if there are
+    some, and none is whole: a training must not begin anew, and write over them, without a word.
     """
+    passed = 0
     for state in _states(prefix):
         try:
             found = find_learned_net(read_state(state), state)
@@ -133,6 +115,10 @@ def newest_pair(prefix: str) -> Path | None:
             return state
         except (SpecError, OSError) as fault:
             log.logger.warning(f"passed over: {fault}")
+            passed += 1
+    if passed:
+        message = f'none of the {passed} snapshots with the prefix "{prefix}" is whole; move them away to start anew'
+        raise SpecError(f"{message}, or give one with --snapshot", Where(prefix))
     return None
 
 
@@ -144,18 +130,41 @@ def _states(prefix: str) -> Iterator[Path]:
         yield path
 
 
-def _packed(value: int | Sequence[torch.Tensor]) -> Any:
-    if isinstance(value, int):
+def _list(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError(f"found {shown(value)}, expected a list")
+    return value
+
+
+def _loss(value: Any) -> float:
+    if type(value) not in (int, float):  # NaN is possible: ``--nan warn``
+        raise ValueError(f"found loss {shown(value)}, expected a number")
+    return float(value)
+
+
+def _remembered(value: Any) -> Remembered:
+    for i, state in value.items():
+        whole_number(int(i), "layer", _MOST_LAYERS)
+        for name, each in state.items():
+            if not isinstance(each, (str, list)):
+                whole_number(each, name)
+            _unpacked(each)
+    return value
+
+
+def _packed(value: int | str | Sequence[torch.Tensor]) -> Any:
+    if isinstance(value, (int, str)):
         return value
     arrays = [tensor.detach().cpu().numpy().astype("<f4") for tensor in value]
     return [{"shape": array.shape, "float32": base64.b64encode(array.tobytes()).decode()} for array in arrays]
 
 
-def _unpacked(value: Any) -> int | tuple[torch.Tensor, ...]:
-    if isinstance(value, int):
+def _unpacked(value: Any) -> int | str | tuple[torch.Tensor, ...]:
+    if isinstance(value, (int, str)):
         return value
-    try:
-        data = [np.frombuffer(base64.b64decode(array["float32"]), "<f4").reshape(array["shape"]) for array in value]
-    except (ValueError, TypeError, LookupError) as fault:
-        raise SpecError(f"has an array that cannot be read ({fault})") from None
-    return tuple(torch.tensor(array) for array in data)
+    return tuple(torch.tensor(_array(each)) for each in value)
+
+
+def _array(value: Any) -> np.ndarray:
+    shape = [whole_number(size, "size") for size in _list(value["shape"])]
+    return np.frombuffer(base64.b64decode(value["float32"], validate=True), "<f4").reshape(shape)

@@ -26,6 +26,7 @@ from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.segments import missing_tool
+from netspec.net.stamp import Stamp
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, save_weights, too_large
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import SolverParameter
@@ -41,7 +42,6 @@ from netspec.solver.extra import (
     read_extra,
     resume,
     running_state,
-    stamp_of,
     write_extra,
 )
 from netspec.solver.heap import keep_freed_memory
@@ -50,9 +50,10 @@ from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.precision import FP16, FP32, LossScale, check_precision, computing
 from netspec.solver.processes import Processes, own_device
 from netspec.solver.replicas import Replicas
+from netspec.solver.settings import Settings, changes, settings_of
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.tally import Outputs, Tally, as_scores, score_lines, scorers
-from netspec.solver.threads import dependence
+from netspec.solver.threads import dependence, divided_sums
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
@@ -538,12 +539,13 @@ class Solver:
         site = "sgd_solver.cpp:296" if hdf5 else "sgd_solver.cpp:284"
         log.info(site, f"Snapshotting solver state to {form} file {state}")
         history = [values.cpu().numpy() for values in self.history]
-        weights = stamp_of(model)
+        weights, settings = Stamp.of(model), self._settings()
         write_state(
             state,
             State(self.iteration, model, self.current_step, history),
             before=lambda unfinished: write_extra(
-                path_beside(state), Extra(self._seed, list(self._losses), states, weights, stamp_of(unfinished))
+                path_beside(state),
+                Extra(self._seed, list(self._losses), states, settings, weights, Stamp.of(unfinished)),
             ),
         )
         self.last_snapshot = state
@@ -600,18 +602,34 @@ class Solver:
             expected = f"{ranks} of training and {self._tests} of testing"
             log.logger.warning(f"{where}: is of {len(extra.nets)} nets, not {expected}: the data starts again")
             return
-        nets = (*training, *self.test_nets)
+        all_nets = (*training, *self.test_nets)
         remembered = extra.nets[rank : rank + len(training)] + extra.nets[ranks:][: len(self.test_nets)]
         try:
-            for net, states in zip(nets, remembered, strict=True):
+            for net, states in zip(all_nets, remembered, strict=True):
                 resume(net, states)
         except SpecError as fault:
             raise SpecError(fault.message, where) from None
         self._losses_before = extra.losses
-        if extra.seed == self._seed:
-            log.logger.info(f"{where}: the training goes on as if it had never stopped")
-        else:
+        if extra.seed != self._seed:
             log.logger.warning(f"{where}: random_seed was {extra.seed}: the random numbers are others from here on")
+        elif told := changes(extra.settings, self._settings()):
+            log.logger.warning(f"{where}: the training goes on with other numbers: {told}")
+        else:
+            log.logger.info(f"{where}: the training goes on as if it had never stopped")
+
+    def _settings(self) -> Settings:
+        """Return what the numbers of this training follow from."""
+        manner: dict[str, Any] = {
+            "precision": self._precision,
+            "exact": self._exact,
+            "compiled": self._compiled,
+            "device": self._device.type,
+            "torch": torch.__version__,
+        }
+        if divided_sums(self.net):
+            manner["threads"] = torch.get_num_threads()
+        tests = {f"test net #{i}": net for i, net in enumerate(self.test_nets)}
+        return settings_of(self.param, {nets.TRAIN_NET: self.net, **tests}, manner)
 
     def _of_today(self, state: State, where: Where) -> State:
         """Return a state in today's form, where it has a history for each layer that shares a parameter."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import struct
 import warnings
 import zipfile
@@ -42,13 +43,15 @@ from netspec.graph.filter import with_state
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
+from netspec.net.stamp import Stamp, sealed
 from netspec.net.table import table
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text, parse_solver_text
 from netspec.scores import Score, Scores, Snapshot, read_scores
 from netspec.solver.checks import check_settings
-from netspec.solver.extra import Extra, Stamp, read_extra, write_extra
+from netspec.solver.extra import Extra, read_extra, resume, write_extra
+from netspec.solver.settings import changes
 from netspec.solver.snapshot import State, read_state, write_state
 
 NET = """
@@ -98,8 +101,44 @@ def state(path: Path) -> None:
 
 
 def extra(path: Path) -> None:
-    carried = {"0": {"iteration": 7}, "3": {"state": [{"shape": [1, 2], "float32": "AACAPwAAAEA="}]}}
-    write_extra(path, Extra(1, [0.5, 0.25], [carried, {}], Stamp(3, "ab"), Stamp(4, "cd")))
+    arrays = [{"shape": [1, 2], "float32": "AACAPwAAAEA="}] * 2
+    carried = {"0": {"next": 7}, "3": {"state": arrays}}
+    settings = {"solver": {"base_lr": 0.5, "stepvalue": [3, 9]}, "train net": {"data_param.source": "db"}}
+    write_extra(path, Extra(1, [0.5, 0.25], [carried, {}], settings, Stamp(3, "ab"), Stamp(4, "cd")))
+
+
+def unhashed(data: bytes) -> bytes:
+    """Return an .extra file without its hash and format."""
+    content = json.loads(data)
+    return json.dumps({name: value for name, value in content.items() if name not in ("format", "hash")}).encode()
+
+
+def hashed(data: bytes) -> bytes:
+    """Return the .extra file of damaged content, whose hash is right, if it is JSON at all."""
+    try:
+        return sealed(json.loads(data)).encode()
+    except (ValueError, TypeError, RecursionError):
+        return data
+
+
+def read_and_compare(path: Path) -> None:
+    found = read_extra(path.with_suffix(""))
+    assert found is not None
+    changes(found.settings, {"solver": {"base_lr": 0.1}, "train net": {}})
+    for states in found.nets:
+        resume(remembering(), states)
+
+
+@cache
+def remembering() -> Net:
+    text = """layer { name: "x" type: "MemoryData" top: "x" top: "l"
+      memory_data_param { batch_size: 1 channels: 1 height: 1 width: 1 } }
+    layer { name: "i" type: "Input" top: "s" top: "c"
+      input_param { shape { dim: 1 dim: 1 dim: 2 } shape { dim: 1 dim: 1 } } }
+    layer { name: "relu" type: "ReLU" bottom: "s" top: "s" }
+    layer { name: "lstm" type: "LSTM" bottom: "s" bottom: "c" top: "y" recurrent_param { num_output: 2 } }"""
+    message, source = parse_net_text(text, "net.prototxt")
+    return build_net(with_state(message, TEST), source, BuildOptions(seed=0))
 
 
 def database(path: Path) -> None:
@@ -256,7 +295,8 @@ FORMATS = {
     ),
     "solverstate": Format(".solverstate", state, read_state),
     "solverstate.h5": Format(".solverstate.h5", state, read_state),
-    "solverstate.extra": Format(".extra", extra, lambda path: read_extra(path.with_suffix(""))),
+    "solverstate.extra": Format(".extra", extra, read_and_compare),
+    "solverstate.extra by value": Format(".extra", extra, read_and_compare, "", unhashed, hashed),
     "hdf5 data": Format(".h5", rows, all_rows),
     "lmdb": Format("", database, all_records, inside="data.mdb"),
     "mean": Format(

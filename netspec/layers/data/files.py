@@ -152,13 +152,15 @@ class ReadingLayer(Layer):
             self._feed.restart(iteration)
 
     @override
-    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
         return {"iteration": self.iteration}
 
     @override
     def resume(self, state: Mapping[str, Any]) -> None:
         super().resume(state)
-        self.restart(_position(self, state["iteration"]))
+        if state["iteration"] < 0:
+            raise self.error(f"found iteration {state['iteration']} to go on from, expected at least 0")
+        self.restart(state["iteration"])
 
     @override
     def close(self) -> None:
@@ -207,12 +209,6 @@ class ReadingLayer(Layer):
     def log_size(self, source: Source, site: str) -> None:
         """Log the shape of a batch."""
         log.info(site, "output data size: " + ",".join(map(str, source.shapes[0])))
-
-
-def _position(layer: Layer, value: object) -> int:
-    if not isinstance(value, int) or value < 0:
-        raise layer.error(f"found iteration {value!r} to go on from, expected a whole number")
-    return value
 
 
 def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:

@@ -197,13 +197,16 @@ class MemoryData(Layer):
         self._next = 0
 
     @override
-    def running_state(self) -> dict[str, int | tuple[torch.Tensor, ...]]:
+    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
         return {"next": self._next}
 
     @override
     def resume(self, state: Mapping[str, Any]) -> None:
         super().resume(state)
-        self._next = int(state["next"])
+        following = state["next"]
+        if following % self.shape[0] or (self._arrays is not None and not 0 <= following < len(self._arrays[0])):
+            raise self.error(f"found row {following} to go on from, which is none that a batch starts with")
+        self._next = following
 
     @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:

@@ -6,13 +6,15 @@ Caffe: include/caffe/layers/python_layer.hpp
 from __future__ import annotations
 
 import importlib
+import json
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from typing_extensions import override
 
+from netspec import log
 from netspec.errors import SpecError, did_you_mean
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
@@ -40,6 +42,8 @@ class Python(Layer):
     The module is looked for in the current directory, then where Python looks (PYTHONPATH). Its class has setup,
     reshape and forward(bottom, top) and backward(top, propagate_down, bottom), and finds self.param_str, self.phase and
     self.blobs. As in Caffe, backward belongs to the last forward. On a GPU the arrays are copies in main memory.
+    A class that remembers more than its blobs has running_state(), which returns what JSON can hold, and resume(state):
+    they are called when a snapshot is taken and when its training is resumed.
 
     bottom[i]  any shape
     top[i]     the shape that reshape or forward gives it
@@ -109,6 +113,31 @@ class Python(Layer):
             for blob, need in zip([*self.bottom, *self.code.blobs], needed, strict=True)
         ]
 
+    @override
+    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
+        """Return what the code's running_state returns, as JSON; "" where it has none."""
+        if not hasattr(self.code, "running_state"):
+            return {"code": ""}
+        state = self._call("running_state")
+        try:
+            return {"code": json.dumps(state)}
+        except (TypeError, ValueError, RecursionError) as fault:
+            raise self._fault("running_state", f"returned what JSON cannot hold ({fault})") from None
+
+    @override
+    def resume(self, state: Mapping[str, Any]) -> None:
+        super().resume(state)
+        if not (hasattr(self.code, "running_state") and hasattr(self.code, "resume")):
+            remedy = "give its class running_state() and resume(state)"
+            told = f"what the code remembers besides its blobs is not restored; if that matters, {remedy}"
+            log.logger.warning(str(self.error(told, "python_param")))
+        elif state["code"]:
+            try:
+                found = json.loads(state["code"])
+            except ValueError as fault:
+                raise self._fault("resume", f"what it remembers is not JSON ({fault})") from None
+            self._call("resume", found)
+
     def _load(self) -> Any:
         """Return an instance of the layer's class."""
         p = self.param.python_param
@@ -132,16 +161,19 @@ class Python(Layer):
         code.phase = self.phase
         return code
 
-    def _call(self, method: str, *arguments: Any) -> None:
+    def _call(self, method: str, *arguments: Any) -> Any:
         """Call a method of the code; anything it raises is an error in the user's file."""
-        p = self.param.python_param
         try:
             with importable():
-                getattr(self.code, method)(*arguments)
+                return getattr(self.code, method)(*arguments)
         except SpecError:
             raise
         except Exception as fault:
-            raise self.error(f"{p.module}.{p.layer}.{method}: {_describe(fault)}", "python_param") from fault
+            raise self._fault(method, _describe(fault)) from fault
+
+    def _fault(self, method: str, message: str) -> SpecError:
+        p = self.param.python_param
+        return self.error(f"{p.module}.{p.layer}.{method}: {message}", "python_param")
 
 
 def _describe(fault: Exception) -> str:

@@ -7,13 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import lmdb
 import numpy as np
 import pytest
 
+import netspec
 from netspec.cli import main
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError
+from netspec.net.stamp import sealed
 from netspec.solver.extra import newest_pair, path_beside, read_extra
 from netspec.solver.snapshot import State, read_state, write_state
 from netspec.solver.solver import Solver, load_solver
@@ -63,6 +66,13 @@ layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip"
 layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" softmax_param { axis: 2 } }"""
 POOL = """layer { name: "pool" type: "Pooling" bottom: "data" top: "pool"
   pooling_param { pool: STOCHASTIC kernel_size: 2 stride: 2 } }"""
+
+
+INPUT = ('layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 dim: 10 dim: 10 } } }', "")
+
+
+def state_of(weights: Path) -> str:
+    return str(weights).replace("caffemodel", "solverstate")
 
 
 def classify(bottom: str = "data") -> str:
@@ -191,6 +201,114 @@ def test_another_random_seed_is_said(warnings: Callable[[], list[str]]) -> None:
     assert warnings() == [f"{state}.extra: random_seed was 3: the random numbers are others from here on"]
 
 
+OTHERWISE = [
+    ({"batch_size: 8": "batch_size: 4"}, {}, 'layer "data" data_param.batch_size is 4, was 8'),
+    ({'source: "db"': 'source: "copy"'}, {}, "layer \"data\" data_param.source is 'copy', was 'db'"),
+    ({"mirror: true": ""}, {}, 'layer "data" transform_param.mirror is the default, was True'),
+    ({"iter_size: 2": ""}, {}, "iter_size is the default, was 2"),
+    ({"base_lr: 0.05": "base_lr: 0.01"}, {}, "base_lr is 0.01, was 0.05"),
+    ({}, {"exact": "all"}, "exact is 'all', was 'small'"),
+    ({}, {"precision": "bf16"}, "precision is 'bf16', was 'fp32'; exact is 'none', was 'small'"),
+]
+
+
+@pytest.mark.parametrize(("changed", "options", "told"), OTHERWISE, ids=[told for *_, told in OTHERWISE])
+def test_what_changes_the_numbers_is_said(
+    changed: dict[str, str], options: dict[str, str], told: str, warnings: Callable[[], list[str]]
+) -> None:
+    write(NETS["crop and mirror"], "iter_size: 2 random_seed: 3")
+    shutil.copytree("db", "copy")
+    _, state = load_solver("solver.prototxt").snapshot()
+    for path in (Path("net.prototxt"), Path("solver.prototxt")):
+        for old, new in changed.items():
+            path.write_text(path.read_text().replace(old, new))
+    load_solver("solver.prototxt", snapshot=state, **options)
+    (said,) = [line for line in warnings() if line.startswith(state)]
+    assert said.startswith(f"{state}.extra: the training goes on with other numbers: ")
+    assert told in said
+
+
+def test_another_number_of_records_is_said(warnings: Callable[[], list[str]]) -> None:
+    write(NETS["crop and mirror"], "random_seed: 3")
+    _, state = load_solver("solver.prototxt").snapshot()
+    with lmdb.open("db", lock=False, map_size=1 << 24) as env, env.begin(write=True) as transaction:
+        transaction.delete(b"%08d" % 36)
+    load_solver("solver.prototxt", snapshot=state)
+    assert 'train net, layer "data" number of records is 36, was 37' in warnings()[-1]
+
+
+def test_what_changes_no_number_is_not_said(
+    warnings: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
+) -> None:
+    write(NETS["crop and mirror"], "random_seed: 3")
+    _, state = load_solver("solver.prototxt").snapshot()
+    Path("solver.prototxt").write_text(SOLVER.replace("max_iter: 13 display: 1", "max_iter: 99") + "random_seed: 3")
+    Path("net.prototxt").write_text(NETS["crop and mirror"].replace('"xavier"', '"gaussian"'))
+    caplog.set_level(logging.INFO, "netspec")
+    load_solver("solver.prototxt", snapshot=state)
+    assert warnings() == []
+    assert "the training goes on as if it had never stopped" in caplog.text
+
+
+COUNTER = """
+import caffe
+
+class Counter(caffe.Layer):
+    def setup(self, bottom, top):
+        self.passes = 0
+
+    def reshape(self, bottom, top):
+        top[0].reshape(*bottom[0].data.shape)
+
+    def forward(self, bottom, top):
+        self.passes += 1
+        top[0].data[...] = bottom[0].data * self.passes
+
+    def backward(self, top, propagate_down, bottom):
+        pass
+"""
+HOOKS = """
+    def running_state(self):
+        return {"passes": self.passes}
+
+    def resume(self, state):
+        self.passes = state["passes"]
+"""
+COUNTED = """layer { name: "c" type: "Python" bottom: "data" top: "c"
+  python_param { module: "MODULE" layer: "Counter" } }"""
+
+
+def counted(module: str, code: str) -> None:
+    Path(f"{module}.py").write_text(code)
+    write(CROP + COUNTED.replace("MODULE", module) + classify("c"), "random_seed: 3")
+
+
+def test_a_python_layer_goes_on_with_what_it_remembers(caplog: pytest.LogCaptureFixture) -> None:
+    counted("counter_with_hooks", COUNTER + HOOKS)
+    straight = load_solver("solver.prototxt", allow_python=True)
+    straight.step(3)
+    _, state = straight.snapshot()
+    straight.step(3)
+    resumed = load_solver("solver.prototxt", snapshot=state, allow_python=True)
+    resumed.step(3)
+    assert_same(straight, resumed)
+    assert "is not restored" not in caplog.text
+
+
+def test_what_a_python_layer_forgets_is_said(warnings: Callable[[], list[str]]) -> None:
+    counted("counter_without", COUNTER)
+    _, state = load_solver("solver.prototxt", allow_python=True).snapshot()
+    load_solver("solver.prototxt", snapshot=state, allow_python=True)
+    (said,) = {line for line in warnings() if "not restored" in line}
+    assert 'layer "c" (Python): what the code remembers besides its blobs is not restored' in said
+
+
+def test_a_python_layer_that_remembers_what_json_cannot_hold() -> None:
+    counted("counter_of_sets", COUNTER + HOOKS.replace("self.passes}", "{1, 2}}"))
+    with pytest.raises(SpecError, match=r"Counter.running_state: returned what JSON cannot hold \(Object of type set"):
+        load_solver("solver.prototxt", allow_python=True).snapshot()
+
+
 # What is refused
 
 
@@ -232,16 +350,104 @@ def test_weights_that_are_cut_at_the_border_of_a_layer(state: Path) -> None:
     refused(state, r"x_iter_1.caffemodel: is not the file that was written with x_iter_1.solverstate.extra")
 
 
+@pytest.mark.parametrize("form", ["BINARYPROTO", "HDF5"])
+def test_every_command_compares_weights_with_what_was_written(form: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """One bit of a number: every reader would take it."""
+    write(NETS["batches of 8 of 37"], f"snapshot_format: {form}")
+    weights = Path(load_solver("solver.prototxt").snapshot()[0])
+    Path("deploy.prototxt").write_text(classify().partition('layer { name: "loss"')[0].join(INPUT))
+    commands = [
+        ["test", "--model", "net.prototxt", "--weights", str(weights), "--iterations", "1"],
+        ["extract", "--model", "net.prototxt", "--weights", str(weights), "--blob", "ip", "--out", "f.npz"],
+        ["export", "deploy.prototxt", "--weights", str(weights), "--to", "torch", "--out", "e.py"],
+    ]
+    for command in commands:
+        assert main(command) == 0, capsys.readouterr().err
+    net = netspec.load_net("net.prototxt", weights=weights, phase="TRAIN")
+    data = bytearray(weights.read_bytes())
+    data[data.index(net.learnable[0].parameter.detach().numpy().tobytes()[:16]) + 2] ^= 1
+    weights.write_bytes(data)
+    capsys.readouterr()
+    for command in commands:
+        assert main(command) == 1
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if "cut or replaced" in line]
+        assert line.startswith(f"{weights}: is not the file that was written with x_iter_0.solverstate")
+        assert line.endswith("; if you replaced it yourself, remove " + path_beside(state_of(weights)).name)
+    path_beside(state_of(weights)).write_text("{}")
+    assert main(commands[0]) == 0
+    assert f"{weights.name} is not compared with it" in capsys.readouterr().err
+
+
 def test_the_weights_of_another_net(state: Path) -> None:
     path_beside(state).unlink()
     write(NETS["batches of 8 of 37"].replace('"ip"', '"other"'))
     refused(state, r"x_iter_1.caffemodel: holds weights for none of the net's 1 layers")
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": 2}', '{"format": 1, "seed": "x"}'])
+DAMAGED = r"x_iter_1.solverstate.extra: is damaged .*; without it the training resumes as Caffe's"
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": 2}', '{"format": 1, "seed": "x"}', "[" * 5000])
 def test_a_damaged_file_beside_a_state(state: Path, text: str) -> None:
     path_beside(state).write_text(text)
-    refused(state, r"x_iter_1.solverstate.extra: is damaged .*; without it the training resumes as Caffe's")
+    refused(state, DAMAGED)
+
+
+def test_one_changed_digit_beside_a_state(state: Path) -> None:
+    path = path_beside(state)
+    path.write_text(path.read_text().replace('"iteration": 1', '"iteration": 7'))
+    refused(state, r"x_iter_1.solverstate.extra: is damaged \(its own hash does not fit it\)")
+
+
+def forged(state: Path, *path: str | int, value: object) -> None:
+    """Write another value beside a state, with a hash that is right."""
+    content = json.loads(path_beside(state).read_text())
+    inside = content
+    for step in path[:-1]:
+        inside = inside[step]
+    inside[path[-1]] = value
+    del content["hash"], content["format"]
+    path_beside(state).write_text(sealed(content))
+
+
+@pytest.mark.parametrize("value", [True, -1, 1.0, 10**300, None, [{"shape": [-1], "float32": "AACAPw=="}], [{}], {}])
+def test_an_iteration_that_is_none(state: Path, value: object) -> None:
+    forged(state, "nets", 0, "0", "iteration", value=value)
+    refused(state, DAMAGED)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (["seed"], float("inf")),
+        (["seed"], "3"),
+        (["weights", "size"], 1e99),
+        (["state", "hash"], 7),
+        (["losses"], [10**400]),
+        (["losses", 0], [0.5]),
+        (["nets"], {}),
+        (["nets", 0], {"-1": {}}),
+        (["nets", 0], {"x": {}}),
+        (["settings"], []),
+        (["settings", "solver"], 3),
+    ],
+)
+def test_a_value_that_no_training_wrote(state: Path, path: list[str | int], value: object) -> None:
+    forged(state, *path, value=value)
+    refused(state, DAMAGED)
+
+
+@pytest.mark.parametrize(
+    ("remembered", "message"),
+    [
+        ({"iteration": []}, r"found iteration \(tuple\) to remember, expected iteration \(int\)"),
+        ({"iteration": "x"}, r"found iteration \(str\) to remember, expected iteration \(int\)"),
+        ({"next": 3}, r"found next \(int\) to remember, expected iteration \(int\)"),
+    ],
+)
+def test_what_another_layer_remembers(state: Path, remembered: dict, message: str) -> None:
+    forged(state, "nets", 0, "0", value=remembered)
+    refused(state, message)
 
 
 def test_the_weights_beside_a_state_go_before_those_of_the_same_name_elsewhere(state: Path) -> None:
@@ -275,4 +481,9 @@ def test_resume_finds_the_newest_whole_pair(
         path.unlink()
     assert main(["train", "solver.prototxt", "--resume"]) == 0
     assert read_extra("x_iter_10.solverstate") is not None
+    for path in Path().glob("x_iter*.extra"):
+        path.write_text(path.read_text().replace('"seed": ', '"seed": 1'))
+    before = {path: path.read_bytes() for path in Path().glob("x_iter*")}
+    assert main(["train", "solver.prototxt", "--resume"]) == 1  # it would start at iteration 0
+    assert {path: path.read_bytes() for path in Path().glob("x_iter*")} == before
     assert main(["train", "solver.prototxt", "--resume", "--snapshot", "x_iter_5.solverstate"]) == 2

@@ -1,0 +1,123 @@
+"""What a snapshot says of its own files: their sizes and hashes, in ``X.solverstate.extra``.
+
+That file is JSON, with a hash of its own: one changed digit would otherwise give a training other numbers. Who reads
+``X.caffemodel`` compares it with what was written; protobuf reads most damaged files without a word.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from netspec import log
+from netspec.errors import SpecError, Where
+
+FORMAT = 2
+_BLOCK = 1 << 20  # bytes
+_SHOWN = 40  # characters of a wrong value
+MOST = 2**63 - 1
+#: What a damaged file of JSON makes Python raise.
+FAULTS = (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError)
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """The size and the hash of a file."""
+
+    size: int
+    hash: str
+
+    @classmethod
+    def of(cls, path: str | Path) -> Stamp:
+        """Return the stamp of a file. Raises OSError if it cannot be read."""
+        size, hashed = 0, hashlib.blake2b(digest_size=16)
+        with open(path, "rb") as file:
+            while block := file.read(_BLOCK):
+                size += len(block)
+                hashed.update(block)
+        return cls(size, hashed.hexdigest())
+
+    @classmethod
+    def read(cls, value: Any) -> Stamp:
+        """Return the stamp that a value of JSON describes. Raises ValueError for any other value."""
+        size, hashed = value["size"], value["hash"]
+        if not isinstance(hashed, str):
+            raise ValueError(f"found hash {shown(hashed)}, expected a text")
+        return cls(whole_number(size, "size"), hashed)
+
+    def check(self, path: Path, extra: Path) -> None:
+        """Raise SpecError where a file is not the one that was written together with ``extra``."""
+        if Stamp.of(path) != self:
+            message = f"is not the file that was written with {extra.name}: it was cut or replaced"
+            raise SpecError(f"{message}; if you replaced it yourself, remove {extra.name}", Where(str(path)))
+
+
+def whole_number(value: Any, name: str, most: int = MOST) -> int:
+    """Return a value of JSON that is a whole number from 0 to ``most``. Raises ValueError for any other value."""
+    if type(value) is not int or not 0 <= value <= most:
+        raise ValueError(f"found {name} {shown(value)}, expected a whole number")
+    return value
+
+
+def shown(value: Any) -> str:
+    """Return a wrong value for an error message, cut where it is long."""
+    text = f"a number of {value.bit_length()} bits" if type(value) is int and abs(value) > MOST else repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
+
+def sealed(content: Mapping[str, Any]) -> str:
+    """Return the text of an .extra file: the content, the format, and the hash of both."""
+    whole = {"format": FORMAT, **content}
+    return json.dumps({**whole, "hash": _hash(whole)}, indent=1) + "\n"
+
+
+def unsealed(path: Path) -> dict[str, Any]:
+    """Return the content of an .extra file. Raises FileNotFoundError, and SpecError for any other fault."""
+    try:
+        found = json.loads(path.read_text("utf-8"))
+        if found["format"] != FORMAT or type(found["format"]) is not int:
+            raise ValueError(f"found format {shown(found['format'])}, expected {FORMAT}")
+        if found.pop("hash") != _hash(found):
+            raise ValueError("its own hash does not fit it")
+        return found
+    except FileNotFoundError:
+        raise
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
+    except FAULTS as fault:
+        raise damaged(path, fault) from None
+
+
+def damaged(path: Path, reason: Exception) -> SpecError:
+    """Return the error of an .extra file that cannot be understood."""
+    told = f"no {reason}" if isinstance(reason, KeyError) else " ".join(str(reason).split())
+    return SpecError(f"is damaged ({told}); without it the training resumes as Caffe's", Where(str(path)))
+
+
+def check_weights(path: Path) -> None:
+    """Compare ``X.caffemodel`` with ``X.solverstate.extra``, if that is there. Raises SpecError if they do not fit.
+
+    A warning says where the .extra is damaged, so that nothing was compared.
+    """
+    found = re.fullmatch(r"(.+)\.caffemodel(\.h5)?", path.name)
+    extra = path.with_name(f"{found[1]}.solverstate{found[2] or ''}.extra") if found else None
+    if extra is None or not extra.is_file() or not path.is_file():
+        return
+    try:
+        stamp = Stamp.read(unsealed(extra)["weights"])
+    except SpecError as fault:
+        log.logger.warning(f"{fault.where}: {fault.message.partition(';')[0]}: {path.name} is not compared with it")
+        return
+    except FAULTS:
+        return
+    stamp.check(path, extra)
+
+
+def _hash(content: Mapping[str, Any]) -> str:
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
