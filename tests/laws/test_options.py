@@ -3,10 +3,10 @@
 import argparse
 import shlex
 import shutil
-from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -93,7 +93,7 @@ VALUES = {"shape": "data=1,1,28,28", "source": "pair_data=pairs/test_lmdb", "siz
 class Watched(argparse.Namespace):
     """A namespace that notes which of its names a command reads."""
 
-    read: set[str] = set()
+    read: ClassVar[set[str]] = set()
 
     def __getattribute__(self, name: str) -> object:
         if name == "run":  # from here on the command itself
@@ -103,7 +103,7 @@ class Watched(argparse.Namespace):
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(argparse, "Namespace", Watched)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -120,7 +120,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     Path("images.txt").write_text("images/0.png 1\nimages/1.png 2\n")
     np.savez("features.npz", features=np.eye(3, dtype=np.float32), names=np.array(["0.png", "1.png", "2.png"]))
     shutil.copy(GOLDEN / "log" / "caffe_train.log", "train.log")
-    yield tmp_path
+    return tmp_path
 
 
 def options(module: str, command: str) -> list[argparse.Action]:
