@@ -60,6 +60,11 @@ def gemm_routine(values: np.ndarray) -> Callable[..., Any]:
     return _routine("gemm", values)
 
 
+def gemv_routine(values: np.ndarray) -> Callable[..., Any]:
+    """Return BLAS' product of a matrix and a vector: (1, a, x, 1, y, 0, 1, 0, 1, trans, 1) adds a x, or a.T x, to y."""
+    return _routine("gemv", values)
+
+
 def gemm(
     a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, *, a_t: bool = False, b_t: bool = False, add: bool = False
 ) -> None:

@@ -152,7 +152,7 @@ def prepared_columns(
     count, fits, outputs = shape[0], sliding.fits(shape[2:]), len(weight)
     filters = weight.flatten(1).clone().numpy().T
     bias = None if bias is None else bias.clone().view(-1, 1)
-    lay_out = _columns_of_shape(shape, weight.dtype, sliding, fits)
+    lay_out = columns_of_shape(shape, weight.dtype, sliding, fits)
     top_shape, rows = (count, outputs, *fits), (count, outputs, fits[0] * fits[1])
     multiply, dtype = gemm_routine(filters), weight.dtype
 
@@ -167,7 +167,7 @@ def prepared_columns(
     return run
 
 
-def _columns_of_shape(
+def columns_of_shape(
     shape: Axes, dtype: torch.dtype, sliding: Filter, fits: Sequence[int]
 ) -> Callable[[torch.Tensor], np.ndarray]:
     """Return what :meth:`Filter.columns` gives for all maps of one shape: (N, C kernel, positions), in fixed memory."""
@@ -336,11 +336,11 @@ class SummedConvolutions(ParameterSums):
             if total is not None:
                 total += gradient
         if maps_diff is not None:
-            maps_diff = _laid_out_like(maps, maps_diff).to(maps.dtype)
+            maps_diff = laid_out_like(maps, maps_diff).to(maps.dtype)
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
 
 
-def _laid_out_like(maps: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+def laid_out_like(maps: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
     """Return the gradient of maps in their order in memory: where the two differ, torch's kernels are slow."""
     if maps.dim() == 4 and not maps.is_contiguous() and maps.is_contiguous(memory_format=torch.channels_last):
         return diff.contiguous(memory_format=torch.channels_last)

@@ -6,7 +6,7 @@ Caffe: the neuron layers, include/caffe/layers/neuron_layer.hpp
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -14,13 +14,14 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
-from netspec.exact import ALL, libm
+from netspec.exact import ALL, libm, switch
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
 from netspec.layers.base import Finish, Kernel, Layer, Preparation, Shape, finished
 from netspec.layers.learned import values_of
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.training import Kernels, Learning, Room, recorded
 
 
 class Activation(Layer):
@@ -47,6 +48,35 @@ class Rounded(Activation):
     @override
     def finishing(self) -> Finish | None:
         return None if self.context.exact == ALL else type(self).in_place
+
+    # Torch's function into ``out``, and its gradient, from the top's and the top, into ``grad_input``.
+    kernels: ClassVar[tuple[Callable[..., torch.Tensor], Callable[..., torch.Tensor]] | None] = None
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        if switch.applies(self.context.exact, torch.empty(1)):
+            return self._prepared_as_caffe()
+        if self.kernels is None:
+            return recorded(self.run, learning)
+        rooms, (compute, gradient) = (Room(), Room()), self.kernels
+
+        def forward(x: torch.Tensor) -> torch.Tensor:
+            return compute(x, out=rooms[0].like(x))
+
+        def backward(diff: torch.Tensor) -> torch.Tensor:
+            return gradient(diff, rooms[0].like(diff), grad_input=rooms[1].like(diff))
+
+        return forward, backward
+
+    def _prepared_as_caffe(self) -> Kernels:
+        bottom = top = torch.empty(0)
+
+        def forward(x: torch.Tensor) -> torch.Tensor:
+            nonlocal bottom, top
+            bottom, top = x, self.as_caffe(x)
+            return top
+
+        return forward, lambda diff: self.caffes_gradient(bottom, top, diff)
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom by torch's functions, whose gradients autograd knows."""
@@ -93,6 +123,20 @@ class ReLU(Activation):
     @override
     def finishing(self) -> Finish:
         return partial(F.leaky_relu_, negative_slope=self.slope) if self.slope else F.relu_
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        if self.slope:
+            return recorded(self.run, learning)
+        rooms, gradient = (Room(), Room()), torch.ops.aten.threshold_backward.grad_input
+
+        def forward(x: torch.Tensor) -> torch.Tensor:
+            return torch.clamp_min(x, 0, out=rooms[0].like(x))
+
+        def backward(diff: torch.Tensor) -> torch.Tensor:
+            return gradient(diff, rooms[0].like(diff), 0, grad_input=rooms[1].like(diff))
+
+        return forward, backward
 
     @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
@@ -203,6 +247,7 @@ class Sigmoid(Rounded):
 
     gradient_reads = frozenset({"top"})
     in_place = torch.sigmoid_
+    kernels = torch.sigmoid, torch.ops.aten.sigmoid_backward.grad_input
 
     @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
@@ -236,6 +281,7 @@ class TanH(Rounded):
 
     gradient_reads = frozenset({"top"})
     in_place = torch.tanh_
+    kernels = torch.tanh, torch.ops.aten.tanh_backward.grad_input
 
     @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:

@@ -28,6 +28,7 @@ from netspec.graph import Report, raise_fault
 from netspec.layers import fillers
 from netspec.layers.learned import Learned, values_of
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.training import Kernels, Learning, recorded
 from netspec.limits import amount, is_out_of_memory, memory
 from netspec.proto.schema import TEST
 
@@ -218,6 +219,7 @@ class Layer(torch.nn.Module):
         super().__init_subclass__(**named)
         for name in (
             "prepare",
+            "prepare_training",
             "finishing",
             "fresh",
             "any_layout",
@@ -363,6 +365,10 @@ class Layer(torch.nn.Module):
         another form, copied: whoever writes to them has it prepared anew. No kernel may keep an alias of them.
         """
         return finished(self.forward, how.finish)
+
+    def prepare_training(self, learning: Learning) -> Kernels:
+        """Return what computes ``forward``, and its gradients, for bottoms of the present shapes, again and again."""
+        return recorded(self.run, learning)
 
     def finishing(self) -> Finish | None:
         """Return what computes the layer in place, where it maps number to number and there is such a function."""

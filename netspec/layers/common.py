@@ -10,11 +10,13 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
+from netspec.exact.bound import BoundVectors
 from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts, prepared_vectors
 from netspec.layers import fused
 from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.training import Kernels, Learning, Room, recorded
 from netspec.proto.schema import TRAIN
 
 
@@ -92,6 +94,43 @@ class InnerProduct(Layer):
         return lambda data: multiply(data.reshape(one_by_one)).view(top_shape)
 
     @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        weight, bias = (*self.values(), None)[:2]
+        sums, transposed = (*learning.sums, None)[:2], self.param.inner_product_param.transpose
+        top_shape, inputs, wanted = self.top_shapes[0], self.inputs, learning.wanted[0]
+        if math.prod(top_shape) == 0 or inputs == 0:
+            return recorded(self.run, learning)
+        if self.is_exact(weight, self.small):
+            bound = BoundVectors(self.bottom_shapes[0], top_shape, transposed, weight, bias, *sums, wanted)
+            return bound.forward, bound.backward
+        tops = weight.new_empty(math.prod(top_shape[:-1]), top_shape[-1])
+        top, matrix = tops.view(top_shape), weight if transposed else weight.t()
+        diff = torch.empty(self.bottom_shapes[0]) if wanted else None
+        vectors_diff = None if diff is None else diff.view(-1, inputs)
+        vectors = tops
+
+        def forward(data: torch.Tensor) -> torch.Tensor:
+            nonlocal vectors
+            vectors = data.reshape(-1, inputs)
+            if bias is None:
+                torch.mm(vectors, matrix, out=tops)
+            else:
+                torch.addmm(bias, vectors, matrix, out=tops)
+            return top
+
+        def backward(top_diff: torch.Tensor) -> torch.Tensor | None:
+            tops_diff = top_diff.reshape(tops.shape)
+            if sums[0] is not None:
+                sums[0].addmm_(*((vectors.t(), tops_diff) if transposed else (tops_diff.t(), vectors)))
+            if sums[1] is not None:
+                sums[1].add_(tops_diff.sum(0))
+            if vectors_diff is not None:
+                torch.mm(tops_diff, matrix.t(), out=vectors_diff)
+            return diff
+
+        return forward, backward
+
+    @override
     def multiply_adds(self) -> int:
         return math.prod(self.top_shapes[0]) * self.inputs
 
@@ -159,6 +198,23 @@ class Dropout(Layer):
             return data
         kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
         return data * kept.mul_(1 / (1 - self.ratio))
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        """Return the kernels; the numbers drawn are kept, and scale the gradients too."""
+        if self.phase != TRAIN:
+            return lambda data: data, lambda diff: diff
+        draws, rooms, share = self.context.random, (Room(), Room(), Room()), 1 - self.ratio
+
+        def forward(data: torch.Tensor) -> torch.Tensor:
+            kept, top = rooms[0].like(data), rooms[1].like(data)
+            kept.bernoulli_(share, generator=draws.on(data.device)).mul_(1 / share)
+            return torch.mul(data, kept, out=top)
+
+        def backward(diff: torch.Tensor) -> torch.Tensor:
+            return torch.mul(diff, rooms[0].like(diff), out=rooms[2].like(diff))
+
+        return forward, backward
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:

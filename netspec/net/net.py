@@ -37,6 +37,7 @@ from netspec.net.programs import Programs
 from netspec.net.segments import Segment, find_segments
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
+from netspec.run.training import TrainingStep, obstacle
 
 Array = np.ndarray | torch.Tensor
 MUCH = 8  # a net that takes more than this part of the limit is first looked at as a whole
@@ -327,6 +328,14 @@ class Net(torch.nn.Module):
         self.blobs = {self.plan.blobs[v]: values[v] for v in sorted(kept)}
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
+
+    def training_step(self) -> TrainingStep | str:
+        """Return what trains the net by kernels prepared once, or in words why there is none."""
+        if self._segments:
+            return "its layers are compiled"
+        if why := obstacle(self.plan, list(self.layers), self._chains):
+            return why
+        return TrainingStep(self.plan, list(self.layers), self.loss_weights, self._overwritten, self.weighted_sum)
 
     def _following(self, i: int, kept: frozenset[int]) -> list[Layer]:
         """Return the layers that may run with layer ``i``: nobody looks at what lies between."""

@@ -32,7 +32,9 @@ from netspec.proto.binary import split_paths
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
+from netspec.run.training import TrainingStep, is_watched
 from netspec.solver import nets, update
+from netspec.solver.blocks import Blocks
 from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
 from netspec.solver.debug import debug_info
 from netspec.solver.extra import (
@@ -217,6 +219,7 @@ class Solver:
         self._scale, self._overflowed = LossScale(precision), False
         self._exact = exact if precision == FP32 and not compiled else NONE
         self._compiled = compiled
+        self._prepared: TrainingStep | str | None = None  # what trains, or why there is none
         if compiled and (lack := missing_tool(self._device)):
             raise SpecError(f"--compile: {lack}", node.where)
         self._strict = strict
@@ -250,11 +253,8 @@ class Solver:
         if precision == FP16 and self._device.type == "cpu":
             log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs")
         log.info("solver.cpp:57", "Solver scaffolding done.")
-        self.history = [
-            torch.zeros_like(learnable.parameter.detach())
-            for _ in range(self._rule.sets)
-            for learnable in self.net.learnable
-        ]
+        self._blocks = Blocks(self.net.learnable, self._rule.sets)
+        self.history = self._blocks.history
 
     def _build(self, described: nets.SolverNet, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> Net:
         """Build a net and load the weights to start from.
@@ -411,10 +411,16 @@ class Solver:
 
     def clear_gradients(self) -> None:
         """Clear the gradients, before an iteration sums them up."""
-        update.clear(item.parameter for item in self.net.learnable)
+        self._blocks.clear()
 
     def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the training net forward and backward; return its loss and outputs."""
+        if self._prepared is None:
+            self._prepared = self.net.training_step() if self._precision == FP32 else "its precision is not fp32"
+        if isinstance(self._prepared, TrainingStep) and not self.net.keep and not is_watched(self.net.layers):
+            loss, outputs = self._prepared.run()
+            self.net.__dict__["blobs"] = outputs  # a module's own way of setting is slow
+            return loss, outputs
         with computing(self._precision, self._device):
             loss, outputs = self.net.forward_loss()
         if loss.requires_grad:
@@ -441,21 +447,15 @@ class Solver:
         if self._overflowed:
             self.iteration += 1
             return
-        learnable = self.net.learnable
-        weights = [item.parameter.detach() for item in learnable]
-        diffs = [
-            torch.zeros_like(w) if item.parameter.grad is None else item.parameter.grad
-            for item, w in zip(learnable, weights, strict=True)
-        ]
-        clipped = update.clip(diffs, self.param.clip_gradients)
+        clipped = (
+            update.clip(self._blocks.diffs(), self.param.clip_gradients) if self.param.clip_gradients >= 0 else None
+        )
         if clipped:
             norm, factor = map(log.number, clipped)
             limit = log.number(self.param.clip_gradients)
             message = f"Gradient clipping: scaling down gradients (L2 norm {norm} > {limit}) by scale factor {factor}"
             log.info("sgd_solver.cpp:99", message)
-        decays = [self.param.weight_decay * item.decay_mult for item in learnable]
-        rates = [rate * item.lr_mult for item in learnable]
-        update.move(self._rule, self.param, weights, diffs, self.history, rates, decays, self.iteration)
+        self._blocks.move(self._rule, self.param, rate, self.iteration)
         self.replicas.update()
         self.iteration += 1
 

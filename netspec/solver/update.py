@@ -112,10 +112,24 @@ def move(
             for tensors in flat
         )
         own_rates, own_decays = ([numbers[i] for i, _ in block] for numbers in (rates, decays))
-        normalize(own_diffs, param.iter_size)
-        regularize(own_diffs, own_weights, own_decays, param.regularization_type)
-        rule.compute(param, own_diffs, own_rates, own_history, iteration)
-        subtract(own_weights, own_diffs)
+        move_block(rule, param, own_weights, own_diffs, own_history, own_rates, own_decays, iteration)
+
+
+def move_block(
+    rule: Rule,
+    param: Any,
+    weights: Tensors,
+    diffs: Tensors,
+    history: Tensors,
+    rates: Sequence[float],
+    decays: Sequence[float],
+    iteration: int,
+) -> None:
+    """Do all steps of :func:`move` to what fits into a CPU's cache."""
+    normalize(diffs, param.iter_size)
+    regularize(diffs, weights, decays, param.regularization_type)
+    rule.compute(param, diffs, rates, history, iteration)
+    subtract(weights, diffs)
 
 
 def _blocks(tensors: Tensors) -> Iterator[list[tuple[int, slice]]]:

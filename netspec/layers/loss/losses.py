@@ -37,6 +37,7 @@ from netspec.layers.loss.base import (
 )
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.training import Kernels, Learning, Room, recorded
 from netspec.limits import read_bytes
 from netspec.proto.schema import BlobProto
 
@@ -118,6 +119,34 @@ class SoftmaxWithLoss(SoftmaxLoss):
         exact = self.is_exact(x, small=math.prod(x.shape[1:]) <= SMALL_ITEM)
         losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, exact)
         return (self.sum_up(losses, valid, exact), p.reshape(scores.shape))[: self.num_tops]
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        """Return the kernels, where every label counts."""
+        if self.ignore_label is not None:
+            return recorded(self.run, learning)
+        shape, tops, room = self.bottom_shapes[0], self.num_tops, Room()
+        split, flat = (self.outer, self.classes, self.inner), (self.outer, 1, self.inner)
+        divisor = normalizer(self.normalization, self.outer, self.inner, None)
+        exact = self.is_exact(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM)
+        minus_one = torch.tensor(-1.0).expand(flat)
+        p = label = torch.empty(0)
+
+        def forward(scores: torch.Tensor, labels: torch.Tensor) -> Any:
+            nonlocal p, label
+            label = labels.reshape(flat).long()
+            self.valid(label, None)
+            x = scores.reshape(split)
+            p = softmax(x) if exact else F.softmax(x, 1)
+            chosen = p.gather(1, label).clamp_(min=FLT_MIN)
+            loss = total(-(libm.log(chosen) if exact else chosen.log()), exact) / divisor
+            return (loss, p.reshape(shape))[:tops]
+
+        def backward(diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
+            found = room.like(p).copy_(p).scatter_add_(1, label, minus_one)
+            return found.mul_(diff / divisor).view(shape), None
+
+        return forward, backward
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
@@ -421,6 +450,26 @@ class EuclideanLoss(Loss):
         exact = self.is_exact(difference)
         squares = RowSquares.apply(difference.reshape(1, -1))[0] if exact else difference.square().sum()
         return squares / (2 * a.shape[0])
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        shape, other = self.bottom_shapes
+        difference, found = torch.empty(shape), [torch.empty(shape) if wanted else None for wanted in learning.wanted]
+        row, divisor, exact = difference.view(1, -1), 2 * shape[0], self.is_exact(difference)
+
+        def forward(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+            torch.sub(a, b.reshape(shape), out=difference)
+            return (RowSquares.apply(row)[0] if exact else difference.square().sum()) / divisor
+
+        def backward(diff: torch.Tensor) -> Sequence[torch.Tensor | None]:
+            factor = diff / divisor * 2
+            if found[0] is not None:
+                torch.mul(difference, factor, out=found[0])
+            if found[1] is not None:
+                torch.mul(difference, -factor, out=found[1])
+            return found[0], None if found[1] is None else found[1].view(other)
+
+        return forward, backward
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:

@@ -9,10 +9,12 @@ from typing import Any
 import torch
 from typing_extensions import override
 
+from netspec.exact import switch
 from netspec.exact.sums import Copies, Tiles
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.training import Kernels, Learning
 
 
 def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
@@ -34,6 +36,11 @@ class _OtherShape(Layer):
     @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        (shape,), (top_shape,) = self.bottom_shapes, self.top_shapes
+        return lambda x: x.reshape(top_shape), lambda diff: diff.reshape(shape)
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
@@ -140,6 +147,11 @@ class Concat(Layer):
     @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        axis, sizes = self.axis, [shape[self.axis] for shape in self.bottom_shapes]
+        return lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis)
 
     any_layout = True
 
@@ -254,6 +266,18 @@ class Split(Layer):
         if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        """Return the kernels; gradients are added in Caffe's order, or in the order of autograd: the last one first."""
+        order = 1 if self.num_tops > 2 and switch.applies(self.context.exact, torch.empty(1)) else -1
+        tops = self.num_tops
+
+        def backward(*diffs: torch.Tensor | None) -> torch.Tensor:
+            first, *others = [diff for diff in diffs[::order] if diff is not None]
+            return sum(others, first)
+
+        return lambda x: (x,) * tops, backward
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
+from netspec.exact.bound import BoundColumns
 from netspec.exact.products import (
     ColumnProducts,
     Columns,
@@ -19,6 +20,7 @@ from netspec.exact.products import (
     SpreadProducts,
     SummedConvolutions,
     convolution,
+    laid_out_like,
     prepared_columns,
 )
 from netspec.exact.switch import is_recorded
@@ -26,6 +28,7 @@ from netspec.layers import fused
 from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.training import Kernels, Learning, recorded
 from netspec.layers.vision.layout import channels_side_by_side
 
 
@@ -274,6 +277,54 @@ class Convolution(_SlidingFilter):
         return finished(lambda maps: torch.conv2d(maps, weight, bias, *geometry), how.finish)
 
     @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        """Return the kernels for a single bottom (N, C, H, W)."""
+        shape = self.bottom_shapes[0]
+        usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(shape))
+        if not usual or len(self.bottom_shapes) > 1 or math.prod(self.top_shapes[0]) == 0:
+            return recorded(self.run, learning)
+        sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
+        weight, bias = (*self.values(), None)[:2]
+        sums = (*learning.sums, None)[:2]
+        if self.is_exact(weight, self.small):
+            bound = BoundColumns(shape, sliding, self.group, weight, bias, *sums, learning.wanted[0])
+            return bound.forward, bound.backward
+        lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else torch.Tensor.contiguous
+        return self.convolutions(sliding, weight, bias, sums, learning.wanted[0], lay_out)
+
+    def convolutions(
+        self,
+        sliding: Filter,
+        weight: torch.Tensor,
+        bias: torch.Tensor | None,
+        sums: Sequence[torch.Tensor | None],
+        wanted: bool,
+        lay_out: Callable[[torch.Tensor], torch.Tensor],
+    ) -> Kernels:
+        """Return what :class:`SummedConvolutions` computes, of maps that ``lay_out`` puts into its order."""
+        geometry = (sliding.stride, sliding.pad, sliding.dilation)
+        asked = (wanted, *(total is not None for total in sums))
+        bias_shape = None if bias is None else list(bias.shape)
+        gradients = torch.ops.aten.convolution_backward.default
+        maps = laid_out = weight
+
+        def forward(x: torch.Tensor) -> torch.Tensor:
+            nonlocal maps, laid_out
+            maps, laid_out = x, lay_out(x)
+            return torch.conv2d(laid_out, weight, bias, *geometry, self.group)
+
+        def backward(diff: torch.Tensor) -> torch.Tensor | None:
+            maps_diff, *found = gradients(
+                diff, laid_out, weight, bias_shape, *geometry, False, [0, 0], self.group, asked
+            )
+            for total, gradient in zip(sums, found, strict=True):
+                if total is not None:
+                    total.add_(gradient)
+            return laid_out_like(maps, maps_diff) if wanted else None
+
+        return forward, backward
+
+    @override
     def multiply_adds(self) -> int:
         pixels = math.prod(self.top_shapes[0]) // self.num_output
         return len(self.top_shapes) * pixels * math.prod(self.blob_shapes[0])
@@ -387,6 +438,10 @@ class Deconvolution(Convolution):
     @override
     def small(self) -> bool:
         return False
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        return recorded(self.run, learning)
 
     @override
     def prepare(self, how: Preparation) -> Kernel:

@@ -16,6 +16,7 @@ from netspec.exact.switch import is_recorded
 from netspec.layers.base import Kernel, Layer, Preparation, Shape, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.training import Kernels, Learning, recorded
 from netspec.layers.vision.layout import channels_side_by_side
 from netspec.proto.schema import TRAIN
 
@@ -336,6 +337,41 @@ class Pooling(_PoolingBase):
             )  # as there: torch lets NaN win
 
         return finished(kernel, how.finish)
+
+    @override
+    def prepare_training(self, learning: Learning) -> Kernels:
+        """Return the kernels; where a window has no pixel to win, autograd records the pass."""
+        windows, empty = self.windows, math.prod(self.top_shapes[0]) == 0
+        record, trace = recorded(self.run, learning)
+        if self.num_tops > 1 or self.method == STOCHASTIC or empty or not windows.known_to_torch:
+            return record, trace
+        geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
+        given = bottom = indices = torch.empty(0)
+        if self.method == AVE:
+            spread_evenly = torch.ops.aten.avg_pool2d_backward.default
+
+            def average(maps: torch.Tensor) -> torch.Tensor:
+                nonlocal bottom
+                bottom = maps
+                return F.avg_pool2d(maps, *geometry, ceil, True)
+
+            return average, lambda diff: spread_evenly(diff, bottom, *geometry, ceil, True, None)
+        spread, is_usual = torch.ops.aten.max_pool2d_with_indices_backward.default, True
+
+        def forward(maps: torch.Tensor) -> Any:
+            nonlocal given, bottom, indices, is_usual
+            given, bottom = maps, channels_side_by_side(maps)
+            values, indices = F.max_pool2d(bottom, *geometry, 1, ceil, return_indices=True)
+            is_usual = values.amin().item() > LOWEST  # as in max_pool: torch lets NaN win
+            return values if is_usual else record(maps)
+
+        def backward(diff: torch.Tensor) -> Any:
+            if not is_usual:
+                return trace(diff)
+            found = spread(diff, bottom, *geometry, [1, 1], ceil, indices)
+            return found if bottom is given else found.contiguous()
+
+        return forward, backward
 
     @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:

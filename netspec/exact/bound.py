@@ -1,0 +1,191 @@
+"""Products with learned weights for training at fixed shapes: what netspec/exact/products.py computes, call by call.
+
+The arguments of BLAS' calls are made once: they are views of memory that stays where it is. Everything here expects
+that BLAS uses one thread.
+
+Caffe: src/caffe/layers/inner_product_layer.cpp, base_conv_layer.cpp
+"""
+
+# pyright: reportPrivateImportUsage=false
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from netspec.exact.blas import gemm_routine, gemv_routine
+from netspec.exact.products import Filter, columns_of_shape
+
+
+class Matrix:
+    """Shows tensors as matrices with so many columns, to BLAS, which takes them as transposed.
+
+    A tensor that comes again, the same object, has its view from the last time. One whose numbers do not lie one after
+    the other is copied.
+    """
+
+    __slots__ = ("_columns", "_copy", "_last", "_shown", "_tensor")
+
+    def __init__(self, columns: int) -> None:
+        self._columns = columns
+        self._last: torch.Tensor | None = None
+        self._tensor: torch.Tensor | None = None
+
+    def __call__(self, tensor: torch.Tensor) -> np.ndarray:
+        """Return the view, (columns, rows)."""
+        if tensor is self._last:
+            return self._shown
+        if tensor.is_contiguous():
+            self._last = tensor
+            self._shown = tensor.view(-1, self._columns).numpy().T
+            return self._shown
+        if self._tensor is None:
+            self._tensor = torch.empty(tensor.shape, dtype=tensor.dtype)
+            self._copy = self._tensor.view(-1, self._columns).numpy().T
+        self._tensor.copy_(tensor)
+        return self._copy
+
+
+class BoundVectors:
+    """:class:`netspec.exact.products.VectorProducts` of vectors of one shape, and of one matrix.
+
+    ``shape`` is the bottom's, any that has rows of K numbers; the top is ``top_shape``. ``weight_sums`` and
+    ``bias_sums`` are where gradients are added up, None where there are none; ``wanted`` says whether the bottom's is.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        top_shape: tuple[int, ...],
+        transposed: bool,
+        weight: torch.Tensor,
+        bias: torch.Tensor | None,
+        weight_sums: torch.Tensor | None,
+        bias_sums: torch.Tensor | None,
+        wanted: bool,
+    ) -> None:
+        inputs, outputs = weight.shape if transposed else (weight.shape[1], weight.shape[0])
+        rows = math.prod(shape) // inputs
+        self._matrix, self._transposed = weight.numpy().T, transposed
+        self._top = torch.empty(top_shape, dtype=weight.dtype)
+        self._rows = self._top.view(rows, outputs)
+        self._shown = self._rows.numpy().T
+        self._bias = bias
+        self._vectors, self._diffs = Matrix(inputs), Matrix(outputs)
+        self._weight_sums = None if weight_sums is None else weight_sums.numpy().T
+        self._bias_sums = None if bias_sums is None else bias_sums.numpy()
+        self._diff = torch.empty(shape, dtype=weight.dtype) if wanted else None
+        self._diff_shown = None if self._diff is None else self._diff.view(rows, inputs).numpy().T
+        self._ones = np.ones(rows, self._matrix.dtype)
+        self._gemm, self._gemv = gemm_routine(self._matrix), gemv_routine(self._matrix)
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the products."""
+        self._read = self._vectors(data)
+        self._gemm(1.0, self._matrix, self._read, 0.0, self._shown, not self._transposed, 0, 1)
+        if self._bias is not None:
+            self._rows.add_(self._bias)
+        return self._top
+
+    def backward(self, diff: torch.Tensor) -> torch.Tensor | None:
+        """Add up the gradients of the weights; return the vectors'."""
+        rows = self._diffs(diff)
+        if self._weight_sums is not None:
+            first, second = (rows, self._read) if self._transposed else (self._read, rows)
+            self._gemm(1.0, first, second, 1.0, self._weight_sums, 0, 1, 1)
+        if self._bias_sums is not None:
+            self._gemv(1.0, rows, self._ones, 1.0, self._bias_sums, 0, 1, 0, 1, 0, 1)
+        if self._diff_shown is not None:
+            self._gemm(1.0, self._matrix, rows, 0.0, self._diff_shown, self._transposed, 0, 1)
+        return self._diff
+
+
+class BoundColumns:
+    """:class:`netspec.exact.products.ColumnProducts` of maps (N, C, H, W) of one shape.
+
+    The columns of a batch that fits into :data:`netspec.exact.products.COLUMNS` are kept for the backward pass.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        sliding: Filter,
+        group: int,
+        weight: torch.Tensor,
+        bias: torch.Tensor | None,
+        weight_sums: torch.Tensor | None,
+        bias_sums: torch.Tensor | None,
+        wanted: bool,
+    ) -> None:
+        count, channels, *size = shape
+        self._size, self._sliding = tuple(size), sliding
+        fits = sliding.fits(self._size)
+        self._top = torch.empty((count, len(weight), *fits), dtype=weight.dtype)
+        self._bias = None if bias is None else bias.view(-1, 1, 1)
+        self._at_once = min(count, sliding.images_at_once(channels, self._size))
+        positions = math.prod(fits)
+        self._tops = [image.numpy() for image in self._top.flatten(2)]
+        self._columns = [
+            columns_of_shape((min(self._at_once, count - start), channels, *size), weight.dtype, sliding, fits)
+            for start in range(0, count, self._at_once)
+        ]
+        self._groups = [
+            (
+                slice(g * len(weight) // group, (g + 1) * len(weight) // group),
+                slice(
+                    g * channels // group * math.prod(sliding.kernel),
+                    (g + 1) * channels // group * math.prod(sliding.kernel),
+                ),
+            )
+            for g in range(group)
+        ]
+        self._filters = weight.flatten(1).numpy()
+        self._weight_sums = None if weight_sums is None else weight_sums.flatten(1).numpy()
+        self._bias_sums = None if bias_sums is None else bias_sums.numpy()
+        self._diffs = Matrix(positions)
+        self._ones = np.ones(positions, self._filters.dtype)
+        self._spread = None
+        if wanted:
+            rows = channels * math.prod(sliding.kernel)
+            self._spread = torch.empty((self._at_once, rows, positions), dtype=weight.dtype)
+        self._gemm, self._gemv = gemm_routine(self._filters), gemv_routine(self._filters)
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """Return the responses."""
+        self._maps = maps
+        for k, lay_out in enumerate(self._columns):
+            start = k * self._at_once
+            self._laid_out = lay_out(maps[start : start + self._at_once] if len(self._columns) > 1 else maps)
+            for columns, top in zip(self._laid_out, self._tops[start:], strict=False):
+                for outputs, inputs in self._groups:
+                    self._gemm(1.0, columns[inputs].T, self._filters[outputs].T, 0.0, top[outputs].T, 0, 0, 1)
+        if self._bias is not None:
+            self._top.add_(self._bias)
+        return self._top
+
+    def backward(self, diff: torch.Tensor) -> torch.Tensor | None:
+        """Add up the gradients of filters and bias; return the maps'."""
+        count, outputs = self._top.shape[:2]
+        diffs = self._diffs(diff).T.reshape(count, outputs, -1)
+        if self._bias_sums is not None:
+            for each in diffs:
+                self._gemv(1.0, each.T, self._ones, 1.0, self._bias_sums, 0, 1, 0, 1, 1, 1)
+        found: list[torch.Tensor] = []
+        for k, lay_out in enumerate(self._columns):
+            start = k * self._at_once
+            some = diffs[start : start + self._at_once]
+            if self._weight_sums is not None:
+                laid_out = (
+                    lay_out(self._maps[start : start + self._at_once]) if len(self._columns) > 1 else self._laid_out
+                )
+                for columns, each in zip(laid_out, some, strict=True):
+                    for rows, inputs in self._groups:
+                        self._gemm(1.0, columns[inputs].T, each[rows].T, 1.0, self._weight_sums[rows].T, 1, 0, 1)
+            if self._spread is not None:
+                spread = self._spread[: len(some)]
+                for columns, each in zip(spread.numpy(), some, strict=True):
+                    for rows, inputs in self._groups:
+                        self._gemm(1.0, each[rows].T, self._filters[rows].T, 0.0, columns[inputs].T, 0, 1, 1)
+                found.append(self._sliding.spread(spread, self._size))
+        return None if not found else found[0] if len(found) == 1 else torch.cat(found)

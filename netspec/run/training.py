@@ -1,0 +1,225 @@
+"""Training passes of small nets: each layer prepared once, then run forward and backward without autograd between them.
+
+A pass through autograd costs about a millisecond for ten layers, whatever their size; that is what a net of small
+layers or batches spends most of its time on. Here a layer is a pair of kernels (netspec/layers/training.py), made for
+the shapes at hand, and a pass calls one after the other. The numbers are the same.
+"""
+
+# pyright: reportPrivateImportUsage=false
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from netspec.exact.blas import one_thread
+from netspec.graph.plan import Plan
+from netspec.layers.base import Layer
+from netspec.layers.learned import values_of
+from netspec.layers.training import Backward, Diff, Forward, Kernels, Learning, recorded
+from netspec.limits import is_out_of_memory
+
+LARGEST = 2**24  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
+Values = list[Any]  # by value number, a tensor or None
+
+
+def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int]] = ()) -> str:
+    """Return why a net is not trained by prepared kernels, in words; "" if it is.
+
+    ``chained[i]`` has the layers that may run together with layer i (netspec/net/chains.py).
+    """
+    for node, row in zip(plan.nodes, chained, strict=False):
+        if row:
+            return f'"{node.name}" runs together with the layers after it'
+    count = sum(math.prod(shape) for layer in layers for shape in layer.top_shapes)
+    if count > LARGEST:
+        return f"its tops have {count:,} numbers, more than {LARGEST:,}"
+    for node, layer in zip(plan.nodes, layers, strict=True):
+        if layer.context.device.type != "cpu":
+            return "it runs on a GPU"
+        if layer.is_input:
+            return f'"{node.name}" is an input'
+        if any(blob.dtype != torch.float32 for blob in layer.blobs):
+            return f'"{node.name}" does not compute in float32'
+    readers = Counter(v for node in plan.nodes for v in node.bottoms)
+    if any(count > 1 for count in readers.values()):
+        return "a blob has several readers without a Split"
+    owned = Counter(id(blob) for layer in layers for blob in layer.blobs)
+    for node, layer in zip(plan.nodes, layers, strict=True):
+        if type(layer).prepare_training is Layer.prepare_training and any(owned[id(blob)] > 1 for blob in layer.blobs):
+            return f'"{node.name}" shares parameters, and only autograd adds up their gradients'
+    return ""
+
+
+def is_watched(layers: Iterable[Layer]) -> bool:
+    """Return whether hooks wait for autograd's passes, on layers or on learnable blobs, or no gradients are wanted."""
+    if not torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
+        return True
+    for layer in layers:
+        if layer._forward_hooks or layer._forward_pre_hooks or layer._backward_hooks or layer._backward_pre_hooks:
+            return True
+        for blob in layer.blobs._parameters.values():
+            if blob._backward_hooks or blob._post_accumulate_grad_hooks:
+                return True
+    return False
+
+
+@dataclass
+class _Prepared:
+    """The kernels of all layers for one set of shapes, and what they hold."""
+
+    forward: list[tuple[Forward, tuple[int, ...], tuple[int, ...], list[tuple[int, float]]]]
+    backward: list[tuple[Backward, tuple[int, ...], tuple[int, ...]]]
+    held: list[tuple[dict[str, Any], str, torch.Tensor, int, bool, Diff]]  # each learnable blob as it was
+    start: Values  # the gradients that are there before the backward pass: those of the losses
+
+    def is_current(self) -> bool:
+        """Return whether learnable blobs and their gradients lie where they did."""
+        for owner, name, blob, place, learned, gradient in self.held:
+            if owner[name] is not blob or blob.data_ptr() != place or blob.requires_grad != learned:
+                return False
+            if blob.grad is not gradient:
+                return False
+        return True
+
+
+class TrainingStep:
+    """Forward and backward passes of a net that trains.
+
+    ``loss_weights[i][j]`` is the loss weight of layer i's top j, ``weighted(top, weight)`` its part of the loss.
+    ``overwritten[i]``: layer i's gradient reads memory that is overwritten in place (netspec/net/in_place.py).
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        layers: Sequence[Layer],
+        loss_weights: Sequence[Sequence[float]],
+        overwritten: Sequence[bool],
+        weighted: Callable[[torch.Tensor, float], torch.Tensor],
+    ) -> None:
+        self._plan, self._layers, self._loss_weights = plan, list(layers), loss_weights
+        self._overwritten, self._weighted = overwritten, weighted
+        self._sources = [i for i, node in enumerate(plan.nodes) if not node.bottoms and not len(layers[i].blobs)]
+        self._made: dict[tuple[torch.Size, ...], _Prepared] = {}
+        self._values: Values = []
+
+    def run(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Run the net forward and backward; return the weighted sum of its losses, and the outputs.
+
+        The gradients of the learnable blobs are added to ``grad``.
+        """
+        plan, layer = self._plan, self._layers[0]
+        try:
+            with torch.no_grad(), one_thread():
+                values: Values = [None] * len(plan.blobs)
+                shapes = []
+                for i in self._sources:
+                    layer = self._layers[i]
+                    for v, top in zip(plan.nodes[i].tops, layer.run(), strict=False):
+                        values[v] = top
+                        shapes.append(top.shape)
+                prepared = self._made.get(key := tuple(shapes))
+                if prepared is None or not prepared.is_current():
+                    self._made = {key: (prepared := self._prepare(values))}
+                return self._run(prepared, values)
+        except (MemoryError, RuntimeError) as fault:
+            if is_out_of_memory(fault):
+                raise layer.error("the training needs more memory than there is") from None
+            raise
+
+    def _run(self, prepared: _Prepared, values: Values) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        self._values = values
+        loss: torch.Tensor | None = None
+        for kernel, bottoms, tops, losses in prepared.forward:
+            made = kernel(*[values[v] for v in bottoms])
+            if not isinstance(made, torch.Tensor):
+                for v, top in zip(tops, made, strict=False):
+                    values[v] = top
+            else:
+                if tops:
+                    values[tops[0]] = made
+                made = (made,)
+            for j, weight in losses:
+                term = made[j] if weight == 1 and not made[j].shape else self._weighted(made[j], weight)
+                loss = term if loss is None else loss + term
+        diffs = list(prepared.start)
+        for kernel, tops, bottoms in prepared.backward:
+            given = [diffs[v] for v in tops]
+            if all(diff is None for diff in given):
+                continue
+            found = kernel(*given)
+            if found is not None:
+                for v, diff in zip(bottoms, (found,) if isinstance(found, torch.Tensor) else found, strict=False):
+                    if v >= 0 and diff is not None:
+                        diffs[v] = diff if diffs[v] is None else diffs[v] + diff
+        self._values = []
+        outputs = {name: values[v].clone() for name, v in self._plan.outputs.items()}
+        return torch.zeros(()) if loss is None else loss.clone(), outputs
+
+    def _prepare(self, values: Values) -> _Prepared:
+        """Make the kernels for data of these shapes; let every learned blob have a gradient."""
+        plan = self._plan
+        shapes = {v: tuple(x.shape) for v, x in enumerate(values) if x is not None}
+        needs: set[int] = set()  # values whose gradient somebody reads
+        made = _Prepared([], [], [], [None] * (len(plan.blobs) + len(plan.nodes)))
+        for i, (node, layer) in enumerate(zip(plan.nodes, self._layers, strict=True)):
+            for name, blob in layer.blobs._parameters.items():
+                if blob.requires_grad and blob.grad is None:
+                    blob.grad = torch.zeros_like(blob, memory_format=torch.contiguous_format)
+                made.held.append((layer.blobs._parameters, name, blob, blob.data_ptr(), blob.requires_grad, blob.grad))
+            if i in self._sources:
+                if losses := self._losses(i, layer, made):
+                    made.forward.append((lambda *tops: tops, node.tops, (), losses))
+                continue
+            layer.fit([shapes[v] for v in node.bottoms])
+            shapes.update(zip(node.tops, layer.top_shapes, strict=False))
+            free = [plan.net.force_backward or not blocked for blocked in node.blocked]
+            wanted = tuple(v in needs and f for v, f in zip(node.bottoms, free, strict=True))
+            learns = any(blob.requires_grad for blob in layer.blobs)
+            forward, backward = self._kernels(i, wanted)
+            made.forward.append((forward, node.bottoms, node.tops, self._losses(i, layer, made)))
+            if any(wanted) or learns:
+                needs.update(node.tops)
+                bottoms = tuple(v if w else -1 for v, w in zip(node.bottoms, wanted, strict=True))
+                made.backward.append((backward, self._tops(i), bottoms))
+        made.backward.reverse()
+        return made
+
+    def _losses(self, i: int, layer: Layer, made: _Prepared) -> list[tuple[int, float]]:
+        """Note the gradients of a layer's losses; return which of its tops they are, and their weights."""
+        found = [(j, weight) for j, weight in enumerate(self._loss_weights[i]) if weight]
+        for j, weight in found:
+            made.start[self._tops(i)[j]] = torch.full(layer.top_shapes[j], weight)
+        return found
+
+    def _tops(self, i: int) -> tuple[int, ...]:
+        """Return the values that layer i makes; a loss may have a top without a name."""
+        return self._plan.nodes[i].tops or (len(self._plan.blobs) + i,)
+
+    def _kernels(self, i: int, wanted: tuple[bool, ...]) -> Kernels:
+        layer = self._layers[i]
+        if self._overwritten[i]:
+            return self._overwritten_kernels(i)
+        whole = all(layer.blob(j) is blob and blob.is_contiguous() for j, blob in enumerate(layer.blobs))
+        learning = Learning(wanted, tuple(blob.grad if blob.requires_grad else None for blob in layer.blobs))
+        return layer.prepare_training(learning) if whole else recorded(layer.run, learning)
+
+    def _overwritten_kernels(self, i: int) -> Kernels:
+        """Return the kernels of a layer whose gradient reads what later layers have left in its memory."""
+        node, layer = self._plan.nodes[i], self._layers[i]
+        final = self._plan.final[node.tops[0]]
+        held = node.in_place[0] and bool(layer.gradient_reads & {"bottom", "sign"})
+
+        def forward(bottom: torch.Tensor) -> torch.Tensor:
+            return layer.run(bottom)[0]
+
+        def backward(diff: torch.Tensor) -> torch.Tensor:
+            top = self._values[final]
+            return layer.caffes_gradient(top if held else self._values[node.bottoms[0]], top, diff)
+
+        return forward, backward

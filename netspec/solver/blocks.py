@@ -1,0 +1,164 @@
+"""The learned blobs of a training, side by side in memory, so that one operation updates many of them.
+
+An operation of torch takes as long for a bias of ten numbers as for ten thousand. So small blobs that have the same
+multipliers are put into one piece of memory, and so are their gradients and their history: parameters stay what they
+are, views of that memory. Large ones stay where they are, and are cut into blocks that fit into a CPU's cache. All of
+Caffe's rules work number by number, so this changes no number.
+"""
+
+# pyright: reportPrivateImportUsage=false
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+
+from netspec.layers.learned import values_of
+from netspec.solver import update
+
+LINE = 16  # numbers, 64 bytes: where each blob begins
+
+
+class Learnable(Protocol):
+    """A parameter with its multipliers, as in netspec/net/net.py."""
+
+    parameter: torch.nn.Parameter
+    lr_mult: float
+    decay_mult: float
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Numbers that lie side by side, with their gradients and their history, a tensor for each set."""
+
+    weights: torch.Tensor
+    diffs: torch.Tensor
+    history: list[torch.Tensor]
+    lr_mult: float
+    decay_mult: float
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a parameter and its gradient were put."""
+
+    parameter: torch.nn.Parameter
+    address: int
+    gradient: torch.Tensor | None
+
+
+class Blocks:
+    """The parameters that a solver updates, and the rule's history of each: ``sets`` after one another.
+
+    Parameters move in memory when this is made, on a CPU; nobody may hold aliases of them yet.
+    """
+
+    def __init__(self, learnable: Sequence[Learnable], sets: int) -> None:
+        self._learnable, self._sets = learnable, sets
+        self._places: list[_Place] = []
+        self._gradients: list[torch.Tensor] = []  # each piece of memory
+        self._blocks: list[_Block] = []
+        self._histories: dict[int, list[torch.Tensor]] = {}
+        groups: dict[Any, list[int]] = {}
+        if not all(item.parameter.device.type == "cpu" and item.parameter.is_contiguous() for item in learnable):
+            self.history = [torch.zeros_like(values_of(item.parameter)) for _ in range(sets) for item in learnable]
+            return
+        for i, item in enumerate(learnable):
+            blob = item.parameter
+            if blob.numel() > update.BLOCK:
+                self._keep(i)
+            else:
+                groups.setdefault((item.lr_mult, item.decay_mult, blob.dtype, blob.requires_grad), []).append(i)
+        for indices in groups.values():
+            self._put_together(indices)
+        self.history = [self._histories[i][k] for k in range(sets) for i in range(len(learnable))]
+
+    def _put_together(self, indices: Sequence[int]) -> None:
+        """Put blobs with the same multipliers into pieces of memory of at most ``BLOCK`` numbers."""
+        piece: list[int] = []
+        room = update.BLOCK
+        for i in indices:
+            size = _lines(self._learnable[i].parameter)
+            if piece and size > room:
+                self._move(piece)
+                piece, room = [], update.BLOCK
+            piece.append(i)
+            room -= size
+        self._move(piece)
+
+    def _move(self, piece: Sequence[int]) -> None:
+        first = self._learnable[piece[0]]
+        size = sum(_lines(self._learnable[i].parameter) for i in piece)
+        weights, diffs, *history = (torch.zeros(size, dtype=first.parameter.dtype) for _ in range(2 + self._sets))
+        start = 0
+        for i in piece:
+            blob = self._learnable[i].parameter
+            here, shape = slice(start, start + blob.numel()), blob.shape
+            weights[here].copy_(values_of(blob).view(-1))
+            blob.data = weights[here].view(shape)
+            if blob.requires_grad:
+                blob.grad = diffs[here].view(shape)
+            self._places.append(_Place(blob, blob.data_ptr(), blob.grad))
+            self._histories[i] = [each[here].view(shape) for each in history]
+            start += _lines(blob)
+        self._gradients.append(diffs)
+        self._blocks.append(_Block(weights, diffs, history, first.lr_mult, first.decay_mult))
+
+    def _keep(self, i: int) -> None:
+        """Cut a large blob, which stays where it is, into blocks."""
+        item = self._learnable[i]
+        blob = item.parameter
+        if blob.requires_grad:
+            blob.grad = torch.zeros_like(blob)
+        self._places.append(_Place(blob, blob.data_ptr(), blob.grad))
+        self._histories[i] = [torch.zeros_like(values_of(blob)) for _ in range(self._sets)]
+        diffs = torch.zeros_like(values_of(blob)) if blob.grad is None else blob.grad
+        self._gradients.append(diffs)
+        flat = [each.view(-1).split(update.BLOCK) for each in (values_of(blob), diffs, *self._histories[i])]
+        for weights, gradient, *history in zip(*flat, strict=True):
+            self._blocks.append(_Block(weights, gradient, history, item.lr_mult, item.decay_mult))
+
+    def _are_in_place(self) -> bool:
+        """Return whether parameters and gradients are where they were put."""
+        for place in self._places:
+            blob = place.parameter
+            if blob.grad is not place.gradient or blob.data_ptr() != place.address:
+                return False
+        return bool(self._blocks)
+
+    def clear(self) -> None:
+        """Set all gradients to 0."""
+        if self._are_in_place():
+            for gradient in self._gradients:
+                gradient.zero_()
+        else:
+            update.clear(item.parameter for item in self._learnable)
+
+    def diffs(self) -> list[torch.Tensor]:
+        """Return the gradient of each parameter, zeros where it has none."""
+        found = []
+        for item in self._learnable:
+            blob = item.parameter
+            found.append(torch.zeros_like(values_of(blob)) if blob.grad is None else blob.grad)
+        return found
+
+    def move(self, rule: update.Rule, param: Any, rate: float, iteration: int) -> None:
+        """Update the weights (:func:`netspec.solver.update.move`); gradients then contain what was subtracted."""
+        if not self._are_in_place():
+            learnable = self._learnable
+            weights = [values_of(item.parameter) for item in learnable]
+            rates = [rate * item.lr_mult for item in learnable]
+            decays = [param.weight_decay * item.decay_mult for item in learnable]
+            update.move(rule, param, weights, self.diffs(), self.history, rates, decays, iteration)
+            return
+        decay = param.weight_decay
+        for block in self._blocks:
+            rates, decays = [rate * block.lr_mult], [decay * block.decay_mult]
+            update.move_block(rule, param, [block.weights], [block.diffs], block.history, rates, decays, iteration)
+
+
+def _lines(blob: torch.Tensor) -> int:
+    """Return how many numbers a blob takes, in whole lines."""
+    return -(-blob.numel() // LINE) * LINE
