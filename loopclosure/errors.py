@@ -14,7 +14,8 @@ def printable(text: str) -> str:
     return text.translate(_ESCAPES)
 
 
-# C0 and C1 controls, separators of lines, marks that turn the direction of writing, and halves of characters.
+# C0 and C1 controls, separators of lines, marks that turn the direction of writing, and what no file may hold: halves
+# of characters, and two that are none.
 _CONTROLS = [
     *(code for code in range(32) if chr(code) != "\t"),
     *range(127, 160),
@@ -23,6 +24,8 @@ _CONTROLS = [
     *range(0x202A, 0x202F),
     *range(0x2066, 0x206A),
     *range(0xD800, 0xE000),
+    0xFFFE,
+    0xFFFF,
 ]
 _ESCAPES = {code: repr(chr(code))[1:-1] for code in _CONTROLS}
 

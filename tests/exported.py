@@ -15,6 +15,8 @@ import torch
 import netspec
 from golden_cases import set_parameters
 from netspec.export.shapes import NetShapes
+from netspec.export.source import class_name
+from netspec.export.torch import torch_source
 from netspec.net.net import Net
 
 ONNX_EXTRA = "the onnx extra is not installed: pip install 'netspec-caffe[onnx]'"
@@ -123,6 +125,16 @@ def run_module(module: torch.nn.Module, net: Net, inputs: Arrays) -> dict[str, n
         found = module(*(torch.from_numpy(inputs[name]) for name in net.inputs))
     found = found if isinstance(found, dict) else {net.outputs[0]: found}
     return {name: value.detach().numpy() for name, value in found.items()}
+
+
+def source_module(net: Net) -> torch.nn.Module:
+    """Return the module of the exported source, with its weights, for inference."""
+    text, state, _ = torch_source(net)
+    namespace: dict[str, Any] = {"__name__": "exported", "__file__": "exported.py"}
+    exec(compile(text, "exported.py", "exec"), namespace)
+    module = namespace[class_name(net.name or "net")]()
+    module.load_state_dict(state)
+    return module.eval()
 
 
 def assert_same(found: Arrays, expected: Arrays, scalars_have_an_axis: bool = False) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from html import escape
 from importlib.resources import files
 
@@ -24,9 +25,7 @@ def html_of(diagram: Diagram, picture: Picture) -> str:
         # No text of a layer can end the script: "<" is written as an escape.
         "LAYERS": json.dumps(layers).replace("<", "\\u003c"),
     }
-    for name, part in parts.items():
-        template = template.replace(f"@{name}@", part, 1)
-    return template
+    return re.sub(f"@({'|'.join(parts)})@", lambda place: parts[place[1]], template)  # at once: a part may hold a mark
 
 
 def _band(picture: Picture, band: Band, number: int) -> str:

@@ -14,7 +14,8 @@ from netspec.errors import SpecError, Where
 from netspec.export.deploy import fold, with_inputs, write_caffe
 from netspec.export.onnx import export_onnx
 from netspec.export.preprocess import Preprocess
-from netspec.export.torch import export_pt2, export_torch, write_tensors
+from netspec.export.pt2 import export_pt2
+from netspec.export.torch import export_torch, write_tensors
 from netspec.graph.filter import with_state
 from netspec.graph.prune import prune
 from netspec.net.build import build_net
@@ -92,7 +93,7 @@ def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | 
     if target == "torch":
         return export_torch(net, out, source.origin)
     if target == "pt2":
-        return export_pt2(net, out, source.origin)
+        return export_pt2(net, out)
     write_tensors(blob_tensors(net), out, source.metadata())
     return []
 

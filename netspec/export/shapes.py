@@ -125,6 +125,25 @@ def find_shapes(net: Net) -> NetShapes:
     return NetShapes(built, tuple(free), tuple(fixed))
 
 
+def input_shapes(net: Net, shapes: NetShapes) -> dict[str, tuple[int | str, ...]]:
+    """Return what inputs the net takes, by blob: for each size its number, or a name where it is free.
+
+    Inputs that have one name for a size must agree about it, as Caffe's layers want it.
+    """
+    found: dict[str, tuple[int | str, ...]] = {}
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        for v in node.tops if layer.is_input else ():
+            sizes: list[int | str] = list(shapes.built[v])
+            for free in shapes.free:
+                for axis in (axis for value, axis in free.axes if value == v and not free.counted):
+                    shared = any(value != v for value, _ in free.axes)
+                    alone = shared and _try(net, ((v, axis),), free.size)[1] is None
+                    sizes[axis] = f"{free.name}_{net.plan.blobs[v]}" if alone else free.name
+            found[net.plan.blobs[v]] = tuple(sizes)
+    _propagate(net, {})
+    return found
+
+
 def _input_sizes(net: Net) -> dict[str, tuple[Axis, ...]]:
     """Return the sizes of the inputs that might be free, by name: equal ones of one kind are one."""
     found: dict[tuple[str, int], list[Axis]] = {}

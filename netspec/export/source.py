@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import builtins
 import keyword
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 
 WIDTH = 88  # ruff's and black's line length where nothing else is configured
+_STRING = re.compile(r'"(?:[^"\\]|\\.)*"')
 MARK = re.compile("\x02([vmn])(\\d+)\x03")  # a value, a module, a number
 _TAKEN = {"self", "x", "torch", "nn", "F", "math", "Path", "load_file", "load", "forward", "main"}
 _TAKEN |= {name for name in dir(torch.nn.Module) if not name.startswith("__")} | {"training", "T_destination"}
@@ -98,16 +100,31 @@ class Program:
     outputs: dict[str, int] = field(default_factory=dict)
     functions: dict[str, Callable[..., Any]] = field(default_factory=dict)
 
+    def attributes(self) -> dict[int, str]:
+        """Return the attribute of each module that the net's class has, in the order in which they are used."""
+        taken: set[str] = set()
+        used = dict.fromkeys(m for statement in self.statements for m in statement.modules())
+        return {m: unique(legal(self.modules[m].layer), taken) for m in used}
 
-# Names
+
+# Names: no text of a file enters source but as an identifier or quoted
 
 
 def legal(name: str, prefix: str = "layer_") -> str:
     """Return a Python name made of a layer's or a blob's."""
     text = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or prefix.rstrip("_")
-    if text[0].isdigit():
-        text = prefix + text
-    return f"{text}_" if keyword.iskeyword(text) or text in _TAKEN or hasattr(builtins, text) else text
+    return _free(prefix + text if text[0].isdigit() else text, "_")
+
+
+def _free(identifier: str, ending: str) -> str:
+    """Return an identifier, with the ending where Python or the file itself uses it."""
+    used = keyword.iskeyword(identifier) or identifier in _TAKEN or hasattr(builtins, identifier)
+    return identifier + ending if used else identifier
+
+
+def quoted(text: str) -> str:
+    """Return a text as a literal in double quotes; without its quotes it can stand in a docstring too."""
+    return '"' + repr('"' + text)[2:-1].replace('"', '\\"') + '"'
 
 
 def unique(name: str, taken: set[str]) -> str:
@@ -123,15 +140,22 @@ def class_name(text: str) -> str:
     """Return the name of a class made of words."""
     words = [word for word in re.split(r"[^0-9A-Za-z]+", text) if word]
     name = "".join(word[0].upper() + word[1:] for word in words) or "Net"
-    return f"Net{name}" if name[0].isdigit() else name
+    return _free(f"Net{name}" if name[0].isdigit() else name, "Net")
 
 
 def number(value: Any) -> str:
-    """Return a number, a bool or a tuple of them as a person writes it; floats as short as float32 allows."""
+    """Return a number, a bool or a tuple of them as a person writes it; floats as short as float32 allows.
+
+    A text, which is the name of a free size, is quoted.
+    """
     if isinstance(value, (tuple, list)):
         inner = ", ".join(number(v) for v in value)
         return f"[{inner}]" if isinstance(value, list) else f"({inner},)" if len(value) == 1 else f"({inner})"
+    if isinstance(value, str):
+        return quoted(value)
     if isinstance(value, float):
+        if not math.isfinite(value):
+            return "torch.nan" if math.isnan(value) else "torch.inf" if value > 0 else "-torch.inf"
         text = (
             np.format_float_positional(np.float32(value), trim="-")
             if 1e-4 <= abs(value) < 1e6
@@ -172,10 +196,19 @@ def lay_out(statement: str, indent: int) -> list[str]:
     return [*lines, space + tail]
 
 
+def _outside_strings(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the characters that are in no quoted text, and where they are."""
+    end = 0
+    for match in _STRING.finditer(text):
+        yield from enumerate(text[end : match.start()], end)
+        end = match.end()
+    yield from enumerate(text[end:], end)
+
+
 def _outermost_brackets(text: str) -> list[tuple[int, int]]:
     """Return where the brackets that are in no others open and close."""
     found, depth, opening = [], 0, 0
-    for i, character in enumerate(text):
+    for i, character in _outside_strings(text):
         if character in "([{":
             opening = i if depth == 0 else opening
             depth += 1
@@ -189,7 +222,7 @@ def _outermost_brackets(text: str) -> list[tuple[int, int]]:
 def _split(text: str) -> list[str]:
     """Return the parts of an argument list."""
     parts, depth, start = [], 0, 0
-    for i, character in enumerate(text):
+    for i, character in _outside_strings(text):
         depth += (character in "([{") - (character in ")]}")
         if character == "," and depth == 0:
             parts.append(text[start:i].strip())

@@ -7,19 +7,18 @@ of this project but the line that says where it came from. It computes what the 
 from __future__ import annotations
 
 import inspect
-import io
 import re
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError
 from netspec.export.blocks import Block, find_blocks
-from netspec.export.shapes import NetShapes, settled
+from netspec.export.inputs import check_shapes
+from netspec.export.shapes import NetShapes, input_shapes, settled
 from netspec.export.source import (
     WIDTH,
     Module,
@@ -31,6 +30,7 @@ from netspec.export.source import (
     legal,
     mark,
     number,
+    quoted,
     substitute,
     unique,
 )
@@ -52,61 +52,9 @@ def export_torch(net: Net, path: str | Path, origin: str = "a prototxt") -> list
     text, state, notes = torch_source(net, origin)
     weights = path.with_suffix(".safetensors")
     with whole_file(path) as unfinished:
-        unfinished.write_text(text)
+        unfinished.write_text(text, encoding="utf-8")
         write_tensors(state, weights, {"format": "pt", "source": origin})
     return [*notes, f"the weights are in {weights.name}, beside the module"]
-
-
-def export_pt2(net: Net, path: str | Path, origin: str = "a prototxt") -> list[str]:
-    """Write a net as a torch.export archive: what the exported source computes; return notes for its user.
-
-    The sizes are free as in the source where torch.export can follow them, or else the batch alone, or none.
-    """
-    _, shapes = settled(net, lambda shapes: write_program(net, shapes))
-    module = torch_module(net, origin)
-    inputs = [v for node, layer in zip(net.plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops]
-    notes = list(shapes.fixed)
-    for names in _choices([free.name for free in shapes.free if not free.counted]):
-        dims = {free.name: torch.export.Dim.AUTO for free in shapes.free if free.name in names}
-        axes = {axis: free.name for free in shapes.free for axis in free.axes if free.name in dims}
-        dynamic = [
-            {axis: dims[axes[v, axis]] for axis in range(len(shapes.built[v])) if (v, axis) in axes} for v in inputs
-        ]
-        example = []
-        for v in inputs:  # a size of 1 would be taken for a constant
-            sizes = [max(2, size) if (v, axis) in axes else size for axis, size in enumerate(shapes.built[v])]
-            example.append(torch.zeros(sizes))
-        try:
-            program = torch.export.export(module, tuple(example), dynamic_shapes=tuple(dynamic), strict=False)
-        except Exception as fault:
-            reason = str(fault).strip().splitlines()
-            if not names:
-                raise SpecError(
-                    f"torch.export cannot take it: {reason[0] if reason else fault}", Where(str(path))
-                ) from fault
-            continue
-        with whole_file(path) as unfinished:
-            buffer = io.BytesIO()
-            torch.export.save(program, buffer)
-            unfinished.write_bytes(buffer.getvalue())
-        fixed = [free.name for free in shapes.free if not free.counted and free.name not in names]
-        return [*notes, *([f"torch.export fixes the sizes {joined(fixed)}"] if fixed else [])]
-    raise AssertionError("the last choice has no free size")
-
-
-def _choices(names: list[str]) -> list[list[str]]:
-    """Return which sizes to leave free, the most first."""
-    return [*([names] if len(names) > 1 else []), *([["N"]] if "N" in names else []), []]
-
-
-def torch_module(net: Net, origin: str = "a prototxt") -> torch.nn.Module:
-    """Return the module of the exported source, with its weights, for inference."""
-    text, state, _ = torch_source(net, origin)
-    namespace: dict[str, Any] = {"__name__": "exported", "__file__": "exported.py"}
-    exec(compile(text, "exported.py", "exec"), namespace)  # the source was written above
-    module = namespace[class_name(net.name or "net")]()
-    module.load_state_dict(state)
-    return module.eval()
 
 
 def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: Mapping[str, str]) -> None:
@@ -123,14 +71,17 @@ def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, t
     name = class_name(net.name or "net")
     blocks = find_blocks(program, name)
     _join_chains(program)
-    attributes = _attributes(program)
+    attributes = program.attributes()
+    expected = input_shapes(net, shapes)
     sizes = [f"{program.names[v]} {_shape(shapes, v)}" for v in program.inputs]
     made = [f"{blob} {_shape(shapes, v)}" for blob, v in net.plan.outputs.items()]
+    if expected:
+        program.functions[check_shapes.__name__] = check_shapes
     example = ", ".join(f"torch.zeros({', '.join(map(str, shapes.built[v]))})" for v in program.inputs)
     parts = [textwrap.dedent(inspect.getsource(function)).strip() for function in program.functions.values()]
     parts += [_block_class(program, block) for block in blocks]
     parts += [
-        _net_class(program, name, attributes, f"{', '.join(sizes)} -> {', '.join(made)}"),
+        _net_class(program, name, attributes, f"{', '.join(sizes)} -> {', '.join(made)}", expected),
         _loader(name),
         _main(program, example),
     ]
@@ -162,12 +113,9 @@ def _header(net: str, origin: str, body: str) -> str:
         "from safetensors.torch import load_file",
         "from torch import nn",
     ]
-    return "\n".join([f'"""{_sentence(f"{net}, converted from {origin}")}."""', "", *imports])
-
-
-def _sentence(text: str) -> str:
-    text = " ".join(text.split()).replace('"', "'").replace("\\", "/")
-    return text if len(text) < WIDTH - 8 else text[: WIDTH - 12] + "..."
+    sentence = " ".join(f"{net}, converted from {origin}".split())
+    sentence = sentence if len(sentence) < WIDTH - 8 else sentence[: WIDTH - 12] + "..."
+    return "\n".join([f'""{quoted(f"{sentence}.")}""', "", *imports])
 
 
 def _loader(name: str) -> str:
@@ -184,15 +132,21 @@ def _main(program: Program, example: str) -> str:
     if len(program.outputs) > 1:
         lines += ["    for name, output in outputs.items():", "        print(name, tuple(output.shape))"]
     else:
-        lines += [f'    print("{next(iter(program.outputs), "")}", tuple(outputs.shape))']
+        lines += lay_out(f"print({quoted(next(iter(program.outputs), ''))}, tuple(outputs.shape))", 4)
     return "\n".join(lines)
 
 
 # Classes
 
 
-def _net_class(program: Program, name: str, attributes: Mapping[int, str], description: str) -> str:
-    taken: set[str] = set()
+def _net_class(
+    program: Program,
+    name: str,
+    attributes: Mapping[int, str],
+    description: str,
+    expected: Mapping[str, tuple[int | str, ...]],
+) -> str:
+    taken = set(program.functions)
     inputs = {v: unique(legal(program.names[v], "blob_"), taken) for v in program.inputs}
     made = [_constructed(program.modules[m], attribute, {}) for m, attribute in attributes.items()]
     body = _forward(
@@ -204,6 +158,10 @@ def _net_class(program: Program, name: str, attributes: Mapping[int, str], descr
         lambda v, _: program.names[v],
         lambda n: number(program.numbers[n][1]),
     )
+    if expected:
+        shapes = ", ".join(f"{quoted(program.names[v])}: {argument}.shape" for v, argument in inputs.items())
+        wanted = ", ".join(f"{quoted(blob)}: {number(sizes)}" for blob, sizes in expected.items())
+        body = [f"{check_shapes.__name__}({{{shapes}}}, {{{wanted}}})", *body]
     lines = [f"class {name}(nn.Module):", *_docstring(f"{description}.", 4), ""]
     return "\n".join([*lines, *_methods("", [], made, ", ".join(inputs.values()), body)])
 
@@ -254,10 +212,11 @@ def _methods(arguments: str, kept: Sequence[str], made: Sequence[str], inputs: s
 
 
 def _docstring(text: str, indent: int) -> list[str]:
-    space = " " * indent
+    space, text = " " * indent, quoted(text)[1:-1]
     if indent + len(text) + 6 <= WIDTH:
         return [f'{space}"""{text}"""']
-    lines = [space + line for line in textwrap.wrap(text, WIDTH - indent)]
+    wrapped = textwrap.wrap(text, WIDTH - indent, break_long_words=False)  # which could part an escape
+    lines = [space + line for line in wrapped]
     return [f'{space}"""Inputs and outputs.', "", *lines, f'{space}"""']
 
 
@@ -266,13 +225,6 @@ def _constructed(module: Module, attribute: str, named: Mapping[str, str]) -> st
     if module.kind == "buffer":
         return f'self.register_buffer("{attribute}", {call})'
     return f"self.{attribute} = {call}"
-
-
-def _attributes(program: Program) -> dict[int, str]:
-    """Return the attribute of each module that the net's class has, in the order in which they are used."""
-    taken: set[str] = set()
-    used = dict.fromkeys(m for statement in program.statements for m in statement.modules())
-    return {m: unique(legal(program.modules[m].layer), taken) for m in used}
 
 
 def _join_chains(program: Program) -> None:
@@ -345,6 +297,7 @@ def _forward(
             return [*lines, f"return {expression}"]
         for v in statement.targets:
             wanted = legal(name_of(v, statement), "blob_")
+            wanted = f"{wanted}_" if wanted in program.functions else wanted
             passed = last_read.get(v, -1) == i + 1 and sum(v in s.values() for s in statements) == 1
             candidates = [*("x", "y")[: 2 * passed], wanted, *(f"{wanted}_{k}" for k in range(2, 1000))]
             unused = last_read.get(v, -1) < 0
@@ -353,7 +306,7 @@ def _forward(
         lines.append(f"{', '.join(names[v] for v in statement.targets)} = {expression}")
     if len(outputs) == 1:
         return [*lines, f"return {names[next(iter(outputs.values()))]}"]
-    pairs = ", ".join(f'"{name}": {names[v]}' for name, v in outputs.items())
+    pairs = ", ".join(f"{quoted(name)}: {names[v]}" for name, v in outputs.items())
     return [*lines, f"return {{{pairs}}}"]
 
 

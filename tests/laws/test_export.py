@@ -4,14 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, run_module
+from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, run_module, source_module
 from laws.test_registry import EXAMPLES, TYPES, folder  # noqa: F401
 from netspec.errors import SpecError
 from netspec.export.deploy import with_inputs
 from netspec.export.onnx import onnx_model
-from netspec.export.torch import torch_module
+from netspec.export.pt2 import torch_module
 from netspec.graph.filter import with_state
 from netspec.layers import Layer, layer_class
 from netspec.net.build import build_net
@@ -61,7 +60,7 @@ def test_layer_computes_the_same_elsewhere_or_says_why_it_cannot(
         pytest.importorskip("onnx", reason=ONNX_EXTRA)
     monkeypatch.chdir(folder)
     net = net_of_example(name, folder)
-    write = onnx_model if target == "ONNX" else torch_module
+    write = onnx_model if target == "ONNX" else source_module
     refused = (NOT_IN_ONNX if target == "ONNX" else NOT_IN_TORCH).get(name)
     if refused:
         with pytest.raises(SpecError, match=rf'layer "it" \({name}\): cannot be exported to {target}: .*{refused}'):
@@ -77,7 +76,6 @@ def test_layer_computes_the_same_elsewhere_or_says_why_it_cannot(
     elif target == "ONNX":
         assert_same(in_onnxruntime(write(net)[0], inputs), here(net, inputs))  # type: ignore[index]
     else:
-        module = write(net)
-        assert isinstance(module, torch.nn.Module)
-        assert_same(run_module(module, net, inputs), here(net, inputs))
+        for module in (source_module(net), torch_module(net)):
+            assert_same(run_module(module, net, inputs), here(net, inputs))
     net.close()

@@ -21,11 +21,20 @@ import numpy as np
 
 import netspec
 import netspec.proto.text
-from exported import Arrays, calibrated, here, in_onnxruntime, in_opencv, random_inputs, run_module, trained
+from exported import (
+    Arrays,
+    calibrated,
+    here,
+    in_onnxruntime,
+    in_opencv,
+    random_inputs,
+    run_module,
+    source_module,
+    trained,
+)
 from netspec.dialects import use_dialect
 from netspec.export.deploy import fold, write_caffe
 from netspec.export.onnx import onnx_model
-from netspec.export.torch import torch_module
 from netspec.net.net import Net
 from paths import SHARED
 
@@ -69,7 +78,7 @@ def row(net: Net) -> Mapping[str, str]:
         found["OpenCV 5"] = attempt(lambda: in_opencv(model, inputs), expected)
     except netspec.SpecError as fault:
         found["onnxruntime"] = str(fault)
-    found["PyTorch"] = attempt(lambda: run_module(torch_module(net), net, inputs), expected)
+    found["PyTorch"] = attempt(lambda: run_module(source_module(net), net, inputs), expected)
     with TemporaryDirectory() as folder:
         prototxt, weights = write_caffe(fold(net), Path(folder) / "folded")
         found["folded"] = attempt(lambda: here(netspec.load_net(prototxt, weights=weights), inputs), expected)

@@ -15,13 +15,13 @@ from exported import (
     other_inputs,
     random_inputs,
     run_module,
+    source_module,
     trained,
 )
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.export.onnx import onnx_model
 from netspec.export.shapes import find_shapes
-from netspec.export.torch import torch_module
 from netspec.net.net import Net
 
 pytestmark = pytest.mark.slow
@@ -112,7 +112,7 @@ def test_layer_computes_the_same(name: str, net_of: Callable[..., Net]) -> None:
     net = trained(net_of(net_text(layer, shapes)))
     inputs = random_inputs(net)
     model, _ = onnx_model(net)
-    module = torch_module(net)
+    module = source_module(net)
     for given in (inputs, other_inputs(net, find_shapes(net), inputs)):
         expected = here(net, given)
         assert_same(in_onnxruntime(model, given), expected)
@@ -133,7 +133,7 @@ def test_unpooling_brings_values_to_where_they_came_from(net_of: Callable[..., N
     assert [line.split(" is fixed")[0] for line in notes] == ["the height", "the width"]
     expected = here(net, inputs)
     assert_same(in_onnxruntime(model, inputs), expected)
-    assert_same(run_module(torch_module(net), net, inputs), expected)
+    assert_same(run_module(source_module(net), net, inputs), expected)
     if OPENCV_5:
         assert_same(in_opencv(model, inputs), expected)
 
@@ -146,7 +146,7 @@ def test_regions_are_pooled(net_of: Callable[..., Net]) -> None:
     inputs = {"x": random_inputs(net)["x"], "rois": corners}
     assert_same(in_onnxruntime(onnx_model(net)[0], inputs), here(net, inputs))
     with pytest.raises(SpecError, match=r"\(ROIPooling\): cannot be exported to PyTorch: .*pooling of regions"):
-        torch_module(net)
+        source_module(net)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_what_has_no_counterpart_is_refused_with_its_place_and_reason(
 ) -> None:
     use_dialect(dialect)
     net = net_of(net_text(layer, shapes))
-    for target, write in (("ONNX", onnx_model), ("PyTorch", torch_module)):
+    for target, write in (("ONNX", onnx_model), ("PyTorch", source_module)):
         with pytest.raises(
             SpecError, match=rf'^net.prototxt:\d+:1: layer "it" \(\w+\): cannot be exported to {target}: '
         ):
@@ -220,7 +220,7 @@ def test_detections_are_the_same(name: str, images: int, net_of: Callable[..., N
     if OPENCV_5 and "confidence_threshold" in settings:  # its suppression takes no threshold below 0
         assert_same(in_opencv(model, inputs), expected)
     if "CENTER_SIZE" in settings and "false" not in settings:
-        assert_same(run_module(torch_module(net), net, inputs), expected)
+        assert_same(run_module(source_module(net), net, inputs), expected)
 
 
 def test_an_adaptive_threshold_is_refused(net_of: Callable[..., Net]) -> None:

@@ -9,12 +9,21 @@ import numpy as np
 import pytest
 
 import netspec
-from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, in_opencv, random_inputs, run_module, trained
+from exported import (
+    ONNX_EXTRA,
+    assert_same,
+    here,
+    in_onnxruntime,
+    in_opencv,
+    random_inputs,
+    run_module,
+    source_module,
+    trained,
+)
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.export.onnx import export_onnx, onnx_model
 from netspec.export.preprocess import Preprocess
-from netspec.export.torch import torch_module
 from netspec.net.net import Net
 from paths import ROOT, shared
 
@@ -98,7 +107,7 @@ def test_pooling_has_caffes_windows_at_every_size(
         IMAGE + f'layer {{ name: "y" type: "Pooling" bottom: "data" top: "y" pooling_param {{ {settings} }} }}'
     )
     model, _ = onnx_model(net)
-    module = torch_module(net)
+    module = source_module(net)
     rng = np.random.default_rng(0)
     for height, width in ((12, 10), (7, 8), (9, 13), (11, 6), (5, 5)):
         inputs = {"data": rng.uniform(-1, 1, (2, 3, height, width)).astype(np.float32)}
@@ -140,7 +149,7 @@ layer { name: "sum" type: "Eltwise" bottom: "crop" bottom: "data" top: "sum" }""
 def test_a_net_that_crops_to_its_input_runs_at_other_sizes(net_of: Callable[..., Net]) -> None:
     net = net_of(IMAGE.replace("12", "16") + UPSAMPLING)
     model, notes = onnx_model(net)
-    module = torch_module(net)
+    module = source_module(net)
     assert notes == []
     for height, width in ((16, 10), (22, 31), (9, 9)):
         inputs = {"data": np.random.default_rng(0).standard_normal((2, 3, height, width)).astype(np.float32)}
@@ -238,7 +247,7 @@ def test_real_models_compute_what_caffe_or_opencv_computed(name: str) -> None:
     use_dialect("blocks")
     net = netspec.load_net(folder / prototxt, weights=folder / weights)
     model, _ = onnx_model(net)
-    module = torch_module(net)
+    module = source_module(net)
     stored = np.load(folder / golden)
     for k in sorted({key.split("/")[0] for key in stored.files}):
         inputs = {key.split("/", 2)[2]: stored[key] for key in stored.files if key.startswith(f"{k}/in/")}

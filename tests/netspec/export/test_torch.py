@@ -1,6 +1,7 @@
 """PyTorch source: the same numbers without this project, formatted, and taken by torch.export and torch.compile."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,9 +14,10 @@ import pytest
 import torch
 
 import netspec
-from exported import assert_same, golden_net, here, other_inputs, random_inputs, run_module, trained
+from exported import assert_same, golden_net, here, other_inputs, random_inputs, run_module, source_module, trained
+from netspec.export.pt2 import export_pt2, torch_module
 from netspec.export.shapes import settled
-from netspec.export.torch import export_pt2, export_torch, torch_module, torch_source
+from netspec.export.torch import export_torch, torch_source
 from netspec.export.torch_code import write_program
 from netspec.net.net import Net
 from paths import GOLDEN, ROOT
@@ -42,12 +44,15 @@ def test_golden_layer_computes_the_same(case: Path) -> None:
         with pytest.raises(netspec.SpecError, match=REFUSED[case.name]):
             torch_source(net)
         return
-    module = torch_module(net)
-    assert_same(run_module(module, net, inputs), here(net, inputs))
+    modules = [source_module(net), torch_module(net)]
+    for module in modules:
+        again, _ = golden_net(case)  # a recurrent net remembers what it saw
+        assert_same(run_module(module, net, inputs), here(again, inputs))
     assert formatted(torch_source(net)[0])
     inputs = other_inputs(net, settled(net, lambda shapes: write_program(net, shapes))[1], inputs)
-    again, _ = golden_net(case)  # a recurrent net remembers what it saw
-    assert_same(run_module(module, net, inputs), here(again, inputs))
+    for module in modules:
+        again, _ = golden_net(case)  # a recurrent net remembers what it saw
+        assert_same(run_module(module, net, inputs), here(again, inputs))
 
 
 def test_the_module_runs_without_this_project(tmp_path: Path) -> None:
@@ -112,7 +117,7 @@ def test_what_repeats_is_a_class(net_of: Callable[..., Net]) -> None:
     assert "sum0_to_sum2.1.a.weight" in state
     assert text.count("nn.Conv2d(") == 3
     assert formatted(text)
-    assert_same(run_module(torch_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+    assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
 
 
 TOWERS = """name: "Towers"
@@ -133,7 +138,7 @@ def test_towers_that_share_weights_are_one_module(net_of: Callable[..., Net]) ->
     text, state, _ = torch_source(net)
     assert len(state) == 8
     assert text.count("self.ip2(") == 2  # for one tower and for the other
-    assert_same(run_module(torch_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+    assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
 
 
 def test_a_deconvolution_longer_than_the_map(net_of: Callable[..., Net]) -> None:
@@ -141,7 +146,7 @@ def test_a_deconvolution_longer_than_the_map(net_of: Callable[..., Net]) -> None
     layer { name: "up" type: "Deconvolution" bottom: "data" top: "up"
       convolution_param { num_output: 2 kernel_size: 5 stride: 2 } }"""
     net = trained(net_of(text))
-    assert_same(run_module(torch_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+    assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
 
 
 def test_names_that_python_does_not_take(net_of: Callable[..., Net]) -> None:
@@ -150,7 +155,7 @@ def test_names_that_python_does_not_take(net_of: Callable[..., Net]) -> None:
     layer { name: "forward" type: "InnerProduct" bottom: "self" top: "print" inner_product_param { num_output: 2 } }
     layer { name: "1/x" type: "InnerProduct" bottom: "in" top: "2/x" inner_product_param { num_output: 2 } }"""
     net = trained(net_of(text))
-    assert_same(run_module(torch_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+    assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
 
 
 def test_torch_export_takes_it_with_a_free_batch_and_size(net_of: Callable[..., Net], tmp_path: Path) -> None:
@@ -161,10 +166,38 @@ def test_torch_export_takes_it_with_a_free_batch_and_size(net_of: Callable[..., 
     assert_same(run_module(program, net, inputs), here(net, inputs))
 
 
+PAIRS = """layer { name: "in" type: "Input" top: "a" top: "b" input_param { shape { dim: 2 dim: 1 dim: 6 dim: 6 } } }
+layer { name: "label" type: "Input" top: "label" input_param { shape { dim: 2 } } }
+layer { name: "fa" type: "InnerProduct" bottom: "a" top: "fa" inner_product_param { num_output: 3 } }
+layer { name: "fb" type: "InnerProduct" bottom: "b" top: "fb" inner_product_param { num_output: 3 } }
+layer { name: "loss" type: "ContrastiveLoss" bottom: "fa" bottom: "fb" bottom: "label" top: "loss" }
+layer { name: "c" type: "Input" top: "c" input_param { shape { dim: 2 dim: 4 } } }
+layer { name: "abs" type: "AbsVal" bottom: "c" top: "abs" }"""
+
+
+def test_inputs_of_other_sizes_are_refused(net_of: Callable[..., Net], tmp_path: Path) -> None:
+    net = trained(net_of(PAIRS))
+    export_pt2(net, tmp_path / "pairs.pt2")
+    archive = torch.export.load(tmp_path / "pairs.pt2").module()
+    for module in (source_module(net), torch_module(net), archive):
+        image, label, other = torch.zeros(3, 1, 6, 6), torch.zeros(3), torch.zeros(5, 4)
+        module(image, image, label, other)
+        for wrong in (
+            (torch.zeros(3, 1, 4, 9), image, label, other),  # as many numbers
+            (torch.zeros(3, 1, 12, 3), image, label, other),
+            (torch.zeros(1, 1, 6, 6), image, label, other),  # torch would use it three times
+            *([] if module is archive else [(image, image, label[:, None], other)]),  # PyTorch's own guards: sizes
+        ):
+            with pytest.raises((ValueError, AssertionError, RuntimeError)):
+                module(*wrong)
+    with pytest.raises(ValueError, match=re.escape("b has shape (4, 1, 6, 6), expected (3, 1, 6, 6)")):
+        source_module(net)(image, torch.zeros(4, 1, 6, 6), label, other)
+
+
 @pytest.mark.parametrize("backend", ["eager", "aot_eager", "inductor"])
 def test_torch_compile_takes_it(backend: str, net_of: Callable[..., Net]) -> None:
     if backend == "inductor" and not (shutil.which("g++") or os.environ.get("CXX")):
         pytest.skip("no C++ compiler")
     net = trained(net_of(SMALL))
-    compiled: Any = torch.compile(torch_module(net), backend=backend, fullgraph=True)
+    compiled: Any = torch.compile(source_module(net), backend=backend, fullgraph=True)
     assert_same(run_module(compiled, net, random_inputs(net)), here(net, random_inputs(net)))
