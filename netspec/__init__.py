@@ -1,22 +1,23 @@
 """netspec, the living Caffe: runs Caffe's prototxt in PyTorch, unmodified, with Caffe's numbers.
 
-The public names are loaded when they are first used, so that ``import netspec.proto.text`` needs no torch.
+The public names are loaded when they are first used, so that ``import netspec.proto.text`` needs no torch. Nothing is
+imported here that takes time: until this is done a program cannot answer signals (netspec/__main__.py).
 """
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import os
-from typing import TYPE_CHECKING, Any
 
 from netspec import waiting
-from netspec.errors import SpecError
 from netspec.proto.dialect.folders import FOLDERS
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from netspec.dialects import use_dialect
     from netspec.engines.net import load_net
+    from netspec.errors import SpecError
     from netspec.net.net import Net
     from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights
@@ -28,6 +29,7 @@ waiting.sleep_soon()  # before torch is loaded
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
 
 _HOMES = {
+    "SpecError": "netspec.errors",
     "use_dialect": "netspec.dialects",
     "Net": "netspec.net.net",
     "layer": "netspec.net.one_layer",
@@ -70,6 +72,8 @@ __path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the n
 
 
 def __getattr__(name: str) -> Any:
+    import importlib.util
+
     if name == "__version__":
         from netspec.version import version
 

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from loopclosure.errors import InputError, printable
 from loopclosure.progress import Item
 
-DONE, FAULT, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130  # exit statuses
+DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
 
 
 class WrongUsage(Exception):
@@ -61,35 +61,46 @@ def run(parser: argparse.ArgumentParser, words: list[str]) -> int:
     except MemoryError:
         print("there is not enough memory", file=sys.stderr)
         return FAULT
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as end:
         print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return 128 + int(end.args[0] if end.args else signal.SIGINT)
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Make SIGTERM interrupt the block as Ctrl-C does; a second of either ends the process at once, with status 130.
+    """Make SIGTERM interrupt the block as Ctrl-C does: a KeyboardInterrupt with the signal's number.
 
-    Signals that the program around it handles or ignores are left alone.
+    A second of either ends the process at once. Signals that the program around it handles or ignores are left alone.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    mine = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    before = {number: usual for number, usual in mine.items() if signal.getsignal(number) == usual}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in before.items() if _is_usual(handler)}
+    came: list[int] = []
 
-    def interrupt(*_: object) -> None:
-        for number in before:
-            signal.signal(number, lambda *_: os._exit(INTERRUPTED))
-        raise KeyboardInterrupt
+    def interrupt(number: int, _: object) -> None:
+        if came:
+            os._exit(128 + number)
+        came.append(number)
+        raise KeyboardInterrupt(number)
 
     try:
         for number in before:
             signal.signal(number, interrupt)
         yield
+    except Exception:
+        if came:  # what is imported meanwhile may make another error of it
+            raise KeyboardInterrupt(*came) from None
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _is_usual(handler: object) -> bool:
+    """Say whether a signal has no handler but Python's own, or that of a program that starts (``end_at_once``)."""
+    return handler in (signal.SIG_DFL, signal.default_int_handler) or getattr(handler, "__name__", "") == "end_at_once"
 
 
 def warn(doubt: str) -> None:

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import signal
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -61,28 +62,40 @@ class _Verbose(argparse.Action):
         namespace.log_level, namespace.log_form = logging.INFO, log.GlogFormatter()
 
 
-@contextmanager
-def signals(effects: Mapping[signal.Signals, str]) -> Iterator[Callable[[], str | None]]:
-    """Yield a function to call between iterations: it returns the effect of a received signal, or None.
+class Signals:
+    """What signals ask of a training: called between iterations, it returns the effect of one that came, or None.
 
-    A second signal that stops ends the process at once.
+    ``stopped_by`` is the number of the signal that asked to stop, 0 before. A second one that does ends the process at
+    once.
     """
-    came: list[str] = []
-    stopping = False
+
+    def __init__(self) -> None:
+        self.stopped_by = 0
+        self._came: deque[str] = deque()
+
+    def __call__(self) -> str | None:
+        """Return the effect of the signal that came first, once."""
+        return self._came.popleft() if self._came else None
+
+    def receive(self, effect: str, number: int) -> None:
+        """Note a signal that came."""
+        if effect == "stop":
+            if self.stopped_by:
+                os._exit(128 + number)
+            self.stopped_by = number
+        self._came.append(effect)
+
+
+@contextmanager
+def signals(effects: Mapping[signal.Signals, str]) -> Iterator[Signals]:
+    """Yield what receives the signals within the block, each with its effect: "stop", "snapshot" or "none"."""
+    received = Signals()
     before = {}
-
-    def receive(effect: str) -> None:
-        nonlocal stopping
-        if effect == "stop" and stopping:
-            os._exit(command_line.INTERRUPTED)
-        stopping |= effect == "stop"
-        came.append(effect)
-
     for number, effect in effects.items():
-        handler = signal.SIG_IGN if effect == "none" else lambda *_, effect=effect: receive(effect)
+        handler = signal.SIG_IGN if effect == "none" else lambda n, _, effect=effect: received.receive(effect, n)
         before[number] = signal.signal(number, handler)
     try:
-        yield lambda: came.pop(0) if came else None
+        yield received
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

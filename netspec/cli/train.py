@@ -40,7 +40,7 @@ def add_to(commands: Commands) -> None:
     add_device(p)
     add_state(p, phase=None)
     p.add_argument(
-        "--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C and SIGTERM do (default: stop)"
+        "--sigint_effect", choices=EFFECTS, default="stop", help="what Ctrl-C does (default: stop); SIGTERM stops"
     )
     p.add_argument("--sighup_effect", choices=EFFECTS, default="snapshot", help="what SIGHUP does (default: snapshot)")
     add_python(p)
@@ -94,7 +94,7 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
 
     from netspec.solver.processes import Lost
 
-    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: arguments.sigint_effect}
+    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: "stop"}
     if hasattr(signal, "SIGHUP"):  # Windows has none
         effects[signal.SIGHUP] = arguments.sighup_effect
     with signals(effects) as action:
@@ -117,7 +117,17 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
                 return FAULT
         solver.close()
     log.info("caffe.cpp:250", "Optimization Done.")
-    return DONE
+    return 128 + action.stopped_by if solver.stopped and action.stopped_by and not _as_caffe() else DONE
+
+
+def _as_caffe() -> bool:
+    """Say whether a training that a signal stopped is done, as in Caffe: for who calls it by a name of Caffe's.
+
+    Under torchrun too, which answers any other status with a traceback.
+    """
+    from netspec.solver.processes import started_by_torchrun
+
+    return Path(sys.argv[0]).stem in ("caffe", "train") or started_by_torchrun()
 
 
 def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | None], processes: Processes) -> Solver:

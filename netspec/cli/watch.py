@@ -72,7 +72,7 @@ def _train(arguments: argparse.Namespace) -> int:
     follower = Follower(log)
     follower.poll()
     print("\n".join(_lines(follower)))
-    if status:
+    if 0 < status < 128:  # more: a signal stopped it
         print(log.read_text(errors="replace").splitlines()[-1], file=sys.stderr)
     print(log)
     return status

@@ -48,9 +48,14 @@ class Reader(ABC):
     def record(self, i: int) -> bytes:
         """Return the value of record ``i``; raises SpecError where the database is damaged or was changed."""
 
+    @property
+    @abstractmethod
+    def is_current(self) -> bool:
+        """Whether the database is still as it was when it was opened."""
 
-# A database cannot be opened twice in a process, but two nets (training and test, for example) may use the same one.
-# A forked process opens it anew.
+
+# Two nets (training and test, for example) that use one database share what is known of it. A forked process opens it
+# anew, and so does a net that is built after another program has written to it.
 _open_readers: weakref.WeakValueDictionary[tuple[int, int, int], Reader] = weakref.WeakValueDictionary()
 _open_lock = threading.Lock()
 
@@ -71,7 +76,7 @@ def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) 
         identity = os.getpid(), status.st_dev, status.st_ino
         with _open_lock:
             reader = _open_readers.get(identity)
-            if reader is None:
+            if reader is None or not reader.is_current:
                 reader = _LmdbReader(source) if found == "lmdb" else _LevelDbReader(source)
                 if not len(reader):
                     raise ValueError("is empty: it contains no records")
@@ -128,6 +133,10 @@ class _LmdbReader(Reader):
         except (ValueError, OSError) as fault:
             raise self._fault(fault) from None
 
+    @property
+    def is_current(self) -> bool:
+        return self._file.is_current
+
     def _record(self, i: int) -> Record:
         """Return a record, listing those before it: on a slow disk, listing a large database takes minutes."""
         if i >= len(self._records):
@@ -153,6 +162,7 @@ class _LevelDbReader(Reader):
 
     def __init__(self, source: str) -> None:
         plyvel = _plyvel()
+        self._source, self._stamp = source, _names_and_sizes(source)
         folder = mkdtemp(prefix="netspec-leveldb-")
         # Unlike weakref's, this runs at the end of a worker too, and never in a process that was forked later.
         Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
@@ -173,6 +183,15 @@ class _LevelDbReader(Reader):
 
     def record(self, i: int) -> bytes:
         return self._db.get(self._keys[i])
+
+    @property
+    def is_current(self) -> bool:
+        return _names_and_sizes(self._source) == self._stamp
+
+
+def _names_and_sizes(folder: str) -> dict[str, int]:
+    """Return the files of a LevelDB that hold its contents: none is written over, but one may grow."""
+    return {entry.name: entry.stat().st_size for entry in os.scandir(folder) if not entry.name.startswith(("LO", "."))}
 
 
 def _plyvel() -> ModuleType:

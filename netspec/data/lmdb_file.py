@@ -81,9 +81,14 @@ class LmdbFile:
 
     def value(self, record: Record) -> bytes:
         """Return the value of a record."""
-        if self._seen() != self._stamp:
+        if not self.is_current:
             raise ValueError("was changed by another program while it was read")
         return self._bytes(record.offset, record.size)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether nobody has written to the file since it was opened."""
+        return self._seen() == self._stamp
 
     def _seen(self) -> tuple[int, int]:
         state = os.fstat(self._file)

@@ -137,9 +137,9 @@ def _command(module: str, words: list[str]) -> str:
 {MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
 import sys
 
-from {module} import main
+from netspec.__main__ import program
 
-sys.exit(main([*{words}, *sys.argv[1:]]))
+sys.exit(program({module!r}, [*{words}, *sys.argv[1:]]))
 """
 
 

@@ -312,6 +312,28 @@ def test_a_database_that_is_changed_while_it_is_read(change: str, database: Path
         reader.record(299)
 
 
+@pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
+def test_a_database_that_was_written_to_is_opened_anew(backend: str, tmp_path: Path) -> None:
+    """A notebook goes on: only what was opened before is of yesterday."""
+    plyvel = pytest.importorskip("plyvel") if backend == "leveldb" else None
+    path = str(tmp_path / "db")
+    with Writer(path, backend) as writer:
+        writer.put(b"00000000", b"old")
+    before = open_reader(path, backend)
+    assert open_reader(path, backend) is before
+    if plyvel is None:
+        with lmdb.open(path, lock=False, map_size=1 << 24) as env, env.begin(write=True) as transaction:
+            transaction.put(b"00000001", b"new")
+        os.utime(tmp_path / "db" / "data.mdb", (1, 1))  # clocks of file systems are coarse
+    else:
+        store = plyvel.DB(path)
+        store.put(b"00000001", b"new")
+        store.close()
+    after = open_reader(path, backend)
+    assert [after.record(i) for i in range(len(after))] == [b"old", b"new"]
+    assert len(before) == 1
+
+
 def test_a_database_that_is_replaced_is_still_read(database: Path) -> None:
     reader = open_reader(str(database))
     shutil.rmtree(database)

@@ -46,11 +46,11 @@ def line_of(process: subprocess.Popen[str]) -> str:
 
 @pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_one_line_and_status_130(module: str, number: int) -> None:
+def test_one_line_and_its_status(module: str, number: int) -> None:
     process = start(CODE.format(module=module, cleaning=0))
     process.send_signal(number)
     _, said = process.communicate(timeout=30)
-    assert (process.returncode, said) == (130, "interrupted\n")
+    assert (process.returncode, said) == (128 + number, "interrupted\n")
 
 
 IMPORTED = """
@@ -75,7 +75,48 @@ def test_one_line_while_modules_are_imported(package: str, number: int) -> None:
     process = start(IMPORTED.format(package=package))
     process.send_signal(number)
     _, said = process.communicate(timeout=30)
-    assert (process.returncode, said) == (130, "interrupted\n")
+    assert (process.returncode, said) == (128 + number, "interrupted\n")
+
+
+MANGLED = """
+import argparse, sys, time
+from {module} import Commands, run
+
+def loading(arguments):
+    try:
+        print("begun", flush=True)
+        time.sleep(60)
+    except BaseException:
+        raise ImportError("initialization failed")
+
+parser = argparse.ArgumentParser()
+Commands(parser).add("loading", loading, "")
+sys.exit(run(parser, ["loading"]))
+"""
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_one_line_where_an_import_makes_another_error_of_it(module: str) -> None:
+    """Modules in C do: they know only that they could not be loaded."""
+    process = start(MANGLED.format(module=module))
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=30)
+    assert (process.returncode, said) == (143, "interrupted\n")
+
+
+@pytest.mark.parametrize("package", ["netspec", "loopclosure", "lmdb_build"])
+def test_one_line_from_the_first_line_of_the_program(package: str) -> None:
+    """Whenever it comes, once Python runs the program: also where the arguments are read, and after the command."""
+    code = (
+        f"import os, signal, sys\nfrom {package}.__main__ import main\nfrom random import uniform\n"
+        "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGTERM))\n"
+        "signal.setitimer(signal.ITIMER_REAL, float(sys.argv.pop()))\nsys.exit(main())\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    for tenth in range(6):
+        words = [sys.executable, "-c", code, "--help", str(0.002 + tenth / 20)]
+        done = subprocess.run(words, capture_output=True, text=True, env=environment)
+        assert done.returncode == 0 or (done.returncode, done.stderr) == (143, "interrupted\n")
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -85,7 +126,7 @@ def test_a_second_one_ends_at_once(module: str, number: int) -> None:
     process.send_signal(signal.SIGINT)
     assert line_of(process) == "ending"
     process.send_signal(number)
-    assert process.wait(10) == 130
+    assert process.wait(10) == 128 + number
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for processes in /proc")

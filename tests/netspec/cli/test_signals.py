@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -25,11 +25,13 @@ def endless(work_in: Callable[..., Path]) -> Iterator[Callable[..., tuple[subpro
     Path(SOLVER).write_text(text.replace("snapshot_after_train: false", ""))
     started: list[subprocess.Popen] = []
 
-    def start(*words: str) -> tuple[subprocess.Popen, Callable[[str], None]]:
+    def start(
+        *words: str, program: Sequence[str] = ("-m", "netspec", "train")
+    ) -> tuple[subprocess.Popen, Callable[[str], None]]:
         log = Path("training.log")
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         with log.open("w") as stream:
-            command = [sys.executable, "-m", "netspec", "train", SOLVER, *words]
+            command = [sys.executable, *program, SOLVER, *words]
             process = subprocess.Popen(command, stderr=stream, env=environment)
         started.append(process)
 
@@ -60,7 +62,7 @@ def test_an_interrupt_stops_a_training_and_takes_a_snapshot(endless) -> None:
     process, wait_for = endless()
     wait_for("Iteration 10 ")
     process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 0
+    assert process.wait(60) == 130
     assert last_messages(2) == ["Optimization stopped early.", "Optimization Done."]
     (state,) = snapshots()
     assert state.removesuffix(".solverstate") in last_messages(3)[0]
@@ -84,17 +86,56 @@ def test_what_signals_do_can_be_changed(endless) -> None:
     wait_for("Iteration 100 ")
     assert not snapshots()
     process.send_signal(signal.SIGHUP)
-    assert process.wait(60) == 0
+    assert process.wait(60) == 129
     assert len(snapshots()) == 1
 
 
-def test_sigterm_stops_a_training_as_an_interrupt_does(endless) -> None:
-    process, wait_for = endless()
+NAMES = {
+    "netspec": ((), 143),
+    "no effect of Ctrl-C": (("--sigint_effect=none",), 143),
+    "tools/train.py": ((), 0),
+    "torchrun": ((), 0),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sigterm_stops_a_training_with_a_snapshot(name: str, endless, tmp_path: Path) -> None:
+    """A scheduler takes 0 for the end of the work; under Caffe's names it is what Caffe's users expect."""
+    words, status = NAMES[name]
+    ready = {
+        "tools/train.py": (str(ROOT / "tools" / "train.py"),),
+        "torchrun": ("-m", "torch.distributed.run", "--standalone", "-m", "netspec", "train"),
+    }
+    process, wait_for = endless(*words, program=ready.get(name, ("-m", "netspec", "train")))
     wait_for("Iteration 10 ")
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 0
-    assert last_messages(2) == ["Optimization stopped early.", "Optimization Done."]
+    number = process.pid
+    if name == "torchrun":
+        line = next(line for line in Path("training.log").read_text().splitlines() if "Iteration 10 " in line)
+        number = int(line.split()[2])  # glog has the process there
+    os.kill(number, signal.SIGTERM)
+    assert process.wait(60) == status
+    text = Path("training.log").read_text()
+    assert "Traceback" not in text
+    assert text.index("Optimization stopped early.") < text.index("Optimization Done.")
     assert len(snapshots()) == 1
+
+
+@pytest.mark.parametrize("name", ["caffe", "netspec"])
+def test_the_status_goes_by_the_name_of_the_program(name: str, endless) -> None:
+    Path(name).write_text("import sys\nfrom netspec.__main__ import program\nsys.exit(program('netspec.cli'))\n")
+    process, wait_for = endless(program=(name, "train"))
+    wait_for("Iteration 10 ")
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == (0 if name == "caffe" else 130)
+
+
+def test_a_training_whose_standard_error_is_closed(work_in: Callable[..., Path]) -> None:
+    work_in("train/sgd_step")
+    Path(SOLVER).write_text(Path(SOLVER).read_text().replace("snapshot_after_train: false", ""))
+    words = ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-m", "netspec", "train", SOLVER]
+    done = subprocess.run(words, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, timeout=100)
+    assert (done.returncode, done.stdout) == (0, b"")
+    assert Path("sgd_step/ref_iter_60.solverstate.extra").is_file()
 
 
 ENDLESS = """
