@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.dialects import use_dialects_of
 from netspec.errors import ForkFault, SpecError, Where
 from netspec.exact import NONE
 from netspec.graph.filter import filter_net, with_state
@@ -91,7 +90,7 @@ class CaffeFiles:
 
 
 def read_files(prototxt: FileOrBytes, weights: FileOrBytes | None) -> CaffeFiles:
-    """Read a prototxt, switch on the dialects that it needs, and filter it for phase TEST. Raises SpecError."""
+    """Read a prototxt and filter it for phase TEST. Raises SpecError."""
     if isinstance(prototxt, str | os.PathLike):
         file = os.fspath(prototxt)
         try:
@@ -101,7 +100,6 @@ def read_files(prototxt: FileOrBytes, weights: FileOrBytes | None) -> CaffeFiles
     else:
         file, data = PROTOTXT, bytes_of(prototxt)
     text = data.removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")
-    use_dialects_of(text, file)
     net, source = parse_net_text(text, file, upgrade=False, report=_skip)
     if not net.input_shape and not net.input_dim:
         for _ in net.input:  # Caffe leaves out an input without a shape; for OpenCV it gets one from setInput

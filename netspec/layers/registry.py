@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+import sys
+import traceback
 from collections.abc import Callable
 from typing import TypeVar
 
-from netspec.errors import did_you_mean
+from netspec.errors import SpecError, Where, did_you_mean
 from netspec.layers.base import Layer
-from netspec.proto.dialect.files import announce_known
-from netspec.proto.dialect.registry import advice_for, dialects_with_type
+from netspec.proto.dialect.files import DialectFile, announce_known, find_file, known_files, switch_on, waiting
+from netspec.proto.dialect.registry import advice_for, deactivate, dialects_with_type
 
 _LAYERS: dict[str, type[Layer]] = {}
 L = TypeVar("L", bound=type[Layer])
@@ -33,8 +37,57 @@ def register(type_name: str, *reads: str, replaces: type[Layer] | None = None) -
 
 
 def layer_class(type_name: str) -> type[Layer] | None:
-    """Return the class registered for a type, or None."""
+    """Return the class registered for a type, or None.
+
+    A type that one known dialect has switches that dialect on.
+    """
+    run_dialects()
+    if type_name not in _LAYERS:
+        announce_known()
+        dialects = [name for name in dialects_with_type(type_name) if name in known_files()]
+        if len(dialects) == 1:
+            switch_on(find_file(dialects[0]))
+            run_dialects()
     return _LAYERS.get(type_name)
+
+
+def run_dialects() -> None:
+    """Register the layers of the dialects that were switched on. Raises SpecError for one that cannot be loaded."""
+    while waiting:
+        file, dialect = waiting.pop(0)
+        module = file.module or f"netspec_dialect_{file.name}"
+        if module in sys.modules:
+            continue
+        try:
+            for layer_type in dialect.layer_types:
+                if cls := _LAYERS.get(layer_type):
+                    message = f'layer type "{layer_type}" already exists, from {cls.__module__}'
+                    raise SpecError(message, Where(str(file.path)))
+            _run(file, module)
+        except SpecError:
+            deactivate(dialect.name)
+            raise
+
+
+def _run(file: DialectFile, name: str) -> None:
+    """Run a dialect's file, which registers its layers."""
+    try:
+        if file.module:
+            importlib.import_module(name)
+            return
+        spec = importlib.util.spec_from_file_location(name, file.path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+    except Exception as fault:
+        sys.modules.pop(name, None)
+        frames = traceback.extract_tb(fault.__traceback__)
+        lines = [frame.lineno or 0 for frame in frames if frame.filename == str(file.path)]
+        text = " ".join(str(fault).split())
+        place = Where(str(file.path), lines[-1] if lines else 0, 1)
+        raise SpecError(f"cannot be loaded: {type(fault).__name__}: {text}", place) from fault
 
 
 def layer_types() -> list[str]:

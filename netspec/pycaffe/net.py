@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 
 from netspec import log
-from netspec.dialects import use_dialects_of
-from netspec.errors import ForkFault, did_you_mean
+from netspec.errors import did_you_mean
 from netspec.graph.filter import with_state
-from netspec.layers import layer_class
 from netspec.layers.utility import pycaffe_shim
 from netspec.layers.utility.live_blobs import Blob, BlobVec
 from netspec.layers.utility.python import Python
@@ -24,7 +22,6 @@ from netspec.net import net as core
 from netspec.net.build import build_net
 from netspec.net.weights import load_weights, write_binary, write_hdf5
 from netspec.proto.schema import PhaseValue
-from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net
 from netspec.pycaffe import mode
 from netspec.pycaffe.errors import caffes_errors
@@ -69,7 +66,7 @@ class Net:
             if not Path(path).is_file():
                 raise RuntimeError(f"Could not open file {path}")
         with caffes_errors():
-            net, source = _read(network_file)
+            net, source = parse_net(network_file)
             self._hold(
                 build_net(with_state(net, PhaseValue(phase), level or 0, stages or ()), source, mode.build_options())
             )
@@ -309,20 +306,6 @@ class Net:
     def set_device(self, device_id: int) -> None:
         """Set the GPU for nets to come."""
         mode.set_device(device_id)
-
-
-def _read(network_file: FilePath) -> tuple[Any, SourceMap]:
-    """Return the net of a prototxt and where its parts stand; switch on the dialects that it needs."""
-    try:
-        net, source = parse_net(network_file)
-        if all(layer_class(layer.type) for layer in net.layer):
-            return net, source
-    except ForkFault:
-        pass
-    used = use_dialects_of(Path(network_file).read_text("utf-8", "surrogateescape"), str(network_file))
-    if used:
-        log.logger.info(f"{network_file}: switched on the layers and fields of {' and '.join(used)}")
-    return parse_net(network_file)
 
 
 def _older_form(network_file: FilePath, weights: FilePath, phase: int | None) -> tuple[int, FilePath, int]:

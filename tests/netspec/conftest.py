@@ -2,14 +2,13 @@
 
 import logging
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fresh_dialects import fresh_dialects
 from netspec.cli import main
 from netspec.exact.blas import CAFFES, kernels
 from netspec.graph.filter import with_state
@@ -19,12 +18,6 @@ from netspec.net.options import BuildOptions
 from netspec.proto.schema import TEST, PhaseValue
 from netspec.proto.text import parse_net_text
 from paths import GOLDEN
-
-
-@pytest.fixture
-def leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let a test use dialects; switch them off when it is done."""
-    yield from fresh_dialects(monkeypatch)
 
 
 @pytest.fixture(scope="session")

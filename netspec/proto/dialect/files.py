@@ -18,7 +18,7 @@ from pathlib import Path
 from netspec import log
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto.dialect.folders import FOLDERS
-from netspec.proto.dialect.registry import Dialect, announce
+from netspec.proto.dialect.registry import Dialect, activate, announce
 
 GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name and a module each
 
@@ -102,6 +102,19 @@ def _registered_types(tree: ast.Module) -> Iterator[str]:
 
 def _name(node: ast.expr) -> str:
     return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
+waiting: list[tuple[DialectFile, Dialect]] = []  # switched on; their layers are not registered yet
+
+
+def switch_on(file: DialectFile) -> None:
+    """Add the fields of a dialect to the schema. Its layers are registered when the next layer is looked up.
+
+    Raises SpecError where its file has a fault, or Caffe or another dialect has one of its fields.
+    """
+    dialect = read_dialect(file)
+    activate(dialect)
+    waiting.append((file, dialect))
 
 
 @cache

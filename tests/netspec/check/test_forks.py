@@ -14,6 +14,7 @@ NORM = """layer { name: "n" type: "Normalize" bottom: "a" top: "n"
   norm_param < across_spatial: false scale_filler { type: "constant" value: -20 } > }
 """
 SHUFFLE = 'layer { name: "s" type: "ShuffleChannel" bottom: "a" top: "s" shuffle_channel_param { group: 2 } }\n'
+STRANGE = 'layer { name: "s" type: "Strange" bottom: "a" top: "s" strange_param { group: 2 } }\n'
 POOL = (
     'layer { name: "k" type: "Pooling" bottom: "a" top: "k" pooling_param { kernal: -3, pool: MAX kernel_size: 2 } }\n'
 )
@@ -28,13 +29,10 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def test_unknown_fields_and_layers_are_counted_by_dialect():
-    Path("net.prototxt").write_text(INPUT + PERMUTE % (1, 1) + PERMUTE % (2, 2) + NORM + SHUFFLE)
+def test_faults_in_the_fields_of_forks_are_found():
+    Path("net.prototxt").write_text(INPUT + PERMUTE % (1, 1) + NORM + SHUFFLE)
     assert lines("net.prototxt") == [
-        "net.prototxt:3:3: 3 fields (permute_param 2 times, norm_param) and 3 layers (Permute 2 times, Normalize) of "
-        'dialect "ssd"; add --plugin ssd, in Python netspec.use_dialect("ssd")',
-        "net.prototxt:8:63: 1 field (shuffle_channel_param) and 1 layer (ShuffleChannel) of "
-        'dialect "blocks"; add --plugin blocks, in Python netspec.use_dialect("blocks")',
+        'net.prototxt:3:51: layer "p1" (Permute): PermuteParameter has no field "deeper"',
     ]
 
 
@@ -49,10 +47,10 @@ def test_a_field_of_no_dialect_is_named_once_with_its_lines():
 
 
 def test_what_cannot_be_passed_over_comes_after_what_was_found():
-    Path("net.prototxt").write_text(POOL + SHUFFLE + 'layer { odd { a: [1, 2] b { c: 1 }\n  top: "x" \n')
+    Path("net.prototxt").write_text(POOL + STRANGE + 'layer { odd { a: [1, 2] b { c: 1 }\n  top: "x" \n')
     found = lines("net.prototxt")
     assert [line.partition(" ")[0] for line in found] == [
-        f"net.prototxt:{place}:" for place in ("1:72", "2:63", "3:9", "5:1")
+        f"net.prototxt:{place}:" for place in ("1:72", "2:56", "3:9", "5:1")
     ]
     assert found[3] == 'net.prototxt:5:1: the file ends inside "odd" of line 3; is a "}" missing?'
     Path("net.prototxt").write_text("odd: }\nlayer { even 3 }")
@@ -62,9 +60,13 @@ def test_what_cannot_be_passed_over_comes_after_what_was_found():
 
 
 def test_a_solver_and_its_nets_are_read_to_the_end():
-    Path("net.prototxt").write_text(INPUT + NORM)
+    Path("net.prototxt").write_text(INPUT + STRANGE)
     Path("solver.prototxt").write_text('net: "net.prototxt"\nbase_lr: 1\n')
-    assert lines("solver.prototxt")[-1].startswith("net.prototxt:3:3: 1 field (norm_param) and 1 layer (Normalize) of")
+    assert [line.partition(": ")[2] for line in lines("solver.prototxt")] == [
+        "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid",
+        'layer "s" (Strange): LayerParameter has no field "strange_param"; did you mean "tanh_param"?',
+        'layer "s" (Strange): unknown layer type "Strange"; `netspec layers` lists the known ones',
+    ]
     Path("solver.prototxt").write_text('fast: true\nnet: "net.prototxt"\nbase_lr: 1\nquick_mode { x: 1 }\n')
     assert [line.partition(": ")[2] for line in lines("solver.prototxt")] == [
         'SolverParameter has no field "fast"',

@@ -1,12 +1,11 @@
-"""Dialects for one test: registry and schema are afterwards as they were before."""
+"""Layers of dialects for a test."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
 
 from fake_gpu import NAME, POSSIBLE, fake_gpu
-from fresh_dialects import fresh_dialects
 from netspec.dialects import use_dialect
 from netspec.layers import Layer
 from netspec.net.one_layer import make_layer
@@ -14,9 +13,8 @@ from netspec.proto.schema import TEST
 
 
 @pytest.fixture(autouse=True)
-def _leave_no_dialect(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _seed() -> None:
     torch.manual_seed(0)
-    yield from fresh_dialects(monkeypatch)
 
 
 @pytest.fixture

@@ -10,6 +10,11 @@ from netspec.proto.dialect import files as dialect_files
 from netspec.proto.dialect import registry as dialect
 
 
+@pytest.fixture(autouse=True)
+def _no_dialect_is_left_on() -> None:
+    """Instead of the fixture for all tests: the tests of a file share their nets."""
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _leave_no_dialect() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:

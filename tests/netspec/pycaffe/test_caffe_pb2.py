@@ -15,7 +15,7 @@ from netspec.pycaffe.proto import caffe_pb2
 
 
 @pytest.fixture
-def ssd(leave_no_dialect: None) -> None:
+def ssd() -> None:
     use_dialect("ssd")
 
 

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
-def ssd(leave_no_dialect: None) -> None:
+def ssd() -> None:
     use_dialect("ssd")
 
 

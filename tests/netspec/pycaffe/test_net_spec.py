@@ -171,7 +171,7 @@ def test_a_deep_net_needs_no_deep_stack() -> None:
     assert len(top.to_proto().layer) == 3001
 
 
-def test_a_dialects_layers_and_constants(leave_no_dialect: None) -> None:
+def test_a_dialects_layers_and_constants() -> None:
     use_dialect("ssd")
     top = L.Permute(L.Input(shape={"dim": [1, 3, 8, 8]}), order=[0, 2, 3, 1])
     assert top.to_proto().layer[1].permute_param.order == [0, 2, 3, 1]

@@ -114,7 +114,7 @@ USES = {
 
 
 @pytest.fixture(autouse=True)
-def as_in_netspec_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, leave_no_dialect: None) -> Iterator[None]:
+def as_in_netspec_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Let ``import caffe`` find netspec, in a folder with a net, its weights and an image."""
     cv2 = pytest.importorskip("cv2")
     monkeypatch.chdir(tmp_path)

@@ -72,7 +72,7 @@ Detection(0, 'deploy.prototxt', 'x.caffemodel', 32, 'labelmap.prototxt').detect(
 """
 
 
-def test_a_program_for_ssd_in_python_2(run: Run, tmp_path: Path, leave_no_dialect: None) -> None:
+def test_a_program_for_ssd_in_python_2(run: Run, tmp_path: Path) -> None:
     for ending, name in (("prototxt", "deploy.prototxt"), ("caffemodel", "x.caffemodel")):
         shutil.copy(HERE / f"detect.{ending}", tmp_path / name)
     image = np.random.RandomState(0).rand(32, 32, 3).astype(np.float32)
