@@ -16,7 +16,7 @@ _FAMILIES = (walk, pairs, views, lists, convert, compare)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return 0 when done, 1 for an error in the user's files, 2 for wrong usage, 128 + N for signal N."""
+    """Run one command; return 0: done, 1: an error in the user's files, 2: wrong usage, 128 + N: signal N."""
     cv2.setNumThreads(1)  # the pictures are small
     return run(parser(), list(sys.argv[1:] if argv is None else argv), (InputError,))
 

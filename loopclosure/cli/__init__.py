@@ -13,7 +13,7 @@ _COMMANDS = (evaluate, compare, detect, close, similarity)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return 0 when done, 1 for a fault of the user's files, 2 for wrong usage, 128 + N for signal N."""
+    """Run one command; return 0: done, 1: a fault of the user's files, 2: wrong usage, 128 + N: signal N."""
     return run(parser(), list(sys.argv[1:] if argv is None else argv))
 
 

@@ -51,7 +51,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from netspec.layers.registry import run_dialects
 from netspec.proto.dialect.choice import use_dialects_of
 from netspec.proto.dialect.files import find_file, switch_on
 
@@ -64,5 +63,7 @@ def use_dialect(name: str | Path) -> None:
     Does nothing where it is there already. Raises SpecError where there is no such dialect, its file has a fault, or
     Caffe or another dialect has one of its fields or layer types.
     """
+    from netspec.layers.registry import run_dialects  # it needs torch
+
     switch_on(find_file(name))
     run_dialects()

@@ -19,7 +19,6 @@ import torch
 from netspec.exact.blas import one_thread
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
-from netspec.layers.learned import values_of
 from netspec.layers.training import Backward, Diff, Forward, Kernels, Learning, recorded
 from netspec.limits import is_out_of_memory
 
