@@ -245,6 +245,7 @@ class LoopDetector:
             "loops": [asdict(loop) for loop in self.loops],
         }
         if self.check is not None:
+            arrays["sizes"] = np.array([local.size for local in frames.local], np.int64).reshape(-1, 2)
             arrays["points_of_frame"] = np.array([len(local.points) for local in frames.local], np.int64)
             arrays["points"] = np.concatenate([np.zeros((0, 2), np.float32), *(f.points for f in frames.local)])
             arrays["descriptors"] = np.concatenate(
@@ -359,10 +360,11 @@ class LoopDetector:
         assert local is not None
         most = 0
         for number, value in steady:
-            inliers = self.check.inliers(local, self._frames.local[number])
-            if self.check.accepts(inliers):
+            found = self.check.agreement(local, self._frames.local[number])
+            inliers = self.check.enough(found)
+            if inliers:
                 return result("accepted", number, value, inliers)
-            most = max(most, inliers)
+            most = max(most, found.inliers)
         return result("not verified", inliers=most)
 
 
@@ -393,8 +395,13 @@ def _frames(arrays: dict[str, np.ndarray], views: int, checked: bool) -> _Frames
             raise ValueError('"points_of_frame" has a negative number')
         check_array(arrays, "points", "f", (points, 2))
         check_array(arrays, "descriptors", "u", (points, 128))
+        sizes = arrays.get("sizes", np.tile(LocalFeatures.size, (count, 1)))  # files from before it do not have it
+        check_array({"sizes": sizes}, "sizes", "i", (count, 2))
         pieces = zip(np.split(arrays["points"], ends), np.split(arrays["descriptors"], ends), strict=True)
-        frames.local = [LocalFeatures(points, descriptors) for points, descriptors in pieces][:count]
+        frames.local = [
+            LocalFeatures(*parts, (int(width), int(height)))
+            for parts, (width, height) in zip(list(pieces)[:count], sizes, strict=True)
+        ]
     return frames
 
 

@@ -2,13 +2,22 @@
 
 Where the camera is known, the essential matrix, which has fewer degrees of freedom, replaces the fundamental matrix.
 
+How many matches must agree depends on how many there are, on the size of the images and on how near to its epipolar
+line a match must be: enough that chance does not bring them about. The count is that of Moisan and Stival, "A
+probabilistic criterion to detect rigid point matches between two images and estimate the fundamental matrix" (IJCV
+2004). Small images are enlarged first: SIFT finds points down to about two pixels of what it is given.
+
 A flat scene, or a camera that only rotates, does not determine the fundamental matrix. Its inliers still count points
 that agree, so such pairs are accepted. A pair needs texture: two views of a bare wall fail.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,14 +26,32 @@ from loopclosure.errors import InputError
 
 # Fewer matches prove nothing: any seven have a fundamental matrix.
 LEAST_MATCHES = 8
+# The expected number of matrices that as many of the matches fit by chance is at most this, per pair of images. Chance
+# alone is not all: points of one object are not independent, and a detector compares thousands of pairs.
+BY_CHANCE = 1e-6
+SAMPLE, SOLUTIONS = 7, 3  # matches that make a fundamental matrix, and how many they may make
+# The most by which an image is enlarged; beyond it only the interpolation gets finer.
+MOST_ENLARGED = 4.0
 
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """Points of an image (K, 2) float32, x and y in pixels, and their SIFT descriptors (K, 128) uint8."""
+    """Points of an image (K, 2) float32, x and y in pixels, and their SIFT descriptors (K, 128) uint8.
+
+    size  width and height of the image
+    """
 
     points: np.ndarray
     descriptors: np.ndarray
+    size: tuple[int, int] = (640, 480)
+
+
+class Agreement(NamedTuple):
+    """How many points of two images match, how many matches agree with one matrix, and how many chance may not."""
+
+    matches: int
+    inliers: int
+    needed: int
 
 
 @dataclass(frozen=True)
@@ -33,9 +60,10 @@ class GeometricCheck:
 
     max_features   how many of the strongest SIFT points are kept per image; 500 need 66 kB of memory per frame
     ratio          a match must be nearer than ``ratio`` times the second nearest (Lowe's test)
-    max_error_px   distance of an inlier from its epipolar line, in pixels
+    max_error_px   distance of an inlier from its epipolar line, in pixels of the image as it is searched
     confidence     of RANSAC
-    min_inliers    the least number of inliers of a loop
+    min_inliers    the least number of inliers of a loop; 0: as many as rule out chance
+    least_side     images whose shorter side has fewer pixels are enlarged to this, at most four times
     focal_px       focal length in pixels of the images as they are; 0: not known, a fundamental matrix is used
     center_x_px    principal point, with focal_px
     center_y_px
@@ -45,20 +73,32 @@ class GeometricCheck:
     ratio: float = 0.8
     max_error_px: float = 2.0
     confidence: float = 0.985
-    min_inliers: int = 20
+    min_inliers: int = 0
+    least_side: int = 240
     focal_px: float = 0.0
     center_x_px: float = 0.0
     center_y_px: float = 0.0
 
+    def enlarged(self, size: tuple[int, int]) -> float:
+        """Return the factor by which images of a width and height are enlarged."""
+        return min(MOST_ENLARGED, max(1.0, self.least_side / max(1, min(size))))
+
     def describe(self, image: np.ndarray) -> LocalFeatures:
         """Find the points of an image (H, W) or (H, W, 3) uint8; there may be none."""
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        size = (gray.shape[1], gray.shape[0])
+        factor = self.enlarged(size)
+        if factor > 1:
+            gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
         points, descriptors = cv2.SIFT.create(self.max_features).detectAndCompute(gray, None)
         if descriptors is None or not len(points):
-            return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
+            return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), size)
         # OpenCV's SIFT descriptors are integers up to 255, in float32: bytes hold them without loss.
         places = np.array([point.pt for point in points], np.float32)
-        return LocalFeatures(places[: self.max_features], descriptors[: self.max_features].astype(np.uint8))
+        if factor > 1:  # the middle of pixel 0 lies at 0 in both
+            places = (places + 0.5) / np.float32(factor) - 0.5
+        kept = slice(self.max_features)
+        return LocalFeatures(places[kept], descriptors[kept].astype(np.uint8), size)
 
     def matches(self, a: LocalFeatures, b: LocalFeatures) -> np.ndarray:
         """Return the matches (M, 2), points of ``a`` and ``b``, that pass the ratio test; no point of ``b`` twice."""
@@ -74,25 +114,38 @@ class GeometricCheck:
         return np.array(sorted((i, j) for j, i in point_of_a.items()), np.int64).reshape(-1, 2)
 
     def inliers(self, a: LocalFeatures, b: LocalFeatures) -> int:
-        """Count the matches that agree with one fundamental or essential matrix; 0 if there are too few."""
+        """Count the matches that agree with one fundamental or essential matrix; 0 if chance explains them."""
+        return self.enough(self.agreement(a, b))
+
+    def agreement(self, a: LocalFeatures, b: LocalFeatures) -> Agreement:
+        """Match the points of two images, and count the matches that agree with one matrix."""
         matches = self.matches(a, b)
+        factor = self.enlarged(b.size)
+        size = (round(b.size[0] * factor), round(b.size[1] * factor))
+        needed = _needed(len(matches), *size, self.max_error_px)
         if len(matches) < LEAST_MATCHES:
-            return 0
+            return Agreement(len(matches), 0, needed)
         points = a.points[matches[:, 0]], b.points[matches[:, 1]]
+        error = self.max_error_px / max(self.enlarged(a.size), factor)
         if self.focal_px:
             camera = np.array([[self.focal_px, 0, self.center_x_px], [0, self.focal_px, self.center_y_px], [0, 0, 1]])
-            matrix, mask = cv2.findEssentialMat(*points, camera, cv2.RANSAC, self.confidence, self.max_error_px)
+            matrix, mask = cv2.findEssentialMat(*points, camera, cv2.RANSAC, self.confidence, error)
         else:
-            matrix, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, self.max_error_px, self.confidence)
+            matrix, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, error, self.confidence)
         # Without a matrix OpenCV 5.0.0 does not fill in the mask. Of several solutions the mask says nothing.
-        return 0 if matrix is None or matrix.shape != (3, 3) else int(np.count_nonzero(mask))
+        known = matrix is not None and matrix.shape == (3, 3)
+        return Agreement(len(matches), int(np.count_nonzero(mask)) if known else 0, needed)
 
-    def accepts(self, inliers: int) -> bool:
-        """Return whether this many inliers are enough."""
-        return inliers >= self.min_inliers
+    def enough(self, found: Agreement) -> int:
+        """Return the inliers of an agreement; 0 if there are fewer than this check asks for."""
+        return found.inliers if found.inliers >= (self.min_inliers or found.needed) else 0
 
     def __post_init__(self) -> None:
-        if self.max_features < LEAST_MATCHES or self.min_inliers < LEAST_MATCHES or not 0 < self.ratio <= 1:
+        if (
+            self.max_features < LEAST_MATCHES
+            or not (self.min_inliers == 0 or self.min_inliers >= LEAST_MATCHES)
+            or not 0 < self.ratio <= 1
+        ):
             raise InputError(
                 f"geometric check: {self.max_features} features, {self.min_inliers} inliers, ratio {self.ratio:g}; "
                 f"expected at least {LEAST_MATCHES} of both and a ratio in 0..1"
@@ -103,3 +156,48 @@ class GeometricCheck:
                 "geometric check: a known camera needs focal_px, center_x_px and center_y_px, all above 0; "
                 f"got {', '.join(f'{value:g}' for value in camera)}"
             )
+
+
+@lru_cache(4096)
+def _needed(matches: int, width: int, height: int, error_px: float) -> int:
+    """Return the least k with (n - 7) C(n, k) C(k, 7) 3 p^(k - 7) <= BY_CHANCE, n + 1 if there is none.
+
+    p is the greatest share of the image that lies within ``error_px`` of a line.
+    """
+    share = min(1.0, 2 * error_px * math.hypot(width, height) / (width * height))
+    for count in range(SAMPLE + 1, matches + 1):
+        ways = math.comb(matches, count) * math.comb(count, SAMPLE) * SOLUTIONS * (matches - SAMPLE)
+        if math.log(ways) + (count - SAMPLE) * math.log(share) <= math.log(BY_CHANCE):
+            return count
+    return matches + 1
+
+
+@dataclass
+class Pairs:
+    """Verified pairs of images, each image described and each pair matched once for all that ask.
+
+    image  how an image is read: its key -> (H, W) or (H, W, 3) uint8
+    """
+
+    image: Callable[[Any], np.ndarray]
+    _local: dict[tuple[GeometricCheck, Any], LocalFeatures] = field(default_factory=dict)
+    _found: dict[tuple[GeometricCheck, Any, Any], Agreement] = field(default_factory=dict)
+
+    def features(self, check: GeometricCheck, key: Any) -> LocalFeatures:
+        """Return the points of an image."""
+        of = (_by_points(check), key)
+        if of not in self._local:
+            self._local[of] = check.describe(self.image(key))
+        return self._local[of]
+
+    def agreement(self, check: GeometricCheck, a: Any, b: Any) -> Agreement:
+        """Return how many points of two images agree."""
+        of = (replace(check, min_inliers=0), a, b)
+        if of not in self._found:
+            self._found[of] = check.agreement(self.features(check, a), self.features(check, b))
+        return self._found[of]
+
+
+def _by_points(check: GeometricCheck) -> GeometricCheck:
+    """Return a check that finds the same points, the same for all such."""
+    return GeometricCheck(max_features=check.max_features, least_side=check.least_side)

@@ -15,7 +15,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from loopclosure.detector.verification import Pairs
 from loopclosure.errors import InputError
+from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
 
 
@@ -73,10 +75,12 @@ class MethodContext:
     exclude_frames   in one sequence, frames with |i - j| <= exclude_frames are not candidates (SeqSLAM must know this
                      before it searches)
     seed             of all random numbers
+    pairs            what verification has found, for all methods of a run
     """
 
     exclude_frames: int = 0
     seed: int = 0
+    pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
 
 
 # name -> "module:factory", a Factory. On the command line a method is written name[:argument], and one that refines the

@@ -1,9 +1,10 @@
 """Geometric verification of another method's best matches: ``verified+METHOD`` on the command line.
 
 The best k references of each query are compared by local features and a fundamental matrix (an essential matrix, where
-the camera is known). What has too few inliers is rejected: it gets no score, so that a method that accepts nothing
-finds nothing. On top of SeqSLAM a sequence is verified, not a single image: a pair is accepted if any pair on one of
-its trajectories is.
+the camera is known). What is verified comes before all that is not; within both the inner method's order stays. So
+verification can only put right matches before wrong ones, and where images are too small, too dark or too different to
+be verified, the inner method's answer is passed through. On top of SeqSLAM a sequence is verified, not a single image:
+a pair is verified if any pair on one of its trajectories is.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from loopclosure.detector.verification import GeometricCheck
+from loopclosure.detector.verification import GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
 from loopclosure.methods.seqslam import SeqSlam
@@ -20,8 +21,6 @@ from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
 
-# The least of what published systems ask for, 12 to 22.
-MIN_INLIERS = 12
 ORDERS = ("score", "inliers")
 
 
@@ -32,16 +31,19 @@ class Verified:
     inner           the method whose candidates are verified
     check           how, with how many inliers
     k               candidates per query
-    order           of what is accepted: by the inner method's "score", or by the "inliers" of each pair. Inliers tell
-                    whether two views show the same things, but not from how near
+    order           of what is verified: by the inner method's "score", or by the "inliers" of each pair, and then what
+                    is not verified gets no score. Inliers tell whether two views show the same things, but not from
+                    how near
     exclude_frames  in one sequence, references within this many frames of the query are not candidates
+    pairs           where features and inliers are kept
     """
 
     inner: Method
-    check: GeometricCheck = field(default_factory=lambda: GeometricCheck(min_inliers=MIN_INLIERS))
+    check: GeometricCheck = field(default_factory=GeometricCheck)
     k: int = 20
     order: str = "score"
     exclude_frames: int = 0
+    pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
 
     def __post_init__(self) -> None:
         if self.k < 1:
@@ -55,42 +57,48 @@ class Verified:
         return f"verified+{self.inner.name}"
 
     def score(self, images: Images, progress: Progress) -> MethodResult:
-        """Score as :class:`loopclosure.methods.base.Method` says; NaN for what is not accepted."""
+        """Score as :class:`loopclosure.methods.base.Method` says."""
         found = self.inner.score(images, progress)
         seconds = dict(found.seconds)
         candidates = np.where(np.isnan(found.scores), -np.inf, found.scores)
         if images.references is None:
             candidates[~earlier(len(images.queries), self.exclude_frames)] = -np.inf
         inliers = self._inliers(candidates, images, progress, seconds)
-        accepted = inliers >= self.check.min_inliers
+        verified = inliers > 0
+        tried = np.count_nonzero(inliers >= 0)
         notes = [
             *found.notes,
-            f"{np.count_nonzero(accepted)} of {np.count_nonzero(inliers >= 0)} pairs, the best {self.k} of each query, "
-            f"have {self.check.min_inliers} inliers; {self.check}",
+            f"{np.count_nonzero(verified)} of {tried} pairs, the best {self.k} of each query, are verified",
+            f"{self.check}",
         ]
         if self.order == "inliers":
-            return MethodResult(np.where(accepted, inliers, np.nan), seconds, notes, found.training_stages)
+            return MethodResult(np.where(verified, inliers, np.nan), seconds, notes, found.training_stages)
         if isinstance(self.inner, SeqSlam):
-            accepted = on_trajectories(accepted, self.inner.settings.offsets())
-            notes.append("a pair is accepted if any pair on one of its trajectories is")
-        scores = np.where(accepted & ~np.isneginf(candidates), found.scores, np.nan)
+            verified = on_trajectories(verified, self.inner.settings.offsets())
+            notes.append("a pair is verified if any pair on one of its trajectories is")
+        if not verified.any():
+            notes.append("these images cannot be verified: the scores are those of the inner method")
+        known = ~np.isneginf(candidates)
+        scores = np.where(known, candidates, np.nan).astype(np.float64)
+        if known.any():  # what is verified comes first
+            scores[verified & known] += np.ptp(scores[known]) + 1.0
         return MethodResult(scores, seconds, notes, found.training_stages)
 
     def _inliers(
         self, candidates: np.ndarray, images: Images, progress: Progress, seconds: dict[str, float]
     ) -> np.ndarray:
-        """Return the inliers of the best k candidates of each query, -1 for other pairs: (Q, R)."""
-        local = []
+        """Return the inliers of the best k candidates of each query, 0 if too few, -1 for other pairs: (Q, R)."""
         for path in progress(images.tested, "local features", len(images.tested)):
             with timed(seconds, "local features"):
-                local.append(self.check.describe(read_gray(path)))
-        references = local if images.references is None else local[len(images.queries) :]
+                self.pairs.features(self.check, path)
+        references = images.queries if images.references is None else images.references
         inliers = np.full(candidates.shape, -1, np.int64)
         for query in progress(range(len(candidates)), "verification", len(candidates)):
             with timed(seconds, "verification"):
                 best = np.argsort(-candidates[query], kind="stable")[: self.k]
                 for reference in best[~np.isneginf(candidates[query, best])]:
-                    inliers[query, reference] = self.check.inliers(local[query], references[reference])
+                    found = self.pairs.agreement(self.check, images.queries[query], references[reference])
+                    inliers[query, reference] = self.check.enough(found)
         return inliers
 
 
@@ -116,7 +124,7 @@ def verified(argument: str, context: MethodContext, inner: Method | None) -> Ver
     """Build ``verified[:setting=value,...]+METHOD``."""
     if inner is None:
         raise InputError("verified needs a method whose best matches it verifies; write verified+METHOD")
-    plain = Verified(inner, exclude_frames=context.exclude_frames)
+    plain = Verified(inner, exclude_frames=context.exclude_frames, pairs=context.pairs)
     method, check = configure("verified", argument, plain, plain.check)
     method.check = check
     return method
