@@ -1,4 +1,4 @@
-"""``tools/bench``: its commands; netspec/command_line.py reads them as it reads those of netspec."""
+"""``tools/bench``: its commands; netspec/terminal/commands.py reads them as it reads those of netspec."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.growth import KINDS
 from benchmarks.report import Row
-from netspec.command_line import Commands, WrongUsage, run
+from netspec.terminal.commands import Commands, WrongUsage, run
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
@@ -67,7 +67,7 @@ class _Quiet(Commands):
     """Commands that show no log."""
 
     def add(self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str) -> Any:
-        """See :class:`netspec.command_line.Commands`."""
+        """See :class:`netspec.terminal.commands.Commands`."""
         added = super().add(name, function, summary)
         added.set_defaults(log_level=logging.WARNING)
         return added

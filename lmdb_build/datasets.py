@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.progress import Progress, silent
-from netspec import log
 from netspec.data.database import Writer
 from netspec.errors import SpecError, Where
-from netspec.lfs import pointer_fault
+from netspec.files.lfs import pointer_fault
 from netspec.proto.schema import Datum
+from netspec.terminal import log
 
 IMAGES, LABELS = 2051, 2049  # the first number of a file of MNIST
 CIFAR_SHAPE = (3, 32, 32)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-from netspec import waiting
+from netspec.process import waiting
 from netspec.proto.dialect.folders import FOLDERS
 
 TYPE_CHECKING = False
@@ -75,7 +75,7 @@ def __getattr__(name: str) -> Any:
     import importlib.util
 
     if name == "__version__":
-        from netspec.version import version
+        from netspec.terminal.version import version
 
         return version()
     if name in _HOMES:

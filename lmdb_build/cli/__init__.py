@@ -10,7 +10,7 @@ import cv2
 
 from lmdb_build.cli import compare, convert, lists, pairs, views, walk
 from loopclosure.errors import InputError
-from netspec.command_line import Commands, program, run
+from netspec.terminal.commands import Commands, program, run
 
 _FAMILIES = (walk, pairs, views, lists, convert, compare)
 

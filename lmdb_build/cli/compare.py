@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from netspec.command_line import Commands
+from netspec.terminal.commands import Commands
 
 
 def add_to(commands: Commands) -> None:

@@ -28,7 +28,7 @@ from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_posed
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
-from netspec.command_line import Commands, WrongUsage
+from netspec.terminal.commands import Commands, WrongUsage
 
 
 def add_to(commands: Commands) -> None:

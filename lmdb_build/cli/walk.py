@@ -9,7 +9,7 @@ from lmdb_build.cli.arguments import size
 from lmdb_build.cli.bar import bar
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.options import seed
-from netspec.command_line import Commands, WrongUsage
+from netspec.terminal.commands import Commands, WrongUsage
 
 SEASON_S = 1_000_000.0  # between the time stamps of two seasons of one walk
 

@@ -1,6 +1,6 @@
 """Which images a folder or a list names, in which order, and when they were taken: the rule of docs/images.md.
 
-netspec/features/image_list.py follows the same rule; tests/laws/test_image_lists.py holds both to it.
+netspec/files/image_list.py follows the same rule; tests/laws/test_image_lists.py holds both to it.
 """
 
 from __future__ import annotations

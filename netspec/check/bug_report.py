@@ -14,16 +14,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from netspec import log, waiting
 from netspec.check.check import check_file
-from netspec.data.npz import read_npz
 from netspec.data.records import open_records
 from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError, printable
 from netspec.exact.blas import kernels
-from netspec.limits import amount, memory
+from netspec.files.limits import amount, memory
+from netspec.files.npz import read_npz
+from netspec.process import waiting
 from netspec.proto.binary import is_net_binary
-from netspec.version import UNKNOWN, version
+from netspec.terminal import log
+from netspec.terminal.version import UNKNOWN, version
 
 PACKAGES = (
     "netspec-caffe", "torch", "numpy", "scipy", "protobuf", "lmdb", "opencv-python-headless", "h5py", "matplotlib",

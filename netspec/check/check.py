@@ -13,14 +13,13 @@ from pathlib import Path
 
 import torch
 
-from netspec import log
 from netspec.check import net_rules, solver_rules  # noqa: F401, they register their rules
 from netspec.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
 from netspec.check.forks import gathered, unknown_types
 from netspec.errors import ForkFault, SpecError
+from netspec.files.limits import most
 from netspec.graph.filter import with_state, with_train_state
 from netspec.layers.base import Shape
-from netspec.limits import most
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions, not_to_be_given
@@ -33,6 +32,7 @@ from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.checks import check_prefix, check_settings
 from netspec.solver.nets import TRAIN_NET, seed_of, solver_nets
 from netspec.solver.solver import choose_device
+from netspec.terminal import log
 
 
 @dataclass

@@ -6,9 +6,9 @@ import time
 
 import torch
 
-from netspec.log import info, number
 from netspec.net.net import Net
 from netspec.solver.tally import Outputs, Tally, score_lines, scorers
+from netspec.terminal.log import info, number
 
 
 def test_net(net: Net, iterations: int) -> Outputs:

@@ -27,7 +27,7 @@ from netspec.cli import (
     watch,
 )
 from netspec.cli.run import Commands
-from netspec.command_line import program, run
+from netspec.terminal.commands import program, run
 
 _FAMILIES = (
     *(train, measure, check, draw, diff, fmt, lint, lsp, extract, plot, watch, data, look, export),

@@ -8,13 +8,13 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from netspec import log
-from netspec.command_line import refuse
 from netspec.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
 from netspec.graph.steps import PASSES
 from netspec.proto.binary import split_paths
+from netspec.terminal import log
+from netspec.terminal.commands import refuse
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:

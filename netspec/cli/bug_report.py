@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from netspec.cli.run import Commands
-from netspec.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 
 def add_to(commands: Commands) -> None:

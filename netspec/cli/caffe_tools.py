@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import logging
 
-from netspec import log
 from netspec.cli.arguments import add_shapes, device, positive
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage
 from netspec.errors import SpecError
-from netspec.whole_file import whole_file
+from netspec.files.whole_file import whole_file
+from netspec.terminal import log
+from netspec.terminal.commands import WrongUsage
 
 
 def add_to(commands: Commands) -> None:

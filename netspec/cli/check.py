@@ -8,11 +8,11 @@ import sys
 
 from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, stages
 from netspec.cli.run import Commands
-from netspec.command_line import refuse
 from netspec.errors import printable
-from netspec.garbage import no_collection
+from netspec.process.garbage import no_collection
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import PHASES
+from netspec.terminal.commands import refuse
 
 
 def add_to(commands: Commands) -> None:

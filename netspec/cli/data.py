@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from netspec.cli.arguments import bar, positive
 from netspec.cli.run import Commands
-from netspec.command_line import DONE, FAULT, WrongUsage, refuse
 from netspec.errors import printable
+from netspec.terminal.commands import DONE, FAULT, WrongUsage, refuse
 
 if TYPE_CHECKING:
     from netspec.data.records import Records

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from netspec.cli.run import Commands
-from netspec.command_line import DONE, SOMETHING, UNREADABLE
+from netspec.terminal.commands import DONE, SOMETHING, UNREADABLE
 
 
 def add_to(commands: Commands) -> None:

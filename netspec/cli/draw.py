@@ -8,8 +8,8 @@ from pathlib import Path
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage, refuse
 from netspec.proto.schema import PHASES, TEST, TRAIN
+from netspec.terminal.commands import WrongUsage, refuse
 
 FORMATS = (".svg", ".png", ".html")
 

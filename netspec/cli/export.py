@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from netspec import log
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import Commands
-from netspec.command_line import refuse
 from netspec.proto.binary import split_paths
+from netspec.terminal import log
+from netspec.terminal.commands import refuse
 
 EXPORT = """Write a net in another form, with its weights.
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from netspec import log
 from netspec.cli.arguments import (
     add_device,
     add_engine,
@@ -27,12 +26,13 @@ from netspec.cli.arguments import (
     stages,
 )
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage, refuse
 from netspec.errors import SpecError
 from netspec.features.views import read_zooms
+from netspec.files.whole_file import whole_file, why_unwritable
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
-from netspec.whole_file import whole_file, why_unwritable
+from netspec.terminal import log
+from netspec.terminal.commands import WrongUsage, refuse
 
 
 def add_to(commands: Commands) -> None:
@@ -89,9 +89,9 @@ def _extract(arguments: argparse.Namespace) -> None:
 
 
 def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
-    from netspec.features.image_list import list_images
     from netspec.features.images import ImageNet, extract_images
     from netspec.features.scaling import Steps
+    from netspec.files.image_list import list_images
 
     records = ("source", "iterations", "phase", "level", "stage", "allow_python_layers")
     refuse(arguments, records, "is for records; --images are read, and run in phase TEST")

@@ -6,8 +6,8 @@ import argparse
 import sys
 
 from netspec.cli.run import Commands
-from netspec.command_line import DONE, FAULT, SOMETHING, UNREADABLE
 from netspec.errors import SpecError
+from netspec.terminal.commands import DONE, FAULT, SOMETHING, UNREADABLE
 
 STDIN = "-"
 
@@ -52,7 +52,7 @@ def _differs(path: str, text: str, formatted: str) -> int:
 
 
 def _write(path: str, text: str) -> None:
-    from netspec.whole_file import whole_file
+    from netspec.files.whole_file import whole_file
 
     with whole_file(path) as unfinished:
         unfinished.write_bytes(text.encode(errors="surrogateescape"))

@@ -8,7 +8,7 @@ import sys
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import Commands
-from netspec.command_line import DONE, SOMETHING, UNREADABLE, WrongUsage, refuse
+from netspec.terminal.commands import DONE, SOMETHING, UNREADABLE, WrongUsage, refuse
 
 
 def add_to(commands: Commands) -> None:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from netspec.cli.arguments import add_steps, positive, shape
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage, refuse
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto.binary import split_paths
+from netspec.terminal.commands import WrongUsage, refuse
 
 if TYPE_CHECKING:
     from netspec.features.images import ImageNet
@@ -100,9 +100,9 @@ def _maps(arguments: argparse.Namespace) -> None:
 
 def _saliency(arguments: argparse.Namespace) -> None:
     from netspec.features.saliency import of_distance, of_unit
-    from netspec.log import number
     from netspec.pictures.nets import saliency_figure
     from netspec.pictures.style import ending_of, write_figure
+    from netspec.terminal.log import number
 
     if arguments.to:
         refuse(arguments, ("unit",), "and --to exclude each other: a number of the blob, or a distance")

@@ -18,7 +18,7 @@ from netspec.cli.arguments import (
     run_by,
 )
 from netspec.cli.run import Commands
-from netspec.scores import Score, Scores
+from netspec.runs.scores import Score, Scores
 
 
 def add_to(commands: Commands) -> None:

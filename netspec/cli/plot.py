@@ -7,8 +7,8 @@ from pathlib import Path
 
 from netspec.cli.arguments import positive
 from netspec.cli.run import Commands
-from netspec.command_line import WrongUsage
 from netspec.errors import printable
+from netspec.terminal.commands import WrongUsage
 
 
 def add_to(commands: Commands) -> None:

@@ -1,4 +1,4 @@
-"""What the commands of netspec share besides netspec.command_line: dialects, and effects of signals on a training."""
+"""What the commands of netspec share besides netspec.terminal.commands: dialects, and effects of signals on a training."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from netspec import command_line, log
 from netspec.dialects import use_dialect
-from netspec.limits import limited, read_amount
+from netspec.files.limits import limited, read_amount
+from netspec.terminal import commands, log
 
 
-class Commands(command_line.Commands):
+class Commands(commands.Commands):
     """Commands that run with the dialects of ``--plugin``."""
 
     def add(

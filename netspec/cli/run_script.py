@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from netspec.cli.run import Commands
-from netspec.command_line import VARIABLE, WrongUsage, refuse
+from netspec.terminal.commands import VARIABLE, WrongUsage, refuse
 
 NAME = "run"
 _WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel", "--limit")

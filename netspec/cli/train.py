@@ -10,11 +10,11 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from netspec import log
 from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, devices
 from netspec.cli.run import Commands, signals
-from netspec.command_line import DONE, FAULT, WrongUsage
-from netspec.scores import Score, Scores, Snapshot, read_scores
+from netspec.runs.scores import Score, Scores, Snapshot, read_scores
+from netspec.terminal import log
+from netspec.terminal.commands import DONE, FAULT, WrongUsage
 
 if TYPE_CHECKING:
     from netspec.solver.processes import Processes
@@ -171,8 +171,8 @@ def _newest(solver: str) -> Path | None:
 
 def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
     """Refuse a second training that would write snapshots of the same names."""
+    from netspec.files.whole_file import has_locks, only_one
     from netspec.solver.checks import check_prefix
-    from netspec.whole_file import has_locks, only_one
 
     if not (solver.param.snapshot or solver.param.snapshot_after_train):
         return nullcontext()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec.cli.run import Commands
-from netspec.command_line import DONE, WrongUsage, refuse
+from netspec.terminal.commands import DONE, WrongUsage, refuse
 
 if TYPE_CHECKING:
     from netspec.runs.run import Follower

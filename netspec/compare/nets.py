@@ -7,13 +7,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from netspec import log
 from netspec.compare.difference import Difference, Differences
 from netspec.compare.messages import child, differences, labeled
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import Node, Plan, make_plan
 from netspec.proto.schema import PHASE_NAMES, TEST, TRAIN, NetParameter, ParamSpec
 from netspec.proto.source_map import SourceMap
+from netspec.terminal import log
 
 _WIRING = ("name", "bottom", "top", "param", "blobs", "phase", "include", "exclude", "propagate_down", "loss_weight")
 _NOT_THE_NET = ("layer", "layers", "state", "input", "input_shape", "input_dim")

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from netspec.lfs import pointer_fault
+from netspec.files.lfs import pointer_fault
 from netspec.proto.schema import Datum
 
 

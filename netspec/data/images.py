@@ -13,7 +13,7 @@ import numpy as np
 
 from netspec.data.datum import decode_pixels, planar
 from netspec.errors import SpecError, Where
-from netspec.limits import read_bytes
+from netspec.files.limits import read_bytes
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from netspec.data.datum import datum_to_array, parse_datum
 from netspec.data.images import list_lines
 from netspec.data.random_words import words
 from netspec.errors import SpecError, Where
-from netspec.hdf5_file import open_hdf5
+from netspec.files.hdf5 import open_hdf5
 
 _NUMBERS = "biuf"  # kinds of numpy types
 _SIGNATURES = {b"\xff\xd8\xff": "JPEG", b"\x89PNG": "PNG", b"BM": "BMP", b"II*\0": "TIFF", b"MM\0*": "TIFF"}

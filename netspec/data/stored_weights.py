@@ -11,7 +11,7 @@ import numpy as np
 
 from netspec.data.blobs import is_legacy, to_array
 from netspec.errors import SpecError, Where
-from netspec.hdf5_file import layer_groups, open_hdf5
+from netspec.files.hdf5 import layer_groups, open_hdf5
 from netspec.proto.binary import read_net_binary
 
 

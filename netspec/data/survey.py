@@ -12,7 +12,7 @@ import numpy as np
 
 from netspec.data.datum import times
 from netspec.data.records import Record, Records
-from netspec.limits import amount
+from netspec.files.limits import amount
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
 _MOST_FAULTS = 100  # that are kept by name; all are counted

@@ -15,14 +15,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from netspec import log
 from netspec.data.datum import decode_pixels, planar
 from netspec.data.mean import read_mean
 from netspec.data.random_words import words_at
 from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.data.transformer import mean_contradictions
 from netspec.errors import SpecError, Where
-from netspec.limits import read_bytes
+from netspec.files.limits import read_bytes
+from netspec.terminal import log
 
 CHANNELS = 3  # images are always read in color
 

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from netspec import log
 from netspec.dialects._boxes import Array, as_array, highest, overlaps
 from netspec.errors import SpecError, Where
 from netspec.layers.base import Layer, Shape
 from netspec.proto.schema import value
+from netspec.terminal import log
 
 IMAGE, LABEL, CONFIDENCE = 0, 1, 2  # columns of a detection; its box follows
 NO_IMAGE = -1

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from netspec import log
 from netspec.dialects._annotated import AnnotatedData
 from netspec.dialects._boxes import (
     CENTER_SIZE,
@@ -31,6 +30,7 @@ from netspec.layers import Layer, register
 from netspec.layers.base import Shape, rounded
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import value
+from netspec.terminal import log
 
 DECLARATIONS = """
 message PermuteParameter {

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec import log
 from netspec.errors import ForkFault, SpecError, Where
 from netspec.exact import NONE
 from netspec.graph.filter import filter_net, with_state
@@ -25,6 +24,7 @@ from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net_text
 from netspec.proto.upgrade.current import upgrade_net
+from netspec.terminal import log
 
 FileOrBytes = str | os.PathLike[str] | bytes | bytearray | memoryview | np.ndarray
 

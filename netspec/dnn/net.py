@@ -20,10 +20,10 @@ from netspec.dnn.costs import operations
 from netspec.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, DnnError, as_dnn_error
 from netspec.dnn.table import INPUT, Entry, graph_of, make_table, nodes_of, unconnected
 from netspec.errors import Where, did_you_mean
+from netspec.files.whole_file import whole_file
 from netspec.layers.base import Layer as CaffeLayer
 from netspec.layers.base import Shape
 from netspec.net.net import Net as CaffeNet
-from netspec.whole_file import whole_file
 
 Array = np.ndarray
 Shapes = list[Shape]

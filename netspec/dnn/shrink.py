@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from netspec.data.blobs import in_half_precision, to_array
 from netspec.dnn.errors import as_dnn_error
 from netspec.errors import SpecError, Where
+from netspec.files.whole_file import whole_file
 from netspec.proto.binary import parse_net_binary
-from netspec.whole_file import whole_file
 
 
 def shrinkCaffeModel(

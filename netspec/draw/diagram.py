@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 
-from netspec import log
 from netspec.draw.settings import settings_text
 from netspec.errors import SpecError, Where
 from netspec.graph.filter import filter_net, with_state
@@ -25,6 +24,7 @@ from netspec.net.options import BuildOptions
 from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import write_text
+from netspec.terminal import log
 
 Output = tuple[int, int]  # a box and which of its tops
 

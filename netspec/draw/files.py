@@ -11,11 +11,11 @@ from netspec.draw.html import html_of
 from netspec.draw.picture import picture_of
 from netspec.draw.svg import svg_of
 from netspec.errors import SpecError
+from netspec.files.whole_file import whole_file
 from netspec.proto.schema import NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import solver_nets
-from netspec.whole_file import whole_file
 
 
 def write_picture(

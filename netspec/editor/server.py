@@ -9,13 +9,13 @@ from lsprotocol import types as lsp
 from pygls.lsp.server import LanguageServer
 from pygls.uris import to_fs_path
 
-from netspec import log
 from netspec.editor.answers import ERROR, HINT, WARNING, Diagnostic, Shapes, file_faults, text_faults
 from netspec.editor.answers import completion as choices_at
 from netspec.editor.answers import definition as definition_of
 from netspec.editor.answers import hover as hover_text
 from netspec.errors import Where
 from netspec.proto.format import format_text
+from netspec.terminal import log
 
 NAME = "netspec"
 SEVERITIES = {

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from netspec import log
 from netspec.engines.cache import Cache, fill, note
 from netspec.engines.choice import BF16, FP32, Choice
 from netspec.engines.key import key_of
 from netspec.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
 from netspec.errors import SpecError
+from netspec.terminal import log
 
 Export = Callable[[Path], None]  # writes the ONNX model to a path, its weights beside it
 

@@ -14,10 +14,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from netspec import log
 from netspec.engines.choice import BF16, FP32, ONNXRUNTIME, OPENVINO, Choice
 from netspec.engines.key import processor
 from netspec.engines.signal_stack import signal_stack_kept
+from netspec.terminal import log
 
 MODEL, OPTIMIZED = "net.onnx", "optimized.onnx"
 MOST_SHAPES = 4  # for which a model stays compiled

@@ -24,7 +24,7 @@ from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights
 from netspec.proto.schema import PHASES
 from netspec.proto.text import parse_net
-from netspec.version import version
+from netspec.terminal.version import version
 
 
 @dataclass(frozen=True)

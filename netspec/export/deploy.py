@@ -13,6 +13,7 @@ import torch
 
 from netspec.data import blobs
 from netspec.data.blobs import Shape
+from netspec.files.whole_file import whole_file
 from netspec.graph import raise_fault
 from netspec.graph.filter import filter_net
 from netspec.graph.fold import origins
@@ -24,7 +25,6 @@ from netspec.proto.schema import NetParameter, ParamSpec
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.upgrade.rewrite import copy_without
-from netspec.whole_file import whole_file
 
 
 def with_inputs(

@@ -16,11 +16,11 @@ import torch
 from netspec.errors import SpecError
 from netspec.export.preprocess import Preprocess
 from netspec.export.shapes import Fixed, NetShapes, settled
+from netspec.files.whole_file import whole_file
 from netspec.layers.base import Layer
 from netspec.layers.learned import values_of
 from netspec.layers.targets import Sizes
 from netspec.net.net import Net
-from netspec.whole_file import whole_file
 
 OPSET, IR_VERSION = 21, 10  # ONNX 1.16, of 2024: which all runtimes of today read
 LARGEST = 2**31 - 2**24  # bytes of weights: protobuf's limit, with room for the graph

@@ -23,8 +23,8 @@ from netspec.export.inputs import check_shapes
 from netspec.export.shapes import NetShapes, input_shapes, settled
 from netspec.export.source import MARK, Program, joined, legal, unique
 from netspec.export.torch_code import write_program
+from netspec.files.whole_file import whole_file
 from netspec.net.net import Net
-from netspec.whole_file import whole_file
 
 OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: operator.add,

@@ -35,8 +35,8 @@ from netspec.export.source import (
     unique,
 )
 from netspec.export.torch_code import write_program
+from netspec.files.whole_file import whole_file
 from netspec.net.net import Net
-from netspec.whole_file import whole_file
 
 MOST_NESTED = 3  # calls within one another in a line
 

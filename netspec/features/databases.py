@@ -10,12 +10,12 @@ from contextlib import ExitStack
 
 import torch
 
-from netspec import log
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError, Where
 from netspec.graph import check_blobs
 from netspec.net.net import Net
+from netspec.terminal import log
 
 COMMITTED = 1000  # records between two commits; each commit is logged
 

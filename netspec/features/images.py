@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import decode_pixels, planar
 from netspec.engines.choice import TORCH, Choice
@@ -18,9 +17,9 @@ from netspec.engines.model import Model, Origin
 from netspec.engines.runners import Unable, tell_unable
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
-from netspec.features.image_list import ImageList
 from netspec.features.scaling import Steps, scaling_of
 from netspec.features.views import middle
+from netspec.files.image_list import ImageList
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
 from netspec.graph.steps import PASSES
@@ -28,6 +27,7 @@ from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
+from netspec.terminal import log
 
 if TYPE_CHECKING:
     import torch

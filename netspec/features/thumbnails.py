@@ -10,8 +10,8 @@ import numpy as np
 
 from netspec.data.records import open_records
 from netspec.errors import SpecError, Where
-from netspec.features.image_list import list_images
 from netspec.features.images import read_pixels
+from netspec.files.image_list import list_images
 
 SIDE = 112  # pixels on the longer side
 

@@ -24,12 +24,12 @@ from netspec.data.blobs import Shape
 from netspec.data.random_words import derived
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL, switch
+from netspec.files.limits import amount, is_out_of_memory, memory
 from netspec.graph import Report, raise_fault
 from netspec.layers import fillers
 from netspec.layers.learned import Learned, values_of
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.training import Kernels, Learning, recorded
-from netspec.limits import amount, is_out_of_memory, memory
 from netspec.proto.schema import TEST
 
 MOST_AXES = 32  # of a blob of Caffe's (kMaxBlobAxes)

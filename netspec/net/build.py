@@ -11,9 +11,7 @@ from pathlib import Path
 
 import torch
 
-from netspec import log
 from netspec.exact import SMALL
-from netspec.garbage import no_collection
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
@@ -21,9 +19,11 @@ from netspec.graph.steps import PASSES
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.weights import copy_weights, load_weights
+from netspec.process.garbage import no_collection
 from netspec.proto.schema import NetParameter, phase_of
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
+from netspec.terminal import log
 
 
 def load_net(

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 
 from netspec.errors import SpecError
+from netspec.files.limits import amount, most
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
-from netspec.limits import amount, most
 from netspec.proto.schema import TEST
 
 BYTES = 4  # of a number: float32

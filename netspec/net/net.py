@@ -16,18 +16,17 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.exact import ALL
 from netspec.exact.blas import other_kernels
 from netspec.exact.sums import RowSums
 from netspec.exact.switch import applies, is_recorded
+from netspec.files.limits import amount, is_out_of_memory
+from netspec.files.limits import memory as memory_of_machine
 from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import layer_class, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
-from netspec.limits import amount, is_out_of_memory
-from netspec.limits import memory as memory_of_machine
 from netspec.net.chains import chains
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.in_place import Memory, is_overwritten, run_overwritten
@@ -38,6 +37,7 @@ from netspec.net.segments import Segment, find_segments
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.training import TrainingStep, obstacle
+from netspec.terminal import log
 
 Array = np.ndarray | torch.Tensor
 MUCH = 8  # a net that takes more than this part of the limit is first looked at as a whole

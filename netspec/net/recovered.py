@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from netspec import log
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.layers import layer_class
 from netspec.layers.base import Shape
@@ -16,6 +15,7 @@ from netspec.proto.binary import parse_net_binary
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import write_text
+from netspec.terminal import log
 
 
 def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParameter, SourceMap]:

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from netspec import log
 from netspec.errors import SpecError
+from netspec.files.limits import is_out_of_memory
 from netspec.layers.base import Layer
-from netspec.limits import is_out_of_memory
 from netspec.proto.schema import TRAIN
+from netspec.terminal import log
 
 if TYPE_CHECKING:
     from netspec.net.net import Net

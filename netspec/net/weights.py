@@ -16,17 +16,17 @@ import h5py
 import numpy as np
 import torch
 
-from netspec import log
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
+from netspec.files.hdf5 import layer_groups, new_hdf5, open_hdf5
+from netspec.files.whole_file import whole_file
 from netspec.graph import Report, raise_fault
-from netspec.hdf5_file import layer_groups, new_hdf5, open_hdf5
 from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.net.stamp import check_weights
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import NetParameter
-from netspec.whole_file import whole_file
+from netspec.terminal import log
 
 MOST_NAMES = 20  # layers that a warning names
 MOST_BYTES = 2**31 - 1  # of a protobuf message

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
 from netspec.data.datum import times
-from netspec.log import number
 from netspec.pictures.style import COLORS, PALE, STYLE
 from netspec.pictures.tiles import split
+from netspec.terminal.log import number
 
 WIDTH = 9.0  # inches
 MOST_FILTERS, MOST_CHANNELS, MOST_MAPS = 256, 24, 256

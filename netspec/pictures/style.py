@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from netspec.errors import SpecError, Where
-from netspec.whole_file import whole_file, why_unwritable
+from netspec.files.whole_file import whole_file, why_unwritable
 
 # Color-blind readers can distinguish these too (Okabe and Ito).
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")

@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from netspec import log
 from netspec.pictures.style import COLORS, FAULT, GRID, STYLE
 from netspec.runs.curve import Curve, shown_range, smoothed, thinned
 from netspec.runs.run import Run
+from netspec.terminal import log
 
 WIDTH, LOSS_HEIGHT, HEIGHT = 9.0, 3.4, 2.3  # inches
 MOST_POINTS = 2000  # of a curve, of which more cannot be seen

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 from google.protobuf.message import DecodeError, Message
 
 from netspec.errors import SpecError, Where
-from netspec.lfs import pointer_fault
-from netspec.limits import read_bytes
+from netspec.files.lfs import pointer_fault
+from netspec.files.limits import read_bytes
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.current import upgrade_net

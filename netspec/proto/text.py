@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from netspec.errors import ForkFault, SpecError, Where
-from netspec.lfs import pointer_fault
-from netspec.limits import read_bytes
+from netspec.files.lfs import pointer_fault
+from netspec.files.limits import read_bytes
 from netspec.proto.dialect.choice import use_dialects_of
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter

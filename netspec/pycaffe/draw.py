@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 from netspec.errors import SpecError
+from netspec.files.whole_file import whole_file
 from netspec.pycaffe import extras
 from netspec.pycaffe.proto import caffe_pb2
-from netspec.whole_file import whole_file
 
 NEURON_LAYER_STYLE = {"shape": "record", "fillcolor": "#90EE90", "style": "filled"}
 LAYER_STYLE_DEFAULT = {"shape": "record", "fillcolor": "#6495ED", "style": "filled"}

@@ -7,8 +7,8 @@ import os
 import sys
 from typing import Any
 
-from netspec import log
-from netspec.command_line import SEVERITIES, VARIABLE
+from netspec.terminal import log
+from netspec.terminal.commands import SEVERITIES, VARIABLE
 
 
 class _Stderr(logging.StreamHandler):

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 
 import torch
 
-from netspec import log
 from netspec.exact import CHOICES, SMALL
 from netspec.layers.base import Random
 from netspec.net.options import BuildOptions
+from netspec.terminal import log
 
 
 @dataclass

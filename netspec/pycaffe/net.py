@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from netspec import log
 from netspec.errors import did_you_mean
 from netspec.graph.filter import with_state
 from netspec.layers.utility import pycaffe_shim
@@ -27,6 +26,7 @@ from netspec.pycaffe import mode
 from netspec.pycaffe.errors import caffes_errors
 from netspec.pycaffe.named import Named
 from netspec.pycaffe.passes import Passes
+from netspec.terminal import log
 
 FilePath = str | Path
 Arrays = dict[str, np.ndarray]

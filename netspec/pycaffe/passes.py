@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 import torch
 
-from netspec import log
 from netspec.layers.base import Layer
 from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
 from netspec.net.net import Net
+from netspec.terminal import log
 
 AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
 Hook = Callable[[int], object]

@@ -13,7 +13,6 @@ from typing import Any, ClassVar
 import torch
 from typing_extensions import override
 
-from netspec import log
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
 from netspec.pycaffe import mode
@@ -23,6 +22,7 @@ from netspec.pycaffe.net import Net
 from netspec.solver import solver as core_solver
 from netspec.solver.nets import TRAIN_NET
 from netspec.solver.update import rule_faults
+from netspec.terminal import log
 
 Outputs = dict[str, torch.Tensor]
 

@@ -17,10 +17,10 @@ from typing import Any
 import torch
 
 from netspec.exact.blas import one_thread
+from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
 from netspec.layers.training import Backward, Diff, Forward, Kernels, Learning, recorded
-from netspec.limits import is_out_of_memory
 
 LARGEST = 2**24  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
 Values = list[Any]  # by value number, a tensor or None

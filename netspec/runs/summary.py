@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from netspec.log import number
 from netspec.runs.run import RUNNING, Run
+from netspec.terminal.log import number
 
 _FEW = 6  # outputs of test nets that are told
 

@@ -14,8 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from netspec.errors import SpecError
+from netspec.files.whole_file import whole_file
 from netspec.scripts.finder import MARK, NAME, real_caffe
-from netspec.whole_file import whole_file
 
 _PACKAGE = f'''{MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
 """Caffe's Python interface, which netspec provides."""

@@ -18,8 +18,8 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from netspec.errors import SpecError, Where
+from netspec.files.whole_file import whole_file
 from netspec.scripts import python2
-from netspec.whole_file import whole_file
 
 RENAMED_METHODS = {"tostring": "tobytes"}  # of arrays, called without arguments
 

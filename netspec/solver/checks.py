@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from netspec.errors import SpecError
+from netspec.files.whole_file import whole_file, why_unwritable
 from netspec.graph import Report, raise_fault
 from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Place
 from netspec.solver.lr_policy import policy_faults
 from netspec.solver.update import rule_faults
-from netspec.whole_file import whole_file, why_unwritable
 
 REGULARIZATIONS = ("L2", "L1")
 _AT_LEAST_ONE = ("average_loss", "iter_size")

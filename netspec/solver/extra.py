@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec import log
 from netspec.errors import SpecError, Where
+from netspec.files.whole_file import whole_file
 from netspec.net.net import Net
 from netspec.net.stamp import FAULTS, Stamp, damaged, sealed, shown, unsealed, whole_number
 from netspec.solver.settings import Settings
 from netspec.solver.snapshot import find_learned_net, read_state
-from netspec.whole_file import whole_file
+from netspec.terminal import log
 
 _MOST_LAYERS = 1 << 24
 Remembered = dict[str, dict[str, Any]]  # by the layer's number, then by name: what JSON has of it

@@ -14,10 +14,10 @@ import numpy as np
 
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
-from netspec.hdf5_file import Hdf5Group, hdf5_in, open_hdf5
+from netspec.files.hdf5 import Hdf5Group, hdf5_in, open_hdf5
+from netspec.files.whole_file import whole_file
 from netspec.proto.binary import read_binary
 from netspec.proto.schema import SolverState
-from netspec.whole_file import whole_file
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec import log, waiting
 from netspec.errors import SpecError, Where
 from netspec.exact import NONE, SMALL
 from netspec.graph.filter import with_train_state
@@ -28,6 +27,8 @@ from netspec.net.options import BuildOptions
 from netspec.net.segments import missing_tool
 from netspec.net.stamp import Stamp
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, save_weights, too_large
+from netspec.process import waiting
+from netspec.process.heap import keep_freed_memory
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
@@ -46,7 +47,6 @@ from netspec.solver.extra import (
     running_state,
     write_extra,
 )
-from netspec.solver.heap import keep_freed_memory
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.precision import FP16, FP32, LossScale, check_precision, computing
@@ -56,6 +56,7 @@ from netspec.solver.settings import Settings, changes, settings_of
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.tally import Outputs, Tally, as_scores, score_lines, scorers
 from netspec.solver.threads import dependence, divided_sums
+from netspec.terminal import log
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),

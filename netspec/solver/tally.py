@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from netspec.log import number
 from netspec.net.net import Net
+from netspec.terminal.log import number
 
 Outputs = dict[str, list[float]]
 Scorer = Callable[[Sequence[torch.Tensor]], list[float]]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from netspec.log import number
 from netspec.runs.curve import shown_range
+from netspec.terminal.log import number
 
 _EMPTY = 0x2800
 _DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))  # of a column, from the top

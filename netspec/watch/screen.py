@@ -7,11 +7,11 @@ import time
 import numpy as np
 
 from netspec.errors import printable
-from netspec.limits import amount
-from netspec.log import number
+from netspec.files.limits import amount
 from netspec.runs.curve import Curve, smoothed
 from netspec.runs.run import FAILED, RUNNING, Run
 from netspec.runs.summary import iterations_per_second
+from netspec.terminal.log import number
 from netspec.watch.canvas import bar, plot_lines
 
 LOST = "not running"

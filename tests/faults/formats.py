@@ -48,7 +48,7 @@ from netspec.net.table import table
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text, parse_solver_text
-from netspec.scores import Score, Scores, Snapshot, read_scores
+from netspec.runs.scores import Score, Scores, Snapshot, read_scores
 from netspec.solver.checks import check_settings
 from netspec.solver.extra import Extra, read_extra, resume, write_extra
 from netspec.solver.settings import changes

@@ -28,7 +28,7 @@ import torch  # noqa: E402
 
 import lmdb_build.cli  # noqa: E402
 import loopclosure.whole_file  # noqa: E402
-import netspec.whole_file  # noqa: E402
+import netspec.files.whole_file  # noqa: E402
 from faults.commands import CASES, Case, remove_database  # noqa: E402
 
 
@@ -57,7 +57,7 @@ def start(case: Case, slowly: bool = False) -> int:
     null = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(null, stream)
-    for module in (netspec.whole_file, loopclosure.whole_file):
+    for module in (netspec.files.whole_file, loopclosure.whole_file):
         module._swept.clear()  # by this process: a new one knows nothing of that
     sync, status = os.fsync, 1
     if slowly:

@@ -12,8 +12,8 @@ import pytest
 
 import lmdb_build.cli
 from faults.commands import CASES, Case, check_npz
-from netspec import whole_file
 from netspec.cli import main
+from netspec.files import whole_file
 from netspec.net.build import load_net
 from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter

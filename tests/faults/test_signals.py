@@ -29,7 +29,7 @@ parser = argparse.ArgumentParser()
 Commands(parser).add("endless", endless, "")
 sys.exit(run(parser, ["endless"]))
 """
-MODULES = ("netspec.command_line", "loopclosure.cli.run")
+MODULES = ("netspec.terminal.commands", "loopclosure.cli.run")
 
 
 def start(code: str) -> subprocess.Popen[str]:

@@ -9,7 +9,7 @@ import pytest
 
 from paths import ROOT
 
-PACKAGES = {"netspec": "netspec.command_line", "loopclosure": "loopclosure.cli.run"}
+PACKAGES = {"netspec": "netspec.terminal.commands", "loopclosure": "loopclosure.cli.run"}
 CODE = """
 import argparse, sys, types
 from {package}.__main__ import program

@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 import loopclosure.places.image_list
-import netspec.features.image_list
+import netspec.files.image_list
 from paths import ROOT
 
-READERS = (netspec.features.image_list.list_images, loopclosure.places.image_list.list_images)
+READERS = (netspec.files.image_list.list_images, loopclosure.places.image_list.list_images)
 #: Each: files (text where it matters), what is read, and the names that come out, with stamps where there are any.
 FOUND: dict[str, tuple[dict[str, str], str, list[str], list[float] | None]] = {
     "numbers are compared as numbers": (
@@ -127,7 +127,7 @@ def test_what_is_refused_and_how(case: str, read: Any) -> None:
 
 def test_the_rule_is_written_down_where_both_point_to() -> None:
     text = (ROOT / "docs" / "images.md").read_text()
-    for module in (netspec.features.image_list, loopclosure.places.image_list):
+    for module in (netspec.files.image_list, loopclosure.places.image_list):
         assert "docs/images.md" in str(module.__doc__)
         assert all(f"`{ending}`" in text for ending in module.IMAGE_ENDINGS)
         assert all(f"`{name}`" in text for name in module.SUBFOLDERS)

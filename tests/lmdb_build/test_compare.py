@@ -16,7 +16,7 @@ import pytest
 from lmdb_build.cli import main, parser
 from lmdb_build.compare import best_snapshot, read_entry
 from netspec.errors import SpecError
-from netspec.scores import read_scores
+from netspec.runs.scores import read_scores
 from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow

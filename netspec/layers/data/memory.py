@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from netspec import log
 from netspec.errors import SpecError
 from netspec.layers import fillers
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import FillerParameter
+from netspec.terminal import log
 
 T = TypeVar("T")
 

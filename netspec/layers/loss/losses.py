@@ -19,6 +19,7 @@ from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.blas import dots, sum_in_order
 from netspec.exact.losses import Infogain, Logarithm, SigmoidCrossEntropy, softmax
 from netspec.exact.sums import RowMagnitudes, RowSquares
+from netspec.files.limits import read_bytes
 from netspec.layers.base import Shape, rounded
 from netspec.layers.loss.base import (
     BATCH_SIZE,
@@ -38,7 +39,6 @@ from netspec.layers.loss.base import (
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.training import Kernels, Learning, Room, recorded
-from netspec.limits import read_bytes
 from netspec.proto.schema import BlobProto
 
 FLT_MIN = 1.17549435e-38  # SoftmaxWithLoss takes no logarithm of less

@@ -14,12 +14,12 @@ from typing import Any
 import torch
 from typing_extensions import override
 
-from netspec import log
 from netspec.errors import SpecError, did_you_mean
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.pycaffe_shim import importable
+from netspec.terminal import log
 
 
 class _Call(torch.autograd.Function):

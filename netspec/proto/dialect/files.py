@@ -15,10 +15,10 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from netspec import log
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto.dialect.folders import FOLDERS
 from netspec.proto.dialect.registry import Dialect, activate, announce
+from netspec.terminal import log
 
 GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name and a module each
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from google.protobuf import text_format
 
-from netspec import limits
 from netspec.cli import main
 from netspec.data.images import read_image
 from netspec.errors import SpecError
+from netspec.files import limits
 from netspec.layers import fillers
 from netspec.layers.base import Shape
 from netspec.net.need import limit_on

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from netspec import whole_file
+from netspec.files import whole_file
 
 
 def test_a_training_without_file_locks(

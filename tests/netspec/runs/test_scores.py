@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from netspec.errors import SpecError
-from netspec.scores import Score, Scores, Snapshot, read_scores
+from netspec.runs.scores import Score, Scores, Snapshot, read_scores
 
 SCORES = Scores(
     [

@@ -13,10 +13,10 @@ from types import ModuleType
 import pytest
 
 import loopclosure.whole_file
-import netspec.whole_file
+import netspec.files.whole_file
 from paths import ROOT
 
-PACKAGES = (netspec.whole_file, loopclosure.whole_file)
+PACKAGES = (netspec.files.whole_file, loopclosure.whole_file)
 
 
 @pytest.fixture(params=PACKAGES, ids=["netspec", "loopclosure"])

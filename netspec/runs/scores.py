@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
-from netspec.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from netspec.data.images import read_image
 from netspec.data.mean import read_mean
 from netspec.errors import SpecError
 from netspec.features.images import read_pixels
-from netspec.lfs import pointer_fault
+from netspec.files.lfs import pointer_fault
 from netspec.net.build import build_net
 from netspec.net.weights import load_weights
 from netspec.proto.text import parse_net_text, read_net

@@ -22,9 +22,9 @@ import numpy as np
 from h5py import h5o, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from netspec.errors import SpecError, Where
-from netspec.lfs import pointer_fault_at
-from netspec.limits import ALWAYS, amount, bomb
-from netspec.whole_file import whole_file
+from netspec.files.lfs import pointer_fault_at
+from netspec.files.limits import ALWAYS, amount, bomb
+from netspec.files.whole_file import whole_file
 
 _MOST_LINKS = 16  # from link to link
 _MOST_DEFLATED = 1032  # times its size: what deflate can unpack to

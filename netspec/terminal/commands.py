@@ -20,9 +20,9 @@ from contextlib import contextmanager, nullcontext
 from itertools import takewhile
 from typing import Any
 
-from netspec import log
 from netspec.errors import SpecError, did_you_mean
-from netspec.limits import amount, is_out_of_memory, memory
+from netspec.files.limits import amount, is_out_of_memory, memory
+from netspec.terminal import log
 
 DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
 SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: there is something to say; a file cannot be read
@@ -205,7 +205,7 @@ class _Version(argparse.Action):
     """Show the version, which takes a while to find."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object, **__: object) -> None:
-        from netspec.version import version
+        from netspec.terminal.version import version
 
         print(f"{parser.prog} {version()}")
         parser.exit()

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 import netspec
-from netspec import waiting
 from netspec.check.bug_report import bug_report
+from netspec.process import waiting
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -57,7 +57,7 @@ def test_where_torch_is_there_already_it_is_too_late() -> None:
     assert python("-c", f"import torch, netspec; {SHOW}").stdout.strip() == ""
 
 
-HOW = "import netspec.waiting; print(netspec.waiting.how()); print(netspec.waiting.too_late(2))"
+HOW = "import netspec.process.waiting; print(netspec.process.waiting.how()); print(netspec.process.waiting.too_late(2))"
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ from importlib import import_module
 
 import pytest
 
-from netspec import cli, log
-from netspec.command_line import Commands, WrongUsage, refuse, run
+from netspec import cli
 from netspec.errors import SpecError, Where
+from netspec.terminal import log
+from netspec.terminal.commands import Commands, WrongUsage, refuse, run
 
 
 def command(function: Callable[[argparse.Namespace], int | None]) -> argparse.ArgumentParser:

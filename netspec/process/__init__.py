@@ -1,0 +1,1 @@
+"""What concerns the whole process: how threads wait, memory that is kept, the garbage collector."""

@@ -1,0 +1,1 @@
+"""What a user sees of a program: its commands, log and exit status. The ground of netspec and loopclosure."""
