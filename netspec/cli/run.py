@@ -1,4 +1,4 @@
-"""What the commands of netspec share besides netspec.terminal.commands: dialects, and effects of signals on a training."""
+"""What the commands of netspec share besides netspec.terminal: dialects, and effects of signals on a training."""
 
 from __future__ import annotations
 
