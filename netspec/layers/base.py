@@ -101,19 +101,24 @@ class Random:
 
     def restart(self, seed: int) -> None:
         """Begin anew, from another seed."""
-        self.seed = self._now = seed
+        self.seed = seed
+        self._part: str | None = None
         self._generators: dict[str, torch.Generator] = {}
+        self._begun: set[str] = set()  # the generators that draw for this part
 
     def begin(self, what: str) -> None:
         """Go on with draws that follow from the seed and the name of a part of a run, whatever was drawn before."""
-        self._now = derived(self.seed, what)
-        self._generators.clear()
+        self._part = what
+        self._begun.clear()
 
     def on(self, device: torch.device | str = "cpu") -> torch.Generator:
         """Return the generator of ``device`` (made at its first use)."""
         key = str(device)
-        if key not in self._generators:
-            self._generators[key] = torch.Generator(device).manual_seed(self._now)
+        if key not in self._begun:
+            if key not in self._generators:
+                self._generators[key] = torch.Generator(device)
+            self._generators[key].manual_seed(self.seed if self._part is None else derived(self.seed, self._part))
+            self._begun.add(key)
         return self._generators[key]
 
 

@@ -24,6 +24,11 @@ def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
     generator belongs to the version of boost it was built with.
     """
     check(filler, shape)
+    return draw(filler, shape, generator)
+
+
+def draw(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    """Return what :func:`fill` does, for a filler and a shape that were checked."""
     return _FILLERS[filler.type](filler, shape, generator)
 
 

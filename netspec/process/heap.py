@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import ctypes
 import os
+from functools import cache
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h: M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
 _LARGEST = 32 * 2**20  # bytes: the most that glibc takes from its heap, DEFAULT_MMAP_THRESHOLD_MAX
 _USERS = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
 
 
+@cache
 def keep_freed_memory() -> None:
     """Tell glibc to keep what is freed, in blocks of up to 32 MB. What the user's environment says stays.
 

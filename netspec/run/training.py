@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from operator import is_
 from typing import Any
 
 import torch
@@ -54,36 +55,26 @@ def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int
     return ""
 
 
-def is_watched(layers: Iterable[Layer]) -> bool:
-    """Return whether hooks wait for autograd's passes, on layers or on learnable blobs, or no gradients are wanted."""
-    if not torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
-        return True
-    for layer in layers:
-        if layer._forward_hooks or layer._forward_pre_hooks or layer._backward_hooks or layer._backward_pre_hooks:
-            return True
-        for blob in layer.blobs._parameters.values():
-            if blob._backward_hooks or blob._post_accumulate_grad_hooks:
-                return True
-    return False
-
-
 @dataclass
 class _Prepared:
     """The kernels of all layers for one set of shapes, and what they hold."""
 
     forward: list[tuple[Forward, tuple[int, ...], tuple[int, ...], list[tuple[int, float]]]]
     backward: list[tuple[Backward, tuple[int, ...], tuple[int, ...]]]
-    held: list[tuple[dict[str, Any], str, torch.Tensor, int, bool, Diff]]  # each learnable blob as it was
     start: Values  # the gradients that are there before the backward pass: those of the losses
+    blobs: list[torch.Tensor]
+    addresses: list[int]
+    learned: list[bool]
+    gradients: list[Diff]
 
-    def is_current(self) -> bool:
+    def is_current(self, blobs: list[torch.Tensor]) -> bool:
         """Return whether learnable blobs and their gradients lie where they did."""
-        for owner, name, blob, place, learned, gradient in self.held:
-            if owner[name] is not blob or blob.data_ptr() != place or blob.requires_grad != learned:
-                return False
-            if blob.grad is not gradient:
-                return False
-        return True
+        return (
+            all(map(is_, blobs, self.blobs))
+            and all(map(is_, [blob.grad for blob in blobs], self.gradients))
+            and [blob.data_ptr() for blob in blobs] == self.addresses
+            and [blob.requires_grad for blob in blobs] == self.learned
+        )
 
 
 class TrainingStep:
@@ -104,13 +95,33 @@ class TrainingStep:
         self._plan, self._layers, self._loss_weights = plan, list(layers), loss_weights
         self._overwritten, self._weighted = overwritten, weighted
         self._sources = [i for i, node in enumerate(plan.nodes) if not node.bottoms and not len(layers[i].blobs)]
+        self._hooks: list[Any] = [
+            hooks
+            for layer in layers
+            for hooks in (
+                layer._forward_hooks,
+                layer._forward_pre_hooks,
+                layer._backward_hooks,
+                layer._backward_pre_hooks,
+            )
+        ]
+        self._owners = [(layer.blobs._parameters, name) for layer in layers for name in layer.blobs._parameters]
         self._made: dict[tuple[torch.Size, ...], _Prepared] = {}
         self._values: Values = []
+
+    def is_watched(self) -> bool:
+        """Return whether hooks wait for autograd's passes, on layers or learnable blobs, or there is no autograd."""
+        if any(self._hooks) or not torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
+            return True
+        return any(blob._backward_hooks or blob._post_accumulate_grad_hooks for blob in self._blobs())
+
+    def _blobs(self) -> list[Any]:
+        return [owner[name] for owner, name in self._owners]
 
     def run(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net forward and backward; return the weighted sum of its losses, and the outputs.
 
-        The gradients of the learnable blobs are added to ``grad``.
+        The gradients of the learnable blobs are added to ``grad``. The loss is good until the next call.
         """
         plan, layer = self._plan, self._layers[0]
         try:
@@ -119,11 +130,12 @@ class TrainingStep:
                 shapes = []
                 for i in self._sources:
                     layer = self._layers[i]
-                    for v, top in zip(plan.nodes[i].tops, layer.run(), strict=False):
+                    tops = layer.forward()
+                    for v, top in zip(plan.nodes[i].tops, tops if isinstance(tops, tuple) else (tops,), strict=False):
                         values[v] = top
                         shapes.append(top.shape)
                 prepared = self._made.get(key := tuple(shapes))
-                if prepared is None or not prepared.is_current():
+                if prepared is None or not prepared.is_current(self._blobs()):
                     self._made = {key: (prepared := self._prepare(values))}
                 return self._run(prepared, values)
         except (MemoryError, RuntimeError) as fault:
@@ -158,19 +170,27 @@ class TrainingStep:
                         diffs[v] = diff if diffs[v] is None else diffs[v] + diff
         self._values = []
         outputs = {name: values[v].clone() for name, v in self._plan.outputs.items()}
-        return torch.zeros(()) if loss is None else loss.clone(), outputs
+        return torch.zeros(()) if loss is None else loss, outputs
 
     def _prepare(self, values: Values) -> _Prepared:
         """Make the kernels for data of these shapes; let every learned blob have a gradient."""
         plan = self._plan
         shapes = {v: tuple(x.shape) for v, x in enumerate(values) if x is not None}
         needs: set[int] = set()  # values whose gradient somebody reads
-        made = _Prepared([], [], [], [None] * (len(plan.blobs) + len(plan.nodes)))
+        blobs = self._blobs()
+        for blob in blobs:
+            if blob.requires_grad and blob.grad is None:
+                blob.grad = torch.zeros_like(blob, memory_format=torch.contiguous_format)
+        made = _Prepared(
+            [],
+            [],
+            [None] * (len(plan.blobs) + len(plan.nodes)),
+            blobs,
+            [blob.data_ptr() for blob in blobs],
+            [blob.requires_grad for blob in blobs],
+            [blob.grad for blob in blobs],
+        )
         for i, (node, layer) in enumerate(zip(plan.nodes, self._layers, strict=True)):
-            for name, blob in layer.blobs._parameters.items():
-                if blob.requires_grad and blob.grad is None:
-                    blob.grad = torch.zeros_like(blob, memory_format=torch.contiguous_format)
-                made.held.append((layer.blobs._parameters, name, blob, blob.data_ptr(), blob.requires_grad, blob.grad))
             if i in self._sources:
                 if losses := self._losses(i, layer, made):
                     made.forward.append((lambda *tops: tops, node.tops, (), losses))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import is_
 from typing import Any, Protocol
 
 import torch
@@ -40,15 +41,6 @@ class _Block:
     decay_mult: float
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where a parameter and its gradient were put."""
-
-    parameter: torch.nn.Parameter
-    address: int
-    gradient: torch.Tensor | None
-
-
 class Blocks:
     """The parameters that a solver updates, and the rule's history of each: ``sets`` after one another.
 
@@ -57,7 +49,9 @@ class Blocks:
 
     def __init__(self, learnable: Sequence[Learnable], sets: int) -> None:
         self._learnable, self._sets = learnable, sets
-        self._places: list[_Place] = []
+        self._placed: list[torch.nn.Parameter] = []
+        self._addresses: list[int] = []
+        self._their_gradients: list[torch.Tensor | None] = []
         self._gradients: list[torch.Tensor] = []  # each piece of memory
         self._blocks: list[_Block] = []
         self._histories: dict[int, list[torch.Tensor]] = {}
@@ -100,11 +94,17 @@ class Blocks:
             blob.data = weights[here].view(shape)
             if blob.requires_grad:
                 blob.grad = diffs[here].view(shape)
-            self._places.append(_Place(blob, blob.data_ptr(), blob.grad))
+            self._place(blob)
             self._histories[i] = [each[here].view(shape) for each in history]
             start += _lines(blob)
         self._gradients.append(diffs)
         self._blocks.append(_Block(weights, diffs, history, first.lr_mult, first.decay_mult))
+
+    def _place(self, blob: torch.nn.Parameter) -> None:
+        """Note where a parameter and its gradient are."""
+        self._placed.append(blob)
+        self._addresses.append(blob.data_ptr())
+        self._their_gradients.append(blob.grad)
 
     def _keep(self, i: int) -> None:
         """Cut a large blob, which stays where it is, into blocks."""
@@ -112,7 +112,7 @@ class Blocks:
         blob = item.parameter
         if blob.requires_grad:
             blob.grad = torch.zeros_like(blob)
-        self._places.append(_Place(blob, blob.data_ptr(), blob.grad))
+        self._place(blob)
         self._histories[i] = [torch.zeros_like(values_of(blob)) for _ in range(self._sets)]
         diffs = torch.zeros_like(values_of(blob)) if blob.grad is None else blob.grad
         self._gradients.append(diffs)
@@ -122,11 +122,12 @@ class Blocks:
 
     def _are_in_place(self) -> bool:
         """Return whether parameters and gradients are where they were put."""
-        for place in self._places:
-            blob = place.parameter
-            if blob.grad is not place.gradient or blob.data_ptr() != place.address:
-                return False
-        return bool(self._blocks)
+        blobs = self._placed
+        return (
+            bool(self._blocks)
+            and all(map(is_, [blob.grad for blob in blobs], self._their_gradients))
+            and [blob.data_ptr() for blob in blobs] == self._addresses
+        )
 
     def clear(self) -> None:
         """Set all gradients to 0."""

@@ -5,6 +5,7 @@ Caffe: SGDSolver::GetLearningRate (src/caffe/solvers/sgd_solver.cpp:27)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -90,9 +91,12 @@ def learning_rate(param: Any, iteration: int, step: int) -> float:
 
     Raises SpecError if the rate is not a number, as for poly beyond max_iter.
     """
-    with np.errstate(all="ignore"):
-        rate = float(np.float32(POLICIES[param.lr_policy].rate(param, iteration, step)))
-    if not np.isfinite(rate):
+    if param.lr_policy == "fixed":
+        rate = param.base_lr
+    else:
+        with np.errstate(all="ignore"):
+            rate = float(np.float32(POLICIES[param.lr_policy].rate(param, iteration, step)))
+    if not math.isfinite(rate):
         message = f'lr_policy "{param.lr_policy}" gives the learning rate {rate} at iteration {iteration}'
         raise SpecError(f"{message} (max_iter {param.max_iter})")
     return rate

@@ -60,12 +60,11 @@ class LossScale:
         """Return the scaled loss."""
         return loss * self.factor if self._scales else loss
 
-    @torch.no_grad()
     def remove(self, gradients: list[torch.Tensor]) -> bool:
         """Divide the gradients by the factor, then set the next; return whether all of them are finite."""
         if not self._scales or not gradients:
             return True
-        largest = torch._foreach_norm(gradients, torch.inf)
+        largest = torch._foreach_norm(gradients, torch.inf)  # gradients ask for none themselves
         if not bool(torch.stack(largest).isfinite().all()):
             self.factor, self._good = self.factor / 2, 0
             return False

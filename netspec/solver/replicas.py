@@ -25,10 +25,10 @@ class Replicas:
     def __init__(self, root: Net, nets: Sequence[Net], processes: Processes) -> None:
         self._root, self.nets, self._processes = root, nets, processes
 
-    @torch.no_grad()
     def begin(self) -> None:
         """Copy the root's parameters, including BatchNorm's statistics, to every replica, here and elsewhere."""
-        self._processes.copy_root(item.parameter.detach() for item in self._root.learnable)
+        if self._processes.count > 1:
+            self._processes.copy_root(item.parameter.detach() for item in self._root.learnable)
         self._copy(everything=True)
 
     def backward(self, precision: str, scale: LossScale) -> None:
@@ -41,12 +41,14 @@ class Replicas:
             if loss.requires_grad:
                 scale.of(loss).backward()
 
-    @torch.no_grad()
     def reduce(self) -> None:
         """Make the root's gradients the mean over all devices of all processes."""
         count = self._processes.count * (1 + len(self.nets))
-        if count == 1:
-            return
+        if count > 1:
+            self._reduce(count)
+
+    @torch.no_grad()
+    def _reduce(self, count: int) -> None:
         sums = []
         for own, *theirs in zip(*(net.learnable for net in (self._root, *self.nets)), strict=True):
             if own.parameter.grad is None:
@@ -63,7 +65,6 @@ class Replicas:
         for net in self.nets:
             update.clear(item.parameter for item in net.learnable)
 
-    @torch.no_grad()
     def update(self) -> None:
         """Copy the root's learned weights to every replica."""
         self._copy(everything=False)
@@ -80,6 +81,7 @@ class Replicas:
 
     def _copy(self, everything: bool) -> None:
         for net in self.nets:
-            for own, theirs in zip(self._root.learnable, net.learnable, strict=True):
-                if everything or own.lr_mult:
-                    theirs.parameter.copy_(own.parameter, non_blocking=True)
+            with torch.no_grad():
+                for own, theirs in zip(self._root.learnable, net.learnable, strict=True):
+                    if everything or own.lr_mult:
+                        theirs.parameter.copy_(own.parameter, non_blocking=True)

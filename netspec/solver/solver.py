@@ -33,7 +33,7 @@ from netspec.proto.binary import split_paths
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_solver, write_text
-from netspec.run.training import TrainingStep, is_watched
+from netspec.run.training import TrainingStep
 from netspec.solver import nets, update
 from netspec.solver.blocks import Blocks
 from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
@@ -397,7 +397,8 @@ class Solver:
             self.replicas.backward(self._precision, self._scale)
             total += np.float32(loss.item())
         self.replicas.reduce()
-        self._unscale()
+        if self._precision == FP16:
+            self._unscale()
         return float(total / np.float32(self.param.iter_size)), outputs
 
     def _unscale(self) -> None:
@@ -418,7 +419,7 @@ class Solver:
         """Run the training net forward and backward; return its loss and outputs."""
         if self._prepared is None:
             self._prepared = self.net.training_step() if self._precision == FP32 else "its precision is not fp32"
-        if isinstance(self._prepared, TrainingStep) and not self.net.keep and not is_watched(self.net.layers):
+        if isinstance(self._prepared, TrainingStep) and not self.net.keep and not self._prepared.is_watched():
             loss, outputs = self._prepared.run()
             self.net.__dict__["blobs"] = outputs  # a module's own way of setting is slow
             return loss, outputs

@@ -64,9 +64,10 @@ def regularize(diffs: Tensors, weights: Tensors, decays: Sequence[float], kind: 
     chosen = [i for i, decay in enumerate(decays) if decay]
     if not chosen:
         return
-    pull = [weights[i] for i in chosen]
+    pull = weights if len(chosen) == len(weights) else [weights[i] for i in chosen]
     pull = torch._foreach_sign(pull) if kind == "L1" else pull
-    _add_scaled([diffs[i] for i in chosen], pull, [decays[i] for i in chosen])
+    pulled = diffs if len(chosen) == len(diffs) else [diffs[i] for i in chosen]
+    _add_scaled(pulled, pull, [decays[i] for i in chosen])
 
 
 def subtract(weights: Tensors, diffs: Tensors) -> None:
@@ -240,7 +241,11 @@ def _accelerate(diffs: Tensors, rates: Sequence[float], history: Tensors, moment
 
 def _add_scaled(sums: Tensors, terms: Tensors, factors: Sequence[float]) -> None:
     """Sum = sum + factor * term, rounded once, as BLAS' axpy does."""
-    for factor in set(factors):
+    kinds = set(factors)
+    if len(kinds) == 1:
+        torch._foreach_add_(sums, terms, alpha=factors[0])
+        return
+    for factor in kinds:
         chosen = [i for i, own in enumerate(factors) if own == factor]
         torch._foreach_add_([sums[i] for i in chosen], [terms[i] for i in chosen], alpha=factor)
 

@@ -112,7 +112,7 @@ class DummyData(Layer):
         return tuple(self._fill(i, generator) if kept is None else kept for i, kept in enumerate(self._constants))
 
     def _fill(self, i: int, generator: torch.Generator) -> torch.Tensor:
-        return fillers.fill(self._fillers[i], self.shapes[i], generator).to(self.context.device)
+        return fillers.draw(self._fillers[i], self.shapes[i], generator).to(self.context.device)
 
     def _read_shapes(self) -> list[Shape]:
         p = self.param.dummy_data_param

@@ -462,7 +462,7 @@ class EuclideanLoss(Loss):
             return (RowSquares.apply(row)[0] if exact else difference.square().sum()) / divisor
 
         def backward(diff: torch.Tensor) -> Sequence[torch.Tensor | None]:
-            factor = diff / divisor * 2
+            factor = diff / shape[0]  # rounded as diff / divisor, which is half of it
             if found[0] is not None:
                 torch.mul(difference, factor, out=found[0])
             if found[1] is not None:
