@@ -10,6 +10,8 @@ import io
 import math
 import os
 import pickle
+import re
+import struct
 import sys
 import tokenize
 import zipfile
@@ -26,6 +28,7 @@ T = TypeVar("T")
 _FAULTS = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, MemoryError, SyntaxError),
     *(EOFError, NotImplementedError, RuntimeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+    *(struct.error, pickle.UnpicklingError, SystemError),
 )
 _ALWAYS = 1 << 28  # bytes that any file may ask for
 _MOST_PACKED = 100  # times a file's size: real data is packed 2 to 20 times, a file made to fill the memory 1000 times
@@ -72,16 +75,20 @@ def read_lists(path: str | Path) -> list[Any] | None:
             shape, _, dtype = read(stream)
             if not dtype.hasobject:
                 return None
-            values = _Lists(stream).load()
-            if not isinstance(values, np.ndarray) or values.shape != shape:
+            found = _Lists(stream).load()
+            if not isinstance(found, _Array) or found.values.shape != shape:
                 raise ValueError("another array than its header says")
-            return _plain(values)
-    except (*_FAULTS, pickle.UnpicklingError) as error:
+            return _plain(found)
+    except _FAULTS as error:
         raise _fault(error, path, expected) from None
 
 
-class _Lists(pickle.Unpickler):
-    """Unpickles numpy arrays and lists; whatever else a pickle names is refused."""
+class _Lists(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIssue]
+    """Unpickles numpy arrays and lists; whatever else a pickle names is refused.
+
+    What numpy itself would rebuild from a damaged pickle may end the process, and so may the memory that the unpickler
+    in C takes for a large number: this one is in Python, and :class:`_Array` stands for numpy's.
+    """
 
     def find_class(self, module: str, name: str) -> Any:
         if module in ("numpy", "numpy.core.multiarray", "numpy._core.multiarray") and name in _KNOWN:
@@ -89,23 +96,53 @@ class _Lists(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name} is no list of numbers")
 
 
-def _empty_array(*_: Any) -> np.ndarray:
-    """Return the array that a pickle begins with: empty, whatever size the pickle says."""
-    return np.ndarray((0,), np.int8)
+class _Kind:
+    """A dtype in a pickle, by its code: ``O8``, or one of numbers such as ``i8``."""
+
+    def __init__(self, code: str, *_: Any) -> None:
+        if not re.fullmatch(r"O8?|[biuf][1248]", code):
+            raise ValueError(f"an array of {code!r:.40}")
+        self.code, self.order = code, "="
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.order = {">": ">"}.get(state[1], "<")
+
+    def numbers(self, data: bytes) -> np.ndarray:
+        """Return what the bytes hold."""
+        if self.code[0] == "O":
+            raise ValueError("a number of Python objects")
+        return np.frombuffer(data, np.dtype(self.order + self.code))
+
+
+class _Array:
+    """An array in a pickle: ``values`` are known when its state is read."""
+
+    def __init__(self, *_: Any) -> None:
+        self.values = np.empty(0, object)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, kind, by_columns, data = state
+        if kind.code[0] == "O":
+            values = np.empty(len(data), object)
+            for i, each in enumerate(data):
+                values[i] = each
+        else:
+            values = kind.numbers(data)
+        self.values = values.reshape(shape, order="F" if by_columns else "C")
 
 
 _KNOWN: dict[str, Any] = {
-    "ndarray": np.ndarray,
-    "dtype": np.dtype,
-    "_reconstruct": _empty_array,
-    "scalar": lambda dtype, data: np.frombuffer(data, dtype)[0],
+    "ndarray": _Array,
+    "dtype": _Kind,
+    "_reconstruct": _Array,
+    "scalar": lambda kind, data: kind.numbers(data)[0],
 }
 
 
 def _plain(value: Any) -> Any:
     """Return integers and lists of them for what numpy has. Raises ValueError for other values."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
+    if isinstance(value, _Array):
+        value = value.values.tolist()
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     if isinstance(value, (float, np.floating)) and float(value).is_integer():

@@ -18,7 +18,13 @@ class Bag:
     """A bag of the common path: images, odometry of the body, a static transform to the camera, a CameraInfo."""
 
     def __init__(
-        self, file: Path, ros: int, encoding: str = "rgb8", second_camera: bool = False, topic: str = "/cam/image"
+        self,
+        file: Path,
+        ros: int,
+        encoding: str = "rgb8",
+        second_camera: bool = False,
+        topic: str = "/cam/image",
+        count: int = COUNT,
     ) -> None:
         self.file, self._ros = file, ros
         self._store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
@@ -44,7 +50,7 @@ class Bag:
             self._write("/tf_static", 0, self._tree())
             self._write(camera_info, 0, self._camera_info())
             body = path() @ np.linalg.inv(MOUNT)
-            for i in range(COUNT):
+            for i in range(count):
                 self._write(topic, i, self._image(i, encoding))
                 if second_camera:
                     self._write("/other/image", i, self._image(i, encoding))

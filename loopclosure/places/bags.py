@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -52,15 +52,20 @@ class Bag:
 
     def images(self) -> Iterator[tuple[float, np.ndarray]]:
         """Yield (stamp in seconds, image (H, W, 3) uint8 BGR)."""
-        for message in self._messages(self.topic):
-            self.frame = message.header.frame_id
-            yield _seconds(message.header.stamp), self._image(message)
+        with _reading(self.path):
+            for message in self._messages(self.topic):
+                self.frame = message.header.frame_id
+                yield _seconds(message.header.stamp), self._image(message)
 
     def poses(self) -> tuple[np.ndarray, np.ndarray, str]:
         """Return stamps (N,), poses (N, 7) of the camera, and a sentence about how they came to be the camera's.
 
         A static transform from the frame of the poses to that of the images is applied, where the bag has one.
         """
+        with _reading(self.path):
+            return self._poses()
+
+    def _poses(self) -> tuple[np.ndarray, np.ndarray, str]:
         stamps, rows, child = [], [], ""
         for message in self._messages(self.pose_topic):
             child = getattr(message, "child_frame_id", "")
@@ -81,6 +86,10 @@ class Bag:
 
     def camera(self) -> Intrinsics | None:
         """Return the camera that a CameraInfo beside the images says, None without one."""
+        with _reading(self.path):
+            return self._camera()
+
+    def _camera(self) -> Intrinsics | None:
         beside = self.topic.rsplit("/", 2 if self.topic.endswith("/compressed") else 1)[0]
         for connection in self._reader.connections:
             if connection.msgtype == CAMERA_INFO and connection.topic == f"{beside}/camera_info":
@@ -158,7 +167,7 @@ class Bag:
 def open_bag(path: Path, topic: str = "", pose_topic: str = "") -> Iterator[Bag]:
     """Open a bag for a ``with`` statement. Raises InputError if it cannot be read, or has no such topic."""
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise InputError(
@@ -168,12 +177,21 @@ def open_bag(path: Path, topic: str = "", pose_topic: str = "") -> Iterator[Bag]
         raise InputError("no such bag", path)
     if path.suffix == ".db3" and (path.parent / "metadata.yaml").is_file():
         path = path.parent
+    with ExitStack() as stack:
+        with _reading(path):
+            reader = stack.enter_context(AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)))
+            bag = Bag(reader, path, topic, pose_topic)
+        yield bag
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raise InputError for whatever is raised in the block: of a damaged bag the library raises many errors."""
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            yield Bag(reader, path, topic, pose_topic)
+        yield
     except InputError:
         raise
-    except (AnyReaderError, AssertionError, ValueError, KeyError, OSError) as fault:
+    except Exception as fault:
         reason = " ".join(str(fault).split()) or type(fault).__name__
         raise InputError(f"cannot be read as a ROS bag ({reason})", path) from None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -301,7 +302,7 @@ def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
     joined = []
     for left, right in pairs:
         path = folder / f"{left.stem}_{right.stem}.png"
-        if not path.is_file():
+        if not os.path.isfile(path):
             images = read_bgr(left), read_bgr(right)
             if images[0].shape[0] != images[1].shape[0]:
                 raise InputError(f"is {images[1].shape[0]} pixels high, {left.name} {images[0].shape[0]}", right)
@@ -356,7 +357,7 @@ def _folder_name(source: str | Path) -> str:
 
 def _existing(images: list[Path]) -> list[Path]:
     for path in images:
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise InputError("no such image, though the sequence lists it", path)
     return images
 

@@ -95,7 +95,7 @@ def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:
 
 def yaml_numbers(text: str, key: str, count: int, path: Path) -> list[float]:
     """Return the ``count`` numbers in brackets behind ``key:`` of a YAML text, over several lines or one."""
-    found = re.search(rf"^\s*{key}\s*:\s*\[([^\]]*)\]", text, re.MULTILINE)
+    found = re.search(rf"^[ \t]*{key}[ \t]*:\s*\[([^\]]*)\]", text, re.MULTILINE)
     try:
         numbers = [float(part) for part in found[1].split(",")] if found else []
     except ValueError:
@@ -112,9 +112,11 @@ def kitti_projection(text: str, camera: str, path: Path) -> np.ndarray:
         numbers = [float(part) for part in found[1].split()] if found else []
     except ValueError:
         numbers = []
-    if len(numbers) != 12 or not numbers[0] > 0:
+    known = len(numbers) == 12 and np.all(np.isfinite(numbers))
+    matrix = np.array(numbers).reshape(3, 4) if known else np.zeros((3, 4))
+    if not (matrix[0, 0] > 0 and np.linalg.matrix_rank(matrix[:, :3]) == 3):
         raise InputError(f'expected "{camera}:" and the twelve numbers of a projection, as in KITTI\'s calib.txt', path)
-    return np.array(numbers).reshape(3, 4)
+    return matrix
 
 
 def _checked(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from pathlib import Path
 
 import cv2
@@ -107,7 +108,7 @@ def read_place_pairs(path: str | Path) -> list[tuple[str, Path, Path]]:
                 images = []
                 for column in ("query", "ref"):
                     image = path.parent / (row[column] or "")
-                    if not image.is_file():
+                    if not os.path.isfile(image):
                         raise InputError(f'no such {column} image "{row[column]}"', path, reader.line_num, 1)
                     images.append(image)
                 rows.append((row["place_id"], images[0], images[1]))

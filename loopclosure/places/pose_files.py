@@ -244,9 +244,13 @@ def _rotation_fault(row: Sequence[float], kind: str) -> str:
         length = float(np.linalg.norm(row[4:8]))
         wrong = abs(length - 1) > NORM_TOLERANCE
         return f"qw qx qy qz have length {length:.4g}, a rotation has length 1" if wrong else ""
-    matrix = np.array(row).reshape(3, 4)[:, :3]
-    apart = float(np.abs(matrix.T @ matrix - np.eye(3)).max())
-    if apart > MATRIX_TOLERANCE:
+    return matrix_fault(np.array(row).reshape(3, 4)[:, :3])
+
+
+def matrix_fault(matrix: np.ndarray) -> str:
+    """Say why the first three columns (3, 3) of a pose are no rotation; empty if they are one."""
+    apart = float(np.abs(matrix.T @ matrix - np.eye(3)).max()) if np.abs(matrix).max() < 2 else np.inf
+    if not apart <= MATRIX_TOLERANCE:
         return f"its first three columns are no rotation: M^T M differs from the identity by {apart:.3g}"
     reflected = np.linalg.det(matrix) < 0
     return "its first three columns are a reflection (determinant -1), not a rotation" if reflected else ""

@@ -17,7 +17,7 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.image_list import list_images
 from loopclosure.places.intrinsics import Intrinsics, kitti_projection, read_intrinsics, yaml_numbers
-from loopclosure.places.pose_files import PoseForm, moved, read_poses
+from loopclosure.places.pose_files import PoseForm, matrix_fault, moved, read_poses
 from loopclosure.places.trajectory import (
     MAX_DIFFERENCE_S,
     Frame,
@@ -226,6 +226,8 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     if sensor.is_file():
         camera = read_intrinsics(sensor)
         mount = np.array(yaml_numbers(sensor.read_text(encoding="utf-8-sig"), "data", 16, sensor)).reshape(4, 4)
+        if fault := matrix_fault(mount[:3, :3]):
+            raise InputError(f"the camera's pose in the body, T_BS: {fault}", sensor)
     sequence = ImageSequence(folder, images, _names(images, folder), times, camera=camera)
     if not own_poses:
         return sequence
@@ -291,7 +293,7 @@ def _names(images: tuple[Path, ...], folder: Path) -> tuple[str, ...]:
 
 
 def _existing(image: Path, listing: Path, line_number: int) -> Path:
-    if not image.is_file():
+    if not os.path.isfile(image):
         raise InputError(f'no such image "{image.name}" in {image.parent}', listing, line_number, 1)
     return image
 

@@ -94,7 +94,7 @@ def _log_opened(backend: str, path: str) -> None:
 def _kind(source: str) -> str:
     """Return the backend of the database in a folder."""
     folder = Path(source)
-    if not folder.exists():
+    if not os.path.exists(folder):
         raise ValueError(f"does not exist (relative paths start from {os.getcwd()})")
     if not folder.is_dir():
         raise ValueError("is a file; expected a folder that contains data.mdb (LMDB) or CURRENT (LevelDB)")

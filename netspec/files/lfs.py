@@ -23,5 +23,5 @@ def pointer_fault_at(path: str | os.PathLike[str]) -> str:
     try:
         with open(path, "rb") as file:
             return pointer_fault(file.read(_LONGEST))
-    except OSError:
+    except (OSError, ValueError):  # a path with a NUL
         return ""

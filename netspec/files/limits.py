@@ -62,6 +62,8 @@ def is_out_of_memory(fault: BaseException) -> bool:
 
 def read_bytes(path: str | Path) -> bytes:
     """Return what a file or a pipe holds. Raises OSError, for a device too: it may have no end."""
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "a name has no character NUL", str(path))
     with open(path, "rb") as file:
         if stat.S_ISCHR(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.ENODEV, "it is a device, not a file", str(path))

@@ -27,6 +27,7 @@ try:
 except ImportError:  # Windows: there, a file that is open cannot be removed
     fcntl: Any = None
 
+NO_NUL = "a name has no character NUL"
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
 _swept: set[Path] = set()
 
@@ -38,6 +39,8 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     A symbolic link stays one; a pipe or a device gets the bytes. If the block fails, the temporary file is removed, and
     what was at ``path`` is still there. Raises SpecError if it cannot be written.
     """
+    if "\0" in str(path):
+        raise _fault(f"cannot be written: {NO_NUL}", path)
     real = Path(os.path.realpath(path))
     try:
         if real.exists() and not real.is_file() and not real.is_dir():
@@ -133,6 +136,8 @@ def why_unwritable(path: str | Path) -> str:
     """
     path = Path(path)
     folder = path.parent
+    if "\0" in str(path):
+        return NO_NUL
     try:
         if not folder.is_dir():
             folder.stat()

@@ -5,8 +5,8 @@ Caffe: Solver::InitTrainNet, Solver::InitTestNets (src/caffe/solver.cpp)
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
-from pathlib import Path
 
 from netspec.data.random_words import derived
 from netspec.errors import SpecError
@@ -111,7 +111,7 @@ class _Reader:
         return read and (f"{name} file: {value}", *read)
 
     def _read(self, name: str, path: str, index: int) -> tuple[NetParameter, SourceMap]:
-        if not Path(path).is_file():
+        if not os.path.isfile(path):
             message = f'{name} "{path}" is not a file; paths are relative to the working directory'
             raise SpecError(message, self._node.find(name, index))
         return parse_net(path, report=self._report)

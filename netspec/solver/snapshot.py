@@ -5,6 +5,7 @@ Caffe: SGDSolver::SnapshotSolverState, RestoreSolverState (src/caffe/solvers/sgd
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,7 +112,7 @@ def find_learned_net(state: State, path: str | Path) -> Path:
     written = Path(state.learned_net)
     beside = Path(path).parent / written.name
     for candidate in (beside, written):
-        if candidate.is_file():
+        if os.path.isfile(candidate):
             return candidate
     raise SpecError(f"its weights are neither at {beside} nor at {written}", Where(str(path)))
 

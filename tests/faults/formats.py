@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import struct
 import warnings
 import zipfile
@@ -20,6 +21,7 @@ import numpy as np
 import scipy.io
 import torch
 
+from faults import recordings
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.detector.detector import LoopDetector
@@ -68,8 +70,8 @@ layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip"
 class Format:
     """``write(path)`` writes a good file, ``read(path)`` reads it; ``path`` ends in ``suffix``.
 
-    Of a format whose file lies in a folder of its own, ``inside`` is its name there. Where checksums would hide most
-    damage, ``open`` takes the file apart, and ``close`` makes one of damaged parts, whose checksums are right.
+    Of a format whose file lies in a folder of its own, ``x``, ``inside`` is its name there. Where checksums would hide
+    most damage, ``open`` takes the file apart, and ``close`` makes one of damaged parts, whose checksums are right.
     """
 
     suffix: str
@@ -81,7 +83,9 @@ class Format:
 
     def good(self, folder: Path) -> bytes:
         """Return the bytes of a good file, which is written to a folder."""
-        path = folder / f"good{self.suffix}"
+        path = folder / ("x" if self.inside else f"good{self.suffix}")
+        if self.inside:
+            shutil.rmtree(path, ignore_errors=True)
         self.write(path)
         return (path / self.inside if self.inside else path).read_bytes()
 
@@ -328,6 +332,17 @@ FORMATS = {
         lambda path: Scores([Score(1, 0, {"loss": [0.5]})], [Snapshot(1, "x.caffemodel")]).write(path),
         read_scores,
     ),
+    "euroc images": Format("", recordings.euroc, recordings.read_folder, recordings.EUROC_LISTING),
+    "euroc sensor.yaml": Format("", recordings.euroc, recordings.read_folder, recordings.EUROC_SENSOR),
+    "euroc poses": Format("", recordings.euroc, recordings.read_folder, recordings.EUROC_POSES),
+    "kitti calib.txt": Format("", recordings.kitti, recordings.read_folder, "calib.txt"),
+    "kitti times.txt": Format("", recordings.kitti, recordings.read_folder, "times.txt"),
+    "kitti poses": Format("", recordings.kitti, recordings.read_folder, "poses.txt"),
+    "poses": Format(".txt", recordings.poses, recordings.all_poses),
+    "ROS 1 bag": Format(".bag", recordings.bag, recordings.read_bag),
+    "ROS 2 metadata.yaml": Format("", recordings.bag, recordings.read_bag, "metadata.yaml"),
+    "ROS 2 bag": Format("", recordings.bag, recordings.read_bag, recordings.BAG_FILE),
+    "truth of lists": Format(".npy", recordings.lists, recordings.read_matches_of_four),
     "png": Format(".png", picture, either_picture),
     "jpeg": Format(".jpg", picture, either_picture),
 }

@@ -77,9 +77,6 @@ def mutant(data: bytes, draw: random.Random) -> bytes:
 def ending(form: Format, folder: Path, data: bytes) -> str:
     """Read the bytes; return "" or what went wrong."""
     path = folder / f"x{form.suffix}"
-    if form.inside:
-        path = folder / "x"
-        path.mkdir(exist_ok=True)
     (path / form.inside if form.inside else path).write_bytes(data)
     try:
         form.read(path)

@@ -26,8 +26,10 @@ from netspec.data.images import read_image
 from netspec.data.mean import read_mean_option
 from netspec.errors import SpecError
 from netspec.features.images import read_pixels as read_for_features
+from netspec.net.build import load_net
 from netspec.net.weights import load_weights
 from netspec.solver.snapshot import read_state
+from netspec.solver.solver import load_solver
 from paths import ROOT
 
 HUGE = (1 << 20, 1 << 20)
@@ -136,6 +138,30 @@ def test_links_within_a_file_are_followed(tmp_path: Path) -> None:
         file["rows/data"], file["label"], file["packed"] = np.ones((5, 2, 3)), np.zeros(5), np.zeros((5, 4))
         file["data"] = h5py.SoftLink("/rows/data")
     all_rows(tmp_path / "x.h5")
+
+
+HDF5_DATA = 'layer { name: "d" type: "HDF5Data" top: "a" hdf5_data_param { source: "SOURCE" batch_size: 1 } }'
+HDF5_OUTPUT = """layer { name: "i" type: "DummyData" top: "a" top: "b"
+  dummy_data_param { shape { dim: 1 } shape { dim: 1 } } }
+layer { name: "o" type: "HDF5Output" bottom: "a" bottom: "b" hdf5_output_param { file_name: "SOURCE" } }"""
+SETTINGS = (
+    "base_lr: 0.1 lr_policy: 'fixed' max_iter: 1 solver_mode: CPU net_param { layer { name: 'x' type: 'Split' } }"
+)
+
+
+@pytest.mark.parametrize("name", [r"a\000b", "n" * 5000], ids=["NUL", "long"])
+def test_a_name_that_no_file_has(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("list.txt").write_text(name.replace(r"\000", "\0") + "\n")
+    for text in (HDF5_DATA.replace("SOURCE", name), HDF5_DATA.replace("SOURCE", "list.txt"), HDF5_OUTPUT):
+        Path("net.prototxt").write_text(text.replace("SOURCE", name))
+        with pytest.raises(SpecError):
+            load_net("net.prototxt", phase="TRAIN").forward_loss()
+    for field in ("snapshot: 1 snapshot_prefix", "weights", "net"):
+        settings = SETTINGS.partition(" net_param")[0] if field == "net" else SETTINGS
+        Path("solver.prototxt").write_text(f'{settings} {field}: "{name}"')
+        with pytest.raises(SpecError):
+            load_solver("solver.prototxt")
 
 
 def bomb(side: int) -> bytes:

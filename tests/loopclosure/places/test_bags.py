@@ -8,11 +8,13 @@ import pytest
 
 from loopclosure.cli import main
 from loopclosure.errors import InputError
+from loopclosure.places.bags import open_bag
 from loopclosure.places.extraction import extract
 from loopclosure.places.sequences import read_sequence
 from places_layouts import COUNT, path, picture, quaternions
 
 pytest.importorskip("rosbags")
+from faults.recordings import read_bag
 from places_bags import START_S, Bag
 
 
@@ -34,6 +36,40 @@ def test_a_bag_becomes_a_sequence(name: str, ros: int, encoding: str, tmp_path: 
     np.testing.assert_allclose(np.abs(np.sum(sequence.poses[:, 3:] * quaternions(path()), axis=1)), 1, atol=1e-5)
     assert sequence.camera is not None
     assert (sequence.camera.fy, sequence.camera.distortion[:2]) == (28.25, (0.1, -0.2))
+
+
+def test_a_damaged_bag_is_one_line(tmp_path: Path) -> None:
+    """In the index, in a header, in a message, in the text beside it."""
+    whole = Bag(tmp_path / "whole.bag", 1, "mono8", count=3).file.read_bytes()
+    folder = Bag(tmp_path / "two", 2, "mono8", count=3).file
+    text = (folder / "metadata.yaml").read_text()
+    damaged = {tmp_path / f"{at}.bag": whole[:at] + b"\xff\xff" + whole[at + 2 :] for at in range(20, len(whole), 997)}
+    damaged |= {tmp_path / f"{word}.bag": whole.replace(word.encode(), b"xx") for word in ("op=", "topic=", "frame")}
+    refused = 0
+    for file, data in damaged.items():
+        file.write_bytes(data)
+        refused += is_refused(file)
+    assert refused > 5
+    for old, new in (("nanoseconds_since_epoch", "'data'"), ("storage_identifier", "other"), ("files:", "files: 7 #")):
+        (folder / "metadata.yaml").write_text(text.replace(old, new))
+        assert is_refused(folder) or old == "files:"
+    (folder / "metadata.yaml").write_text(text)
+    (folder / "two.db3").write_bytes((folder / "two.db3").read_bytes()[:9000])
+    assert is_refused(folder)
+
+
+def is_refused(file: Path) -> bool:
+    try:
+        read_bag(file)
+    except InputError:
+        return True
+    return False
+
+
+def test_what_uses_a_bag_keeps_its_own_errors(tmp_path: Path) -> None:
+    bag = Bag(tmp_path / "a.bag", 1, count=1).file
+    with pytest.raises(ZeroDivisionError), open_bag(bag):
+        raise ZeroDivisionError
 
 
 def test_a_topic_must_be_chosen_where_there_are_several(tmp_path: Path) -> None:

@@ -69,6 +69,31 @@ def test_a_distortion_that_is_not_known_is_refused(tmp_path: Path) -> None:
         read_sequence(folder)
 
 
+@pytest.mark.parametrize("value", ["99999999999999999999", "1e999", "nan", "0.5"])
+def test_a_mount_that_is_no_rotation_is_refused(value: str, tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path)
+    sensor = folder / "mav0/cam0/sensor.yaml"
+    sensor.write_text(sensor.read_text().replace("data: [0,", f"data: [{value},"))
+    with pytest.raises(InputError, match=r"sensor\.yaml: the camera's pose in the body, T_BS: .* no rotation"):
+        read_sequence(folder)
+
+
+@pytest.mark.parametrize("row", ["30 0 15.5 0 30 0 15.5 0 0 0 1 0", "30 0 15.5 0 0 30 11.5 0 0 0 1 inf"])
+def test_a_projection_that_is_none_is_refused(row: str, tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path)
+    (folder / "calib.txt").write_text(f"P0: {row}\n")
+    with pytest.raises(InputError, match=r'calib\.txt: expected "P0:" and the twelve numbers of a projection'):
+        read_sequence(folder)
+
+
+def test_names_that_no_file_has(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path)
+    for name in ("x" * 5000, "a\0b"):
+        (folder / "mav0/cam0/data.csv").write_text(f"7,{name}\n")
+        with pytest.raises(InputError, match=r"data\.csv:1:1: no such image"):
+            read_sequence(folder)
+
+
 @pytest.mark.parametrize(("camera", "aside"), [("image_0", 0.0), ("image_2", -0.06)])
 def test_kitti_has_the_poses_of_its_camera(camera: str, aside: float, tmp_path: Path) -> None:
     folder = write_kitti(tmp_path, camera)
@@ -151,6 +176,23 @@ class Harmful:
 
     def __reduce__(self) -> tuple:
         return (Path.touch, (Path("harmed"),))
+
+
+def test_damaged_lists_of_matches(tmp_path: Path) -> None:
+    """Each byte in turn: numpy itself would raise a SystemError, or end the process, for some of them."""
+    rows = np.empty((2, 2), dtype=object)
+    rows[0, 0], rows[0, 1], rows[1, 0], rows[1, 1] = 0, [0, 1], 1, np.array([1])
+    np.save(tmp_path / "truth.npy", rows)
+    whole = (tmp_path / "truth.npy").read_bytes()
+    assert read_matches(tmp_path / "truth.npy", 2, 2)[0].tolist() == [[True, True], [False, True]]
+    refused = 0
+    for i in range(128, len(whole)):
+        (tmp_path / "truth.npy").write_bytes(whole[:i] + bytes([whole[i] ^ 0x21]) + whole[i + 1 :])
+        try:
+            read_matches(tmp_path / "truth.npy", 2, 2)
+        except InputError:
+            refused += 1
+    assert refused > 100
 
 
 def test_lists_of_matches_run_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
