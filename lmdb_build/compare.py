@@ -32,8 +32,11 @@ from netspec.runs.scores import Score, read_scores
 from netspec.terminal import log
 
 PHASES = {"train": TRAIN, "validation": TEST}
-PROGRESS = ("Iteration ", "    Test net output", "Snapshotting to", "Optimization Done")  # lines of the log to show
+TESTING = re.compile(r"\] Iteration \d+, Testing net")
+PROGRESS = ("    Test net output", "Snapshotting to", "Optimization Done")  # lines of the log to show
+LOSS = re.compile(r"\] Iteration (\d+)(?: \(.*\))?, loss = (\S+)")
 Say = Callable[[str], None]
+Step = Callable[[int, int, str], None]  # iterations that are done, all of them, and the loss
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class Entry:
 
     bottoms  of its ContrastiveLoss: two descriptors and the label
     loss     that layer's top
+    length   iterations of the training
     tests    batches of a test
     sources  train, validation -> data layer -> database
     """
@@ -50,6 +54,7 @@ class Entry:
     net: str
     name: str
     prefix: str
+    length: int
     tests: int
     bottoms: tuple[str, ...]
     loss: str
@@ -98,6 +103,7 @@ def read_entry(path: str) -> Entry:
         net=solver.net,
         name=net.name or Path(path).parent.name,
         prefix=solver.snapshot_prefix,
+        length=solver.max_iter,
         tests=solver.test_iter[0] if solver.test_iter else 1,
         bottoms=tuple(losses[0].bottom),
         loss=losses[0].top[0],
@@ -105,11 +111,13 @@ def read_entry(path: str) -> Entry:
     )
 
 
-def compare(solvers: Sequence[str], out: Path, train: bool, gpu: str, say: Say) -> tuple[str, list[Path]]:
+def compare(
+    solvers: Sequence[str], out: Path, train: bool, gpu: str, say: Say, step: Step = lambda *_: None
+) -> tuple[str, list[Path]]:
     """Train the nets of the solvers and evaluate the best snapshot of each; return the table and the report's files.
 
     Without ``train`` the snapshots of earlier trainings are evaluated. ``gpu`` is netspec's ``--gpu``. ``say`` gets
-    progress messages. Raises SpecError or InputError for an error in the files.
+    messages, ``step`` how far each training is. Raises SpecError or InputError for an error in the files.
     """
     entries = [read_entry(path) for path in solvers]
     for i, entry in enumerate(entries):
@@ -121,7 +129,7 @@ def compare(solvers: Sequence[str], out: Path, train: bool, gpu: str, say: Say) 
         if train:
             say(f"Training {entry.name} ({entry.solver})")
             words = ["train", "--solver", entry.solver, "--scores", str(out / f"{entry.stem}.scores.json")]
-            _netspec([*words, *_on(gpu)], out / f"{entry.stem}.log", say)
+            _netspec([*words, *_on(gpu)], out / f"{entry.stem}.log", say, step, entry.length)
         runs.append(_judged(entry, out, gpu.replace("all", "0").partition(",")[0], say))
     file = out / "runs.json"
     with whole_file(file) as unfinished:
@@ -197,7 +205,7 @@ def _on(gpu: str) -> list[str]:
     return ["--gpu", gpu] if gpu else []
 
 
-def _netspec(words: list[str], log: Path, say: Say) -> None:
+def _netspec(words: list[str], log: Path, say: Say, step: Step = lambda *_: None, length: int = 0) -> None:
     """Run a command of netspec; keep its log in a file, and show its progress.
 
     Raises SpecError with the command's last line if it fails.
@@ -212,19 +220,21 @@ def _netspec(words: list[str], log: Path, say: Say) -> None:
     ):
         assert process.stderr is not None
         try:
-            last = _relay(process.stderr, file, say)
+            last = _relay(process.stderr, file, say, step, length)
         except KeyboardInterrupt:  # the command was interrupted too: a training ends with a snapshot
-            _relay(process.stderr, file, say)
+            _relay(process.stderr, file, say, step, length)
             raise
     if process.returncode:
         raise SpecError(last if process.returncode == 1 else f"netspec {words[0]} failed: {last or process.returncode}")
 
 
-def _relay(stream: IO[str], file: IO[str], say: Say) -> str:
+def _relay(stream: IO[str], file: IO[str], say: Say, step: Step, length: int) -> str:
     """Copy the lines of a log to a file and show those about progress; return the last one."""
     line = ""
     for line in stream:
         file.write(line)
-        if line.partition("] ")[2].startswith(PROGRESS):
+        if found := LOSS.search(line):
+            step(int(found[1]), length, found[2])
+        if TESTING.search(line) or line.partition("] ")[2].startswith(PROGRESS):
             say(line.rstrip("\n"))
     return line.rstrip("\n")

@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from tqdm import tqdm
+
 from netspec.terminal.commands import Commands
 
 
@@ -26,11 +28,25 @@ def add_to(commands: Commands) -> None:
 def _compare(arguments: argparse.Namespace) -> None:
     from lmdb_build.compare import compare  # which loads the plotting library
 
-    table, files = compare(arguments.solvers, arguments.out, arguments.train, arguments.gpu, _say)
+    shown: list[tqdm] = []  # the bar of the training, on a terminal
+
+    def say(line: str) -> None:
+        tqdm.write(line, file=sys.stderr)
+        sys.stderr.flush()
+
+    def step(done: int, total: int, loss: str) -> None:
+        if not sys.stderr.isatty():
+            say(f"Iteration {done} of {total}, loss = {loss}")
+            return
+        if done == 0:
+            shown[:] = [tqdm(total=total, desc="train", unit="", leave=False)]
+        for bar in shown:
+            bar.set_postfix_str(f"loss {loss}", refresh=False)
+            bar.update(done - bar.n)
+            if done == total:
+                bar.close()
+
+    table, files = compare(arguments.solvers, arguments.out, arguments.train, arguments.gpu, say, step)
     print(table)
     for path in files:
-        _say(f"wrote {path}")
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+        say(f"wrote {path}")

@@ -7,7 +7,6 @@ import os
 import sys
 from pathlib import Path
 
-from lmdb_build.cli.arguments import next_command
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_list import (
@@ -141,8 +140,7 @@ def _pairs(arguments: argparse.Namespace) -> None:
         warp_share=1.0 if arguments.singles else arguments.warp_share,
     )
     lists = build_lists(source, plan, root, arguments.out, print, _warn, bar)
-    for split, path in lists.items():
-        print(next_command("convert", f"{root}/", path, f"{arguments.out / split}_lmdb"))
+    print(f"wrote {', '.join(map(str, lists.values()))}; the names of images in them are relative to {root}/")
 
 
 def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:

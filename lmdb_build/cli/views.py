@@ -6,7 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
-from lmdb_build.cli.arguments import next_command, size
+from lmdb_build.cli.arguments import size
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
 from lmdb_build.views import Batches, Changes, write_views
@@ -64,5 +64,5 @@ def _views(arguments: argparse.Namespace) -> None:
     )
     changes = Changes(arguments.viewpoint, arguments.calm)
     path = write_views(runs, batches, changes, arguments.view_size, root, arguments.out, arguments.seed, bar)
-    print(f"{path}: {arguments.batches} batches of {arguments.size} pairs")
-    print(next_command("convert", f"{path.parent}/", path, f"{arguments.out}_lmdb"))
+    made = f"{arguments.batches} batches of {arguments.size} pairs"
+    print(f"{path}: {made}; the names of images in it are relative to {path.parent}/")
