@@ -4,14 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
 from netspec.exact import libm
-from netspec.exact.blas import add_sums, dots, one_thread, sum_in_order
+from netspec.exact.blas import add_sums, dots, gemv_routine, one_thread, sum_in_order
 
 
 @one_thread()
@@ -21,6 +23,24 @@ def softmax(scores: torch.Tensor) -> torch.Tensor:
     sums = p.new_zeros(len(p), p.shape[2])
     add_sums(p, sums, axis=0)
     return p.div_(sums.unsqueeze(1))
+
+
+def bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return what computes :func:`softmax` of float32 scores of one shape, in memory of its own, with one thread."""
+    p = torch.empty(shape)
+    values, sums = p.numpy(), torch.empty(shape[0], 1, shape[2])
+    add_up, ones = gemv_routine(values), np.ones(shape[1], np.float32)
+    rows = [(each.T, total[0]) for each, total in zip(values, sums.numpy(), strict=True)]
+
+    def run(scores: torch.Tensor) -> torch.Tensor:
+        torch.sub(scores, scores.amax(1, keepdim=True), out=p)  # never above 0: see libm.exp
+        np.copyto(values, np.exp(values.astype(np.complex64)).real)
+        sums.zero_()
+        for each, total in rows:
+            add_up(1.0, each, ones, 1.0, total, 0, 1, 0, 1, 0, 1)
+        return p.div_(sums)
+
+    return run
 
 
 @one_thread()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ from typing_extensions import override
 from netspec.data.blobs import to_array
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.blas import dots, sum_in_order
-from netspec.exact.losses import Infogain, Logarithm, SigmoidCrossEntropy, softmax
+from netspec.exact.losses import Infogain, Logarithm, SigmoidCrossEntropy, bound_softmax, softmax
 from netspec.exact.sums import RowMagnitudes, RowSquares
 from netspec.files.limits import read_bytes
 from netspec.layers.base import Shape, rounded
@@ -123,23 +124,24 @@ class SoftmaxWithLoss(SoftmaxLoss):
     @override
     def prepare_training(self, learning: Learning) -> Kernels:
         """Return the kernels, where every label counts."""
-        if self.ignore_label is not None:
+        if self.ignore_label is not None or math.prod(self.bottom_shapes[0]) == 0:
             return recorded(self.run, learning)
         shape, tops, room = self.bottom_shapes[0], self.num_tops, Room()
         split, flat = (self.outer, self.classes, self.inner), (self.outer, 1, self.inner)
         divisor = normalizer(self.normalization, self.outer, self.inner, None)
         exact = self.is_exact(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM)
         minus_one = torch.tensor(-1.0).expand(flat)
+        normalize = bound_softmax(split) if exact else partial(F.softmax, dim=1)
         p = label = torch.empty(0)
 
         def forward(scores: torch.Tensor, labels: torch.Tensor) -> Any:
             nonlocal p, label
             label = labels.reshape(flat).long()
             self.valid(label, None)
-            x = scores.reshape(split)
-            p = softmax(x) if exact else F.softmax(x, 1)
+            p = normalize(scores.reshape(split))
             chosen = p.gather(1, label).clamp_(min=FLT_MIN)
-            loss = total(-(libm.log(chosen) if exact else chosen.log()), exact) / divisor
+            losses = -(libm.log(chosen) if exact else chosen.log())
+            loss = (sum_in_order(losses.flatten()) if exact else losses.sum()) / divisor
             return (loss, p.reshape(shape))[:tops]
 
         def backward(diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
