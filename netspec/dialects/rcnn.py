@@ -308,6 +308,7 @@ class Proposal(Layer):
     Fork: PVANet's and Intel's caffe, src/caffe/layers/proposal_layer.cpp
     """
 
+    promises = False  # it may find fewer
     bottoms = (3, 3)
     tops = (1, 2)
     label_bottoms = frozenset({0, 1, 2})

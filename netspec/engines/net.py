@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from netspec.data.blobs import Shape
 from netspec.engines.choice import TORCH, Choice
 from netspec.engines.export import write_model
 from netspec.engines.model import Model, Origin
@@ -22,6 +23,7 @@ from netspec.layers.learned import Stamp, is_lent, stamp
 from netspec.net import build
 from netspec.net.net import Array, Net
 from netspec.proto.schema import PHASE_NAMES, TEST
+from netspec.run.shapes import fitted
 
 
 def load_net(
@@ -98,6 +100,7 @@ class EngineNet(torch.nn.Module):
         self._as_loaded = self._exported = self._stamps()
         self._readers = [i for i, layer in enumerate(net.layers) if layer.reads_data]
         self._unable, self._told = False, False
+        self._fits: tuple[dict[str, Shape], dict[str, Shape]] = {}, {}  # of the inputs at the last pass, of all blobs
 
     def __getattr__(self, name: str) -> Any:
         """Return what the torch net has."""
@@ -157,7 +160,11 @@ class EngineNet(torch.nn.Module):
         model = self._current(tuple(wanted))
         given = {name: _array(value) for name, value in inputs.items()}
         given.update(self._read())
+        shapes = self._shapes({name: value.shape for name, value in given.items()})
         found = {**given, **model.run(given)}
+        for name, value in found.items():
+            if shapes.get(name, value.shape) != value.shape:
+                raise Unable(f"{name} has shape {value.shape} there, expected {shapes[name]}")
         values = {name: torch.from_numpy(found[name]) for name in wanted}
         loss = torch.zeros(())
         for name, weight in losses.items():
@@ -173,6 +180,16 @@ class EngineNet(torch.nn.Module):
             for blob, top in zip(layer.param.top, self.net.run_layer(i, {}, {}), strict=False):
                 read[blob] = _array(top)
         return read
+
+    def _shapes(self, given: Mapping[str, Shape]) -> dict[str, Shape]:
+        """Return the shapes of the blobs for inputs of these. Raises SpecError where a layer cannot take them."""
+        if given != self._fits[0]:
+            plan, layers = self.net.plan, list(self.net.layers)
+            ends = [node for node, layer in zip(plan.nodes, layers, strict=True) if layer.is_input or layer.reads_data]
+            values = {v: tuple(given[plan.blobs[v]]) for node in ends for v in node.tops}
+            _, shapes = fitted(plan, layers, values)
+            self._fits = dict(given), {plan.blobs[v]: shape for v, shape in shapes.items()}
+        return self._fits[1]
 
     def _kept(self) -> list[str]:
         if self.net.keep == "all":

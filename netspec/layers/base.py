@@ -187,6 +187,7 @@ class Layer(torch.nn.Module):
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
     reads_data: ClassVar[bool] = False  # its tops are records; exported nets take them as inputs
     counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
+    promises: ClassVar[bool] = True  # its tops have the shapes that ``reshape`` returned, but for ``counted_axis``
     fresh: ClassVar[bool] = False  # its one top is memory of its own, not a bottom's
     any_layout: ClassVar[bool] = False  # its kernel takes bottoms whose channels lie side by side (channels_last)
     remembers: ClassVar[bool] = False  # a pass changes more than its tops: it cannot be prepared
@@ -209,7 +210,8 @@ class Layer(torch.nn.Module):
         self.context.created()
         self.refuse(self._wrong_counts())
         self.setup()
-        self.top_shapes: list[Shape] = [self.possible(s) for s in self.reshape(self.bottom_shapes)]
+        self.top_shapes: list[Shape] = self._reshaped(self.bottom_shapes)
+        self._kept_promise = False  # whether a pass at the present shapes gave tops of ``top_shapes``
 
     @override
     def __setattr__(self, name: str, value: Any) -> None:
@@ -246,11 +248,11 @@ class Layer(torch.nn.Module):
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shapes of the tops for bottoms of these shapes; may keep geometry on ``self``."""
-        raise NotImplementedError
+        raise self.error(f"class {type(self).__name__} does not define reshape(bottom_shapes); write it", "type")
 
     @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
-        raise NotImplementedError
+        raise self.error(f"class {type(self).__name__} does not define forward(*bottoms); write it", "type")
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         """Return the bottom's gradient as Caffe computes it, step by step, from the data in memory at backward.
@@ -393,7 +395,23 @@ class Layer(torch.nn.Module):
                 there = f"this machine has {amount(memory())}"
                 raise self.error(f"its pass needs more memory than there is; {there}") from None
             raise
-        return tops if isinstance(tops, tuple) else (tops,)
+        tops = tops if isinstance(tops, tuple) else (tops,)
+        if not self._kept_promise:
+            self.check_promise(tops)
+            self._kept_promise = True
+        return tops
+
+    def check_promise(self, tops: Sequence[torch.Tensor]) -> None:
+        """Raise SpecError where a pass returned tops of other shapes than ``reshape`` did."""
+        found = [tuple(top.shape) if isinstance(top, torch.Tensor) else None for top in tops]
+        if self.promises and list(map(self._counted, found)) != list(map(self._counted, self.top_shapes)):
+            one, other = (" and ".join(map(str, shapes)) or "no top" for shapes in (found, self.top_shapes))
+            raise self.error(f"forward returned a top of shape {one}, but reshape promised {other}", "type")
+
+    def _counted(self, shape: Shape | None) -> Shape | None:
+        """Return a shape without the size that only a pass finds out."""
+        axis = self.counted_axis
+        return shape if shape is None or axis is None else (*shape[:axis], *shape[axis + 1 :])
 
     def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
         """Run this layer and, where one kernel does their work too, some of those that follow.
@@ -406,7 +424,7 @@ class Layer(torch.nn.Module):
     def fit(self, bottom_shapes: list[Shape]) -> None:
         """Reshape for bottoms of these shapes, if they are others than before."""
         if bottom_shapes != self.bottom_shapes:
-            self.bottom_shapes = bottom_shapes
+            self.bottom_shapes, self._kept_promise = bottom_shapes, False
             try:
                 self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
             except SpecError:
@@ -449,6 +467,15 @@ class Layer(torch.nn.Module):
         if math.prod(shape) > MOST:
             raise self.error(f"found shape {tuple(shape)}, {math.prod(shape):,} numbers, expected at most {MOST:,}")
         return tuple(shape)
+
+    def _reshaped(self, bottom_shapes: list[Shape]) -> list[Shape]:
+        """Return what ``reshape`` says, if that is one possible shape for each top."""
+        shapes: Any = self.reshape(bottom_shapes)
+        if not isinstance(shapes, Sequence) or not all(isinstance(shape, Sequence) for shape in shapes):
+            raise self.error(f"reshape returned {shapes!r}, expected one shape for each top, such as [(2, 3)]", "type")
+        if len(shapes) != self.num_tops:
+            raise self.error(f"reshape returned {len(shapes)} shape(s), expected {self.num_tops}, one for each top")
+        return [self.possible(shape) for shape in shapes]
 
     def refuse(self, faults: Iterable[SpecError]) -> None:
         """Report all of these errors; if there are any, the layer is not built."""

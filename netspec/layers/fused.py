@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -85,7 +86,8 @@ def spread_by_channel(
     """
     (count, channels, *size), (down, across) = shape, sliding.stride
     framed = (count, channels, (size[0] - 1) * down + 1, (size[1] - 1) * across + 1)
-    frame = values_of(weight).new_zeros(framed).contiguous(memory_format=torch.channels_last)
+    zeros = partial(values_of(weight).new_zeros, framed)
+    frame = how.memo(f"frame {framed}", lambda: zeros().contiguous(memory_format=torch.channels_last))
     pixels = frame[:, :, ::down, ::across]
     axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
     turned = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -62,6 +63,8 @@ class Net(torch.nn.Module):
     blobs kept by the last pass: the outputs, with ``keep = "all"`` every blob, or with a list also the listed ones.
     ``params`` maps layer names to lists of tensors in Caffe's blob order; shared parameters are one object.
     ``layers[i]`` belongs to ``param.layer[i]``, splits included. Gradients are computed by torch.
+
+    Threads may share a net: one waits for the pass of another, and ``blobs`` has what its own last pass kept.
     """
 
     def __init__(self, plan: Plan, options: BuildOptions | None = None) -> None:
@@ -75,7 +78,7 @@ class Net(torch.nn.Module):
         self.exact = options.exact
         self.keep: str | Iterable[str] = ()
         self._kept_of: dict[str | tuple[str, ...], frozenset[int]] = {}  # by ``keep``, as it was last
-        self.blobs: dict[str, torch.Tensor] = {}
+        self._passing = _Passing()
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
         self.learnable: list[Learnable] = []
@@ -106,7 +109,7 @@ class Net(torch.nn.Module):
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what was prepared from it."""
         prepared = self.programs and Programs(self, self.programs.passes)
-        return {**super().__getstate__(), "programs": prepared, "_segments": {}}
+        return {**super().__getstate__(), "programs": prepared, "_segments": {}, "_passing": _Passing()}
 
     # Building
 
@@ -280,11 +283,20 @@ class Net(torch.nn.Module):
     @override
     def forward(self, **inputs: Array) -> dict[str, torch.Tensor]:
         """Run the net and return its output blobs; ``inputs`` are the values of the blobs in ``self.inputs``."""
-        return self._run(inputs)[1]
+        return self.forward_loss(**inputs)[1]
 
     def forward_loss(self, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
-        return self._run(inputs)
+        with self._passing.lock:
+            return self._run(inputs)
+
+    @property
+    def blobs(self) -> dict[str, torch.Tensor]:
+        """The blobs kept by the last pass of this thread, or of any where it made none; see ``keep``."""
+        return getattr(self._passing.own, "blobs", self._passing.last)
+
+    def _keep_blobs(self, blobs: dict[str, torch.Tensor]) -> None:
+        self._passing.own.blobs = self._passing.last = blobs
 
     def _run(self, inputs: Mapping[str, Array]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         unknown = sorted(set(inputs) - set(self.inputs))
@@ -325,7 +337,7 @@ class Net(torch.nn.Module):
                 if v not in kept:
                     values.pop(v, None)
         tops = ()
-        self.blobs = {self.plan.blobs[v]: values[v] for v in sorted(kept)}
+        self._keep_blobs({self.plan.blobs[v]: values[v] for v in sorted(kept)})
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
@@ -351,7 +363,7 @@ class Net(torch.nn.Module):
         given = {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
         loss, values = programs.run(given, kept)
         blobs = self.plan.blobs
-        self.__dict__["blobs"] = {blobs[v]: values[v] for v in sorted(kept)}  # a module's own way of setting is slow
+        self._keep_blobs({blobs[v]: values[v] for v in sorted(kept)})
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
@@ -466,6 +478,18 @@ class Net(torch.nn.Module):
         """Close files and stop threads."""
         for layer in self.layers:
             layer.close()
+
+
+class _Passing:
+    """Which thread runs a net, and what the last pass of each kept. A copy of a net has its own."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.own = threading.local()
+        self.last: dict[str, torch.Tensor] = {}
+
+    def __reduce__(self) -> Any:
+        return _Passing, ()
 
 
 class _Tie:

@@ -9,6 +9,7 @@ have stayed the same for a run.
 from __future__ import annotations
 
 import copy
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
@@ -20,14 +21,17 @@ import torch
 from netspec.exact import ALL
 from netspec.exact.blas import one_thread
 from netspec.graph.steps import PACK, Schedule, Step, schedule
-from netspec.layers.base import Kernel, Layer, Preparation, Shape
+from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape
 from netspec.layers.learned import Stamp, is_lent, stamp
 from netspec.net.fold import absorbed_by, roles_of
+from netspec.run.memory import give_back_freed_memory
+from netspec.run.shapes import fitted
 
 if TYPE_CHECKING:
     from netspec.net.net import Net
 
 PROGRAMS = 64  # kept for a net: pyramids of images need one for each size
+RUNS = 4  # times what one run needs: so much may programs keep together, in bytes
 Values = dict[int, torch.Tensor]
 Given = tuple[int, Shape, torch.dtype]
 
@@ -42,6 +46,8 @@ class Program:
     one_thread: bool
     frozen: list[tuple[dict[str, Any], str, torch.Tensor, Stamp]]
     waiting: list[tuple[torch.Tensor, Stamp]]
+    memos: set[Any]  # the keys of what it keeps in memory beside the blobs
+    need: int  # bytes of the values that are alive at one time, at most
 
     def is_current(self) -> bool:
         """Return whether no learned blob was written to or replaced, and none that was has come to rest."""
@@ -63,7 +69,7 @@ class Programs:
         self.passes = frozenset(passes)
         self._sources = [i for i, node in enumerate(net.plan.nodes) if not node.bottoms and not net.layers[i].is_input]
         self.made: OrderedDict[Any, Program] = OrderedDict()
-        self._memos: dict[Any, tuple[tuple[Stamp, ...], Any]] = {}
+        self.memos: dict[Any, tuple[tuple[Stamp, ...], Any]] = {}  # what layers keep, by what they need it for
         self._seen: dict[int, Stamp] = {}
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> tuple[torch.Tensor | None, Values]:
@@ -108,21 +114,39 @@ class Programs:
         key = (given, kept)
         program = self.made.get(key)
         if program is None or not program.is_current():
+            give_back_freed_memory()
             with torch.inference_mode(False), torch.no_grad():
                 program = self.made[key] = self._make(given, kept)
+            self.made.move_to_end(key)
+            self._trim()
         self.made.move_to_end(key)
-        if len(self.made) > PROGRAMS:
-            self.made.popitem(last=False)
         return program
+
+    def _trim(self) -> None:
+        """Give up the programs that were not used for longest, until the rest keeps no more than it may."""
+        learned = sum(blob.nbytes for layer in self.net.layers for blob in layer.blobs)
+        most = RUNS * (learned + max(program.need for program in self.made.values()))
+        while True:
+            used = set[Any]().union(*(program.memos for program in self.made.values()))
+            self.memos = {key: memo for key, memo in self.memos.items() if key in used}
+            if len(self.made) == 1 or (len(self.made) <= PROGRAMS and self.kept_bytes() <= most):
+                return
+            self.made.popitem(last=False)
+
+    def kept_bytes(self) -> int:
+        """Return the bytes that programs keep beside the learned blobs."""
+        values = [value for _, value in self.memos.values()]
+        tensors = [blob for value in values for blob in (value.blobs if isinstance(value, Absorbed) else (value,))]
+        return sum({id(tensor): tensor.nbytes for tensor in tensors}.values())
 
     def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
         net, plan = self.net, self.net.plan
-        fitted = self._fitted(given)
-        layers = [found or layer for found, layer in zip(fitted, net.layers, strict=True)]
+        found, shapes = fitted(plan, list(net.layers), {v: tuple(shape) for v, shape, _ in given})
+        layers = [fit or layer for fit, layer in zip(found, net.layers, strict=True)]
         changing = self._changing()
         probe = torch.empty(1, dtype=next((dtype for *_, dtype in given), torch.float32), device=net.device)
-        exact = [found is not None and found.is_exact(probe, found.small) for found in fitted]
-        as_is = [found is None or bool(changing & _ids(found)) for found in fitted]
+        exact = [fit is not None and fit.is_exact(probe, fit.small) for fit in found]
+        as_is = [fit is None or bool(changing & _ids(fit)) for fit in found]
         roles = roles_of(plan, layers)
         foldable = [not (e or a) for e, a in zip(exact, as_is, strict=True)]
         order = schedule(
@@ -133,15 +157,15 @@ class Programs:
                 affine=_both(roles.affine, foldable),
                 absorbs_before=_both(roles.absorbs_before, foldable),
             ),
-            finishes=[found is not None and found.finishing() is not None for found in fitted],
-            fresh=[found is not None and found.fresh for found in fitted],
+            finishes=[fit is not None and fit.finishing() is not None for fit in found],
+            fresh=[fit is not None and fit.fresh for fit in found],
             given=[v for v, *_ in given],
             kept=kept | {v for i, node in enumerate(plan.nodes) if any(net.loss_weights[i]) for v in node.tops},
             passes=self.passes,
         )
-        line, kinds = [], []
+        line, kinds, memos = [], [], set[Any]()
         for step in order.steps:
-            kernel, kind = self._kernel(step, layers, fitted[step.node] is None, as_is[step.node])
+            kernel, kind = self._kernel(step, layers, found[step.node] is None, as_is[step.node], memos)
             kinds.append("exact" if exact[step.node] else kind)
             losses = [(j, weight) for j, weight in enumerate(net.loss_weights[step.node]) if weight]
             single = step.bottoms[0] if len(step.bottoms) == 1 else -1
@@ -156,11 +180,19 @@ class Programs:
             any(exact),
             [(owner, name, blob, stamp(blob)) for owner, name, blob in blobs if id(blob) not in changing],
             [(blob, stamp(blob)) for _, _, blob in blobs if id(blob) in changing],
+            memos,
+            _most_alive(order.steps, shapes),
         )
 
-    def _kernel(self, step: Step, layers: Sequence[Layer], unknown: bool, as_is: bool) -> tuple[Kernel, str]:
-        """Return what runs a step, and in which way: "by value", "as is", "packed" or "prepared"."""
+    def _kernel(
+        self, step: Step, layers: Sequence[Layer], unknown: bool, as_is: bool, memos: set[Any]
+    ) -> tuple[Kernel, str]:
+        """Return what runs a step, and in which way: "by value", "as is", "packed" or "prepared".
+
+        The keys of the memos that it uses are added to ``memos``.
+        """
         layer = layers[step.node]
+        promised = layers[step.chain.last if step.chain else step.node]
         if unknown:
             layer = layer if layer.remembers else copy.copy(layer)
             return lambda *bottoms: layer.run(*(bottom.contiguous() for bottom in bottoms)), "by value"
@@ -172,9 +204,10 @@ class Programs:
             uses.append(name)
             stamps = tuple(stamp(blob) for blob in blobs)
             key = (name, step.node if step.chain else -1, *map(id, blobs))  # layers that share blobs share this too
-            if self._memos.get(key, (None,))[0] != stamps:
-                self._memos[key] = stamps, make()
-            return self._memos[key][1]
+            memos.add(key)
+            if self.memos.get(key, (None,))[0] != stamps:
+                self.memos[key] = stamps, make()
+            return self.memos[key][1]
 
         if step.chain:
             chain = step.chain
@@ -185,26 +218,9 @@ class Programs:
         if not layer.any_layout or self.net.exact == ALL:
             inner = kernel
             kernel = lambda *bottoms: inner(*(bottom.contiguous() for bottom in bottoms))  # noqa: E731
+        if type(layer).prepare is Layer.prepare or as_is:
+            kernel = _checked(kernel, promised)
         return kernel, "as is" if as_is else "packed" if len(uses) > bool(step.chain) else "prepared"
-
-    def _fitted(self, given: tuple[Given, ...]) -> list[Layer | None]:
-        """Return copies of the layers, fitted to these shapes; None where the shapes follow only from values.
-
-        Layers that remember something are no copies, and what follows on them is not prepared either.
-        """
-        shapes: dict[int, Shape] = {v: tuple(shape) for v, shape, _ in given}
-        found: list[Layer | None] = []
-        for node, layer in zip(self.net.plan.nodes, self.net.layers, strict=True):
-            known = bool(node.bottoms) and all(v in shapes for v in node.bottoms)
-            if known and not layer.remembers:
-                layer = copy.copy(layer)
-                layer.fit([shapes[v] for v in node.bottoms])
-                if layer.counted_axis is None:
-                    shapes.update(zip(node.tops, layer.top_shapes, strict=False))
-                found.append(layer)
-            else:
-                found.append(None)
-        return found
 
     def _changing(self) -> set[int]:
         """Return which learned blobs somebody may be writing to: those that changed, and those that are lent."""
@@ -216,6 +232,32 @@ class Programs:
                     found.add(id(blob))
                 self._seen[id(blob)] = now
         return found
+
+
+def _checked(kernel: Kernel, layer: Layer) -> Kernel:
+    """Return a kernel whose first pass checks the shapes that the layer promised."""
+
+    def checked(*bottoms: torch.Tensor) -> Any:
+        nonlocal unchecked
+        tops = kernel(*bottoms)
+        if unchecked:
+            layer.check_promise(tops if isinstance(tops, tuple) else (tops,))
+            unchecked = False
+        return tops
+
+    unchecked = True
+    return checked
+
+
+def _most_alive(steps: Sequence[Step], shapes: Mapping[int, Shape]) -> int:
+    """Return the bytes of the values that are alive at one time, as far as their shapes are known."""
+    alive, most = dict[int, int](), 0
+    for step in steps:
+        alive.update((v, 4 * math.prod(shapes[v])) for v in (*step.bottoms, *step.tops) if v in shapes)
+        most = max(most, sum(alive.values()))
+        for v in step.ends:
+            alive.pop(v, None)
+    return most
 
 
 def _ids(layer: Layer) -> set[int]:

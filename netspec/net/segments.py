@@ -13,7 +13,8 @@ import os
 import shutil
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import count
 from types import FunctionType, MethodType
 from typing import TYPE_CHECKING, Any
@@ -48,7 +49,6 @@ def missing_tool(device: torch.device) -> str:
 
 def find_segments(net: Net, apart: Sequence[bool]) -> dict[int, Segment]:
     """Return the segments of a net by the number of their first layer; layers that are ``apart`` belong to none."""
-    torch._logging.set_logs(all=logging.ERROR)
     found: dict[int, Segment] = {}
     row: list[int] = []
     for i in range(len(net.layers) + 1):
@@ -118,7 +118,7 @@ class Segment:
         code = _run.__code__.replace(co_name=f"segment_{next(_numbers)}")
         own: Any = MethodType(FunctionType(code, globals()), self)
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), _quiet():
                 warnings.simplefilter("ignore")
                 compiled: Any = torch.compile(own, fullgraph=True, dynamic=False)
                 tops = compiled(*bottoms)
@@ -130,6 +130,20 @@ class Segment:
             raise SpecError(message, first.context.at()) from fault
         self.compiled = compiled
         return tops
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Let torch's compilers log errors only within the block."""
+    loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.partition(".")[0] == "torch"]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _run(segment: Segment, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:

@@ -135,9 +135,10 @@ class Net:
         first = 0 if start is None else self._index(start)
         last = len(self.layers) - 1 if end is None else self._index(end)
         wanted = [*(self.outputs if end is None else self.top_names[end]), *(blobs or ())]
-        self._fill(inputs, self.inputs, "data", "Input blob arguments do not match net inputs.")
-        self._forward(first, last)
-        return {name: self.blobs[name].data for name in dict.fromkeys(wanted)}
+        with self.passes.used():
+            self._fill(inputs, self.inputs, "data", "Input blob arguments do not match net inputs.")
+            self._forward(first, last)
+            return {name: self.blobs[name].data for name in dict.fromkeys(wanted)}
 
     def backward(self, diffs: Sequence[str] | None = None, start: Any = None, end: Any = None, **tops: Any) -> Arrays:
         """Run the layers' backward passes from ``start`` down to ``end`` (names, both included; default all).
@@ -148,16 +149,18 @@ class Net:
         first = len(self.layers) - 1 if start is None else self._index(start)
         last = 0 if end is None else self._index(end)
         wanted = [*(self.inputs if end is None else self.bottom_names[end]), *(diffs or ())]
-        self._fill(tops, self.outputs, "diff", "Top diff arguments do not match net outputs.")
-        self._backward(first, last)
-        return {name: self.blobs[name].diff for name in dict.fromkeys(wanted)}
+        with self.passes.used(forward=False):
+            self._fill(tops, self.outputs, "diff", "Top diff arguments do not match net outputs.")
+            self._backward(first, last)
+            return {name: self.blobs[name].diff for name in dict.fromkeys(wanted)}
 
     def _forward(self, start: int, end: int) -> float:
-        with caffes_errors():
+        with self.passes.used(), caffes_errors():
             return self.passes.forward(start, end).item()
 
     def _backward(self, start: int, end: int) -> None:
-        self.passes.backward(start, end)
+        with self.passes.used(forward=False):
+            self.passes.backward(start, end)
 
     def _index(self, layer: str) -> int:
         if layer not in self.layer_dict:

@@ -9,7 +9,10 @@ Caffe: Net::ForwardFromTo, Net::BackwardFromTo, Net::Reshape (src/caffe/net.cpp)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -50,6 +53,9 @@ class Passes:
         self.hooks: dict[str, list[Hook]] = {
             f"{when}_{which}": [] for when in ("before", "after") for which in ("forward", "backward")
         }
+        self._lock = threading.RLock()
+        self._last: threading.Thread | None = None  # the one that ran a forward pass last
+        self._overtaken = weakref.WeakSet[threading.Thread]()  # those that did before
         self._layers: list[Layer] = list(net.layers)
         self.params = [_parameters(layer) for layer in self._layers]
         self._tapes: list[_Tape | None] = [None] * len(self._layers)
@@ -129,6 +135,36 @@ class Passes:
         return plan.layers[i] and wanted and not from_memory
 
     # Running
+
+    @contextmanager
+    def used(self, forward: bool = True) -> Iterator[None]:
+        """Let one thread at a time use the net within the block, to run forward or backward.
+
+        What a thread looks at then stays as it is when another runs the net. Raises RuntimeError for a backward pass
+        through what another thread's forward pass has left.
+        """
+        with self._lock:
+            thread = threading.current_thread()
+            if self._last is not None and thread is not self._last:
+                if not forward and thread in self._overtaken:
+                    advice = "give each thread a net of its own (share_with), or a lock around both passes"
+                    raise RuntimeError(f"backward: another thread has run this net since; {advice}")
+                self._leave_views()
+            if forward:
+                if self._last is not None:
+                    self._overtaken.add(self._last)
+                self._overtaken.discard(thread)
+                self._last = thread
+            yield
+
+    def _leave_views(self) -> None:
+        """Leave what passes compute to those who look at it; they go on in other memory."""
+        written = {id(self.blobs[b].data_memory) for _, b in self._given}
+        written |= {id(self.blobs[self.names.index(name)].diff_memory) for name in self.net.outputs}
+        memories = {id(each): each for blob in self.blobs for each in (blob.data_memory, blob.diff_memory)}
+        fresh = {key: memory for key, memory in memories.items() if key not in written}
+        for memory in fresh.values():
+            memory.leave_views()
 
     @torch.no_grad()
     def forward(self, start: int, end: int) -> torch.Tensor:

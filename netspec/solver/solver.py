@@ -257,6 +257,10 @@ class Solver:
         self._blocks = Blocks(self.net.learnable, self._rule.sets)
         self.history = self._blocks.history
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse to be copied or pickled. Raises TypeError."""
+        raise TypeError("a Solver cannot be copied or pickled: take a snapshot(), and load_solver(snapshot=...) it")
+
     def _build(self, described: nets.SolverNet, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> Net:
         """Build a net and load the weights to start from.
 

@@ -47,6 +47,12 @@ class ReadingLayer(Layer):
     reads_data = True
     group: ClassVar[str]  # the field with the layer's own settings
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Refuse to be copied or pickled with open files. Raises TypeError."""
+        if self._source is not None:
+            raise TypeError(f"{self.error('reads open files: it cannot be copied or pickled; build its net again')}")
+        return dict(self.__dict__)
+
     def open(self) -> Source | None:
         """Open the files; None where :meth:`attempt` met a fault."""
         raise NotImplementedError

@@ -90,6 +90,11 @@ class Memory:
             if self._seen() is None:
                 self._flat = None
 
+    def leave_views(self) -> None:
+        """Go on in other memory, with the same content, where somebody holds views: they change no more."""
+        if self.is_watched() and self._flat is not None:
+            self._flat, self._seen = self._flat.clone(), _nobody
+
     def is_watched(self) -> bool:
         """Return whether somebody holds a view that is to show what layers compute."""
         return self.device.type == "cpu" and self._seen() is not None

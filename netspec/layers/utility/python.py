@@ -54,6 +54,7 @@ class Python(Layer):
     not_exported = "it runs Python code of its own"
     bottoms = (0, None)
     tops = (0, None)
+    promises = False  # as in Caffe, the code may reshape its tops in forward
 
     @override
     def setup(self) -> None:

@@ -376,3 +376,14 @@ def test_signals_are_handled_after_nets_of_openvino_are_gone(precision: str) -> 
     pytest.importorskip("openvino")
     done = subprocess.run([sys.executable, "-c", FIRST_GOES_FIRST, precision], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.usefixtures("files")
+def test_a_size_that_the_net_does_not_take_is_refused_by_all(engine: str) -> None:
+    odd = np.zeros((2, 3, 19, 12), np.float32)
+    faults = []
+    for net in (load("torch"), load(engine)):
+        with pytest.raises(SpecError, match=r'layer "feat" .*: bottom of shape') as found:
+            net(data=odd)
+        faults.append(str(found.value))
+    assert faults[0] == faults[1]

@@ -1,8 +1,11 @@
 """Runs without gradients: prepared, folded and fused, they give what a layer-by-layer run gives, whoever writes."""
 
 import copy
+import subprocess
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -233,6 +236,50 @@ def test_programs_of_a_net_are_bounded(net_of: Callable[..., Net], monkeypatch: 
         assert_same(quickly(net, data=images(1, 8, size, size)), slowly(net, data=images(1, 8, size, size)))
     assert net.programs is not None
     assert len(net.programs.made) == 2
+
+
+@pytest.mark.parametrize(("runs", "fewest", "most"), [(programs.RUNS, 2, 16), (0, 1, 1)])
+def test_what_programs_keep_is_bounded_by_what_runs_need(
+    runs: int, fewest: int, most: int, net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs, "RUNS", runs)
+    net = trained(net_of(BLOCK + SHARED))
+    assert net.programs is not None
+    learned = sum(item.parameter.nbytes for item in net.learnable)
+    for size in range(8, 24):
+        quickly(net, data=images(1, 8, size, 9))
+        made = net.programs.made.values()
+        limit = runs * (learned + max(program.need for program in made))
+        assert len(made) == 1 or net.programs.kept_bytes() <= limit
+        assert set().union(*(program.memos for program in made)) == set(net.programs.memos)
+    assert fewest <= len(net.programs.made) <= most
+    assert_same(quickly(net, data=images(1, 8, 8, 9)), slowly(net, data=images(1, 8, 8, 9)))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_runs_of_many_sizes_take_little_more_memory_than_one(tmp_path: Path) -> None:
+    """Six small convolutions, 70 batch sizes: the process grows by a few runs of the largest."""
+    text = 'layer { name: "c0" type: "Input" top: "c0" input_param { shape { dim: 1 dim: 32 dim: 64 dim: 64 } } }'
+    for k in range(6):
+        text += f"""layer {{ name: "c{k + 1}" type: "Convolution" bottom: "c{k}" top: "c{k + 1}"
+            convolution_param {{ num_output: 32 kernel_size: 3 pad: 1 weight_filler {{ type: "xavier" }} }} }}"""
+    path = tmp_path / "net.prototxt"
+    path.write_text(text)
+    program = f"""if True:
+        import os, torch, netspec
+        from pathlib import Path
+        torch.set_num_threads(1)
+        net = netspec.load_net({str(path)!r}, seed=0)
+        grown = []
+        for size in range(1, 71):
+            with torch.no_grad():
+                net(c0=torch.ones(size, 32, 64, 64))
+            grown.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
+        print(max(grown) - grown[0])"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=True)
+    one_run = 3 * 4 * 70 * 32 * 64 * 64  # bytes: the input, a bottom and a top
+    assert int(told.stdout) < 3 * one_run
 
 
 def test_nets_that_train_are_not_prepared(net_of: Callable[..., Net]) -> None:

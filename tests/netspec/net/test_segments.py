@@ -1,6 +1,7 @@
 """Layers that torch.compile makes one function of: the same numbers, and what runs layer by layer all the same."""
 
 import gc
+import logging
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -101,6 +102,13 @@ def test_poolings_treat_nan_and_the_rim_as_caffe_does(backend: str, net_of: Call
         assert segments(net) == ["x_in_0_split-max!"] * compiled
     for mine, theirs in zip(*found, strict=True):
         torch.testing.assert_close(mine, theirs, equal_nan=True)
+
+
+def test_torchs_logs_are_as_they_were(net_of: Callable[..., Net]) -> None:
+    names = ("torch._dynamo", "torch._inductor", "torch")
+    before = [logging.getLogger(name).level for name in names]
+    net_of(NET, phase=TRAIN, compiled=True).forward_loss(x=random(4, 3, 11, 11))
+    assert [logging.getLogger(name).level for name in names] == before
 
 
 @pytest.mark.usefixtures("traced_only")

@@ -1,0 +1,33 @@
+"""Which shapes the values of a net have for inputs of other shapes: each layer says so, or refuses."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+
+from netspec.data.blobs import Shape
+from netspec.graph.plan import Plan
+from netspec.layers.base import Layer
+
+
+def fitted(
+    plan: Plan, layers: Sequence[Layer], given: Mapping[int, Shape]
+) -> tuple[list[Layer | None], dict[int, Shape]]:
+    """Return copies of the layers, fitted to values of the shapes ``given``, and the shapes of all values.
+
+    None and no shape is there where shapes follow only from values. Layers that remember something are no copies, and
+    what follows on them is not fitted either. Raises SpecError where a layer cannot take its bottoms.
+    """
+    shapes = dict(given)
+    found: list[Layer | None] = []
+    for node, layer in zip(plan.nodes, layers, strict=True):
+        known = bool(node.bottoms) and all(v in shapes for v in node.bottoms)
+        if known and not layer.remembers:
+            layer = copy.copy(layer)
+            layer.fit([shapes[v] for v in node.bottoms])
+            if layer.counted_axis is None and layer.promises:
+                shapes.update(zip(node.tops, layer.top_shapes, strict=False))
+            found.append(layer)
+        else:
+            found.append(None)
+    return found, shapes

@@ -1,0 +1,59 @@
+"""The loop that runs a net: step by step, each a function of values that others made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import torch
+
+from netspec.exact.sums import RowSums
+from netspec.exact.switch import applies
+
+Values = dict[int, torch.Tensor]  # by value number of a Plan
+
+
+class Step(NamedTuple):
+    """One piece of a run: ``run`` takes the values ``bottoms`` and returns the values ``tops``, one or a tuple.
+
+    ``losses`` are the tops, by their place, that the net's loss sums up, with their weights; after the step the values
+    ``ends`` are not needed any more.
+    """
+
+    run: Callable[..., Any]
+    bottoms: tuple[int, ...]
+    tops: tuple[int, ...]
+    losses: tuple[tuple[int, float], ...] = ()
+    ends: tuple[int, ...] = ()
+
+
+Visit = Callable[[Step, list[torch.Tensor]], Any]  # runs a step on its bottoms; returns what it returns
+
+
+def walk(steps: Iterable[Step], values: Values, exact: str, visit: Visit | None = None) -> torch.Tensor | None:
+    """Run the steps in their order, on ``values`` and into them; return the weighted sum of the losses, if any.
+
+    ``exact`` says which sums are Caffe's to the last bit (netspec/exact). ``visit`` is called in the place of each
+    step's own ``run``.
+    """
+    loss: torch.Tensor | None = None
+    for step in steps:
+        run, bottoms, tops, losses, ends = step
+        given = [values[v] for v in bottoms]
+        made = run(*given) if visit is None else visit(step, given)
+        if not isinstance(made, tuple):
+            made = (made,)
+        values.update(zip(tops, made, strict=False))
+        for j, weight in losses:
+            term = weighted_sum(made[j], weight, exact)
+            loss = term if loss is None else loss + term
+        for v in ends:
+            values.pop(v, None)
+    return loss
+
+
+def weighted_sum(top: torch.Tensor, weight: float, exact: str) -> torch.Tensor:
+    """Return what a top contributes to the net's loss (Caffe: Layer::Forward)."""
+    if top.numel() > 1 and applies(exact, top):
+        return RowSums.apply(top.reshape(1, -1), weight)[0]
+    return top.sum() if weight == 1 else top.sum() * weight

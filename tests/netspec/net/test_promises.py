@@ -1,0 +1,101 @@
+"""A layer's first pass checks what its ``reshape`` promised; what is missing is one line."""
+
+from collections.abc import Callable, Sequence
+
+import pytest
+import torch
+from typing_extensions import override
+
+from netspec.errors import SpecError
+from netspec.layers import registry
+from netspec.layers.base import Layer, Shape
+from netspec.net.net import Net
+
+TEXT = """
+layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 } } }
+layer { name: "odd" type: "Odd" bottom: "data" top: "odd" }
+"""
+
+
+class Odd(Layer):
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes
+
+    @override
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return data[:1]
+
+
+class Whole(Odd):
+    @override
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return 2 * data
+
+
+class Shapeless(Layer):
+    @override
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return data
+
+
+class Idle(Layer):
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes
+
+
+class Flat(Odd):
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes[0]  # type: ignore[return-value]
+
+
+class Many(Odd):
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return [*bottom_shapes, (1,)]
+
+
+@pytest.fixture
+def made(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Layer]], Net]:
+    def make(cls: type[Layer]) -> Net:
+        monkeypatch.setitem(registry._LAYERS, "Odd", cls)
+        return net_of(TEXT)
+
+    return make
+
+
+@pytest.mark.parametrize("gradients", [False, True])
+def test_a_top_of_another_shape_than_promised_is_refused(made: Callable[..., Net], gradients: bool) -> None:
+    net, whole = made(Odd), made(Whole)
+    with torch.set_grad_enabled(gradients):
+        for _ in range(2):
+            with pytest.raises(SpecError) as found:
+                net(data=torch.ones(2, 3))
+        whole(data=torch.ones(2, 3))
+        whole(data=torch.ones(5, 4))
+    assert str(found.value) == (
+        'net.prototxt:3:21: layer "odd" (Odd): forward returned a top of shape (1, 3), but reshape promised (2, 3)'
+    )
+
+
+@pytest.mark.parametrize(
+    ("cls", "message"),
+    [
+        (Shapeless, "class Shapeless does not define reshape(bottom_shapes); write it"),
+        (Flat, "reshape returned (2, 3), expected one shape for each top, such as [(2, 3)]"),
+        (Many, "reshape returned 2 shape(s), expected 1, one for each top"),
+    ],
+)
+def test_a_class_that_promises_nothing_is_refused(made: Callable[..., Net], cls: type[Layer], message: str) -> None:
+    with pytest.raises(SpecError) as found:
+        made(cls)
+    assert found.value.message == message
+
+
+def test_a_class_that_computes_nothing_is_refused(made: Callable[..., Net]) -> None:
+    net = made(Idle)
+    for gradients in (False, True):
+        with torch.set_grad_enabled(gradients), pytest.raises(SpecError, match="Idle does not define forward"):
+            net(data=torch.ones(2, 3))

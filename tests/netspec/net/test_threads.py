@@ -1,0 +1,45 @@
+"""One net, several threads: each gets its own numbers."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from netspec.net.net import Net
+
+TEXT = """
+layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 dim: 12 dim: 12 } } }
+layer { name: "conv" type: "Convolution" bottom: "data" top: "conv"
+  convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "gaussian" std: 0.3 } } }
+layer { name: "relu" type: "ReLU" bottom: "conv" top: "conv" }
+layer { name: "feat" type: "InnerProduct" bottom: "conv" top: "feat"
+  inner_product_param { num_output: 5 weight_filler { type: "gaussian" std: 0.3 } } }
+"""
+COUNT = 200
+
+
+def inputs(k: int) -> np.ndarray:
+    return np.random.default_rng(k).standard_normal((1 + k % 3, 3, 12, 12), np.float32)
+
+
+def in_threads(run: Callable[[int], None]) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(run, range(COUNT)))
+
+
+@pytest.mark.parametrize("gradients", [False, True])
+def test_threads_that_share_a_net_get_their_own_numbers(net_of: Callable[..., Net], gradients: bool) -> None:
+    net = net_of(TEXT)
+    net.keep = "conv"
+    with torch.no_grad():
+        expected = [(net(data=inputs(k))["feat"], net.blobs["conv"]) for k in range(COUNT)]
+
+    def run(k: int) -> None:
+        with torch.set_grad_enabled(gradients):
+            feat = net(data=inputs(k))["feat"].detach()
+            for found, wanted in zip((feat, net.blobs["conv"].detach()), expected[k], strict=True):
+                torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-5)
+
+    in_threads(run)
