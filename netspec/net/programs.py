@@ -24,7 +24,7 @@ from netspec.graph.steps import PACK, Schedule, Step, schedule
 from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape
 from netspec.layers.learned import Stamp, is_lent, stamp
 from netspec.net.fold import absorbed_by, roles_of
-from netspec.run.memory import give_back_freed_memory
+from netspec.process.heap import give_back_freed_memory
 from netspec.run.shapes import fitted
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Memory that an iteration frees is kept for the next.
+"""Memory that an iteration frees is kept for the next, and holes that runs of ever other sizes leave are given back.
 
 The C library gives freed memory back to the system, which must clear it before the process gets it again: of a training
 on a CPU that can take a twentieth of the time.
@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 from functools import cache
+from typing import Any
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h: M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
 _LARGEST = 32 * 2**20  # bytes: the most that glibc takes from its heap, DEFAULT_MMAP_THRESHOLD_MAX
@@ -28,3 +30,18 @@ def keep_freed_memory() -> None:
     library = ctypes.CDLL(None)
     library.mallopt(_MMAP_THRESHOLD, _LARGEST)
     library.mallopt(_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def give_back_freed_memory() -> None:
+    """Give the system what lies free between blocks in use, where the C library can (glibc: malloc_trim).
+
+    Passes on inputs of ever other sizes leave ever other holes: a net of six convolutions that had seen 70 batch sizes
+    held five times the memory that it used.
+    """
+    if trim := _malloc_trim():
+        trim(0)
+
+
+@cache
+def _malloc_trim() -> Any:
+    return getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform.startswith("linux") else None
