@@ -2,11 +2,11 @@
 
 import sys
 
-from netspec.__main__ import program
+from netspec.terminal.main import program
 
 
 def main() -> int:
-    """Run one command of lmdb_build."""
+    """Run one command of lmdb-build."""
     return program("lmdb_build.cli")
 
 

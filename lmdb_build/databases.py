@@ -27,7 +27,6 @@ import cv2
 import numpy as np
 
 from lmdb_build.pairs.list_file import read_pair_list
-from loopclosure.errors import InputError
 from loopclosure.progress import Progress, silent
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum, decode_image, encoded_datum, times
@@ -65,10 +64,7 @@ class Options:
 
 def read_pairs(path: str) -> list[Entry]:
     """Return the entries of a list of pairs; see lmdb_build/pairs/list_file.py. Raises SpecError for a bad line."""
-    try:
-        pairs = read_pair_list(Path(path))
-    except InputError as fault:  # everything else here raises SpecError
-        raise SpecError(fault.message, Where(fault.file, fault.line, fault.column)) from None
+    pairs = read_pair_list(Path(path))
     return [Entry((pair.first, pair.second), pair.label, Where(path, pair.line, 1)) for pair in pairs]
 
 

@@ -1,59 +1,8 @@
 """The program ``loopclosure``, and ``python -m loopclosure``."""
 
-from __future__ import annotations
-
-import io
-import os
-import signal
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
-from importlib import import_module
 
-
-def program(module: str, words: Sequence[str] | None = None) -> int:
-    """Run the command line of a module, and return its exit status.
-
-    An interrupt is one line and status 128 + its number from the start: most of a short command's time goes into
-    imports. What the encoding of stdout does not have, such as bytes of a file name that are not UTF-8, is printed as
-    escapes. Where stderr is closed, what goes there is lost.
-    """
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    ours = [number for number, handler in before.items() if handler in (signal.SIG_DFL, signal.default_int_handler)]
-    try:
-        for number in ours:
-            signal.signal(number, end_at_once)
-        if sys.stderr is None:
-            # No file gets descriptor 2 either, where libraries write.
-            sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
-        if isinstance(sys.stdout, io.TextIOWrapper):
-            sys.stdout.reconfigure(errors="backslashreplace")
-        return _written(import_module(module).main(words))
-    finally:
-        for number in ours:
-            signal.signal(number, before[number])
-
-
-def end_at_once(number: int, _: object) -> None:
-    """End the process with one line, while nothing is begun that must be undone; a command has a handler of its own."""
-    with suppress(OSError):
-        os.write(2, b"interrupted\n")
-    os._exit(128 + number)
-
-
-def _written(status: int) -> int:
-    """Write what stdout still holds, and return the status. At its own end Python would print a traceback."""
-    out = sys.stdout
-    if out is None:  # the caller has closed it
-        return status
-    try:
-        out.flush()
-    except OSError as fault:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())  # it is written once more
-        if not isinstance(fault, BrokenPipeError):
-            print(f"standard output: {fault.strerror}", file=sys.stderr)
-        return status or 1
-    return status
+from netspec.terminal.main import program
 
 
 def main() -> int:

@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from loopclosure.errors import InputError, printable
+from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, make_method
 from loopclosure.places.datasets import DataSet
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import BestMatches, JudgedScores, PrecisionRecall
 from loopclosure.progress import Progress, silent
+from netspec.errors import printable
 
 RECALL_AT = (1, 5, 10)
 SOFT_ZONE = "; soft zone"

@@ -1,7 +1,7 @@
 """netspec, the living Caffe: runs Caffe's prototxt in PyTorch, unmodified, with Caffe's numbers.
 
 The public names are loaded when they are first used, so that ``import netspec.proto.text`` needs no torch. Nothing is
-imported here that takes time: until this is done a program cannot answer signals (netspec/__main__.py).
+imported here that takes time: until this is done a program cannot answer signals (netspec/terminal/main.py).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ def run(module: str, *words: str) -> int:
     """
     sys.path[0] = str(ROOT)  # in place of this folder
     try:
-        return import_module("netspec.__main__").program(module, [*words, *sys.argv[1:]])
+        return import_module("netspec.terminal.main").program(module, [*words, *sys.argv[1:]])
     except ModuleNotFoundError as fault:
         python = VENV / "bin" / "python"
         if python.is_file() and Path(sys.prefix).resolve() != VENV.resolve():

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import cv2
 
 from lmdb_build.cli import compare, convert, lists, pairs, views, walk
-from loopclosure.errors import InputError
 from netspec.terminal.commands import Commands, program, run
 
 _FAMILIES = (walk, pairs, views, lists, convert, compare)
@@ -18,7 +17,7 @@ _FAMILIES = (walk, pairs, views, lists, convert, compare)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return 0: done, 1: an error in the user's files, 2: wrong usage, 128 + N: signal N."""
     cv2.setNumThreads(1)  # the pictures are small
-    return run(parser(), list(sys.argv[1:] if argv is None else argv), (InputError,))
+    return run(parser(), list(sys.argv[1:] if argv is None else argv))
 
 
 def parser() -> argparse.ArgumentParser:

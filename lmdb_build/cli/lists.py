@@ -7,8 +7,8 @@ from pathlib import Path
 
 from lmdb_build.pairs.contact_sheet import write_contact_sheet
 from lmdb_build.pairs.list_file import join_lists, root_of
-from loopclosure.options import seed
 from netspec.terminal.commands import Commands
+from netspec.terminal.options import seed
 
 
 def add_to(commands: Commands) -> None:

@@ -21,13 +21,13 @@ from lmdb_build.pairs.by_list import (
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
 from loopclosure.descriptors.feature_file import read_features
-from loopclosure.options import above_zero, seed
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
 from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_posed
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
 from netspec.terminal.commands import Commands, WrongUsage
+from netspec.terminal.options import above_zero, seed
 
 
 def add_to(commands: Commands) -> None:

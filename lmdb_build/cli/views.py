@@ -10,8 +10,8 @@ from lmdb_build.cli.arguments import size
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
 from lmdb_build.views import Batches, Changes, write_views
-from loopclosure.options import above_zero, seed
 from netspec.terminal.commands import Commands, WrongUsage, refuse
+from netspec.terminal.options import above_zero, seed
 
 
 def add_to(commands: Commands) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 from lmdb_build.cli.arguments import size
 from lmdb_build.cli.bar import bar
 from lmdb_build.walk.sequence import Walk, write_walk
-from loopclosure.options import seed
 from netspec.terminal.commands import Commands, WrongUsage
+from netspec.terminal.options import seed
 
 SEASON_S = 1_000_000.0  # between the time stamps of two seasons of one walk
 

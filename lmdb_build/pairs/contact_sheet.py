@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from lmdb_build.pairs.list_file import ListedPair, read_pair_list
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
-from loopclosure.whole_file import whole_file
+from netspec.errors import SpecError
+from netspec.files.whole_file import whole_file
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 240, 180
 BORDER, CAPTION, TITLE = 6, 40, 44
@@ -73,7 +74,7 @@ def _pair(pair: ListedPair, list_file: Path, root: Path, colour: tuple[int, int,
     for number, name in enumerate((pair.first, pair.second)):
         try:
             picture = read_bgr(root / name)
-        except InputError as error:
+        except SpecError as error:
             raise InputError(f"{root / name} {error.message}", list_file, pair.line, 1) from error
         left = BORDER + number * (IMAGE_WIDTH + BORDER)
         tile[BORDER : BORDER + IMAGE_HEIGHT, left : left + IMAGE_WIDTH] = _fitted(picture)

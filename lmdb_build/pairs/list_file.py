@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 ROOT_FOLDER = (
     "root folder"  # this setting is the folder that image names are relative to, itself relative to the list's folder

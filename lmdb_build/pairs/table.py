@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from loopclosure.errors import InputError
-from loopclosure.places.image_list import IMAGE_ENDINGS
+from netspec.files.image_list import IMAGE_ENDINGS
 
 
 def read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]]], list[str]]:

@@ -34,7 +34,7 @@ from loopclosure.places.trajectory import (
     write_groundtruth,
     write_rgb_list,
 )
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 Array = NDArray[np.float64]
 

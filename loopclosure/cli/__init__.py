@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from loopclosure.cli import close, compare, detect, evaluate, similarity
-from loopclosure.cli.run import Commands, run
+from netspec.terminal.commands import Commands, program, run
 
 _COMMANDS = (evaluate, compare, detect, close, similarity)
 
@@ -19,8 +19,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
-    made = argparse.ArgumentParser(prog="loopclosure", description="Evaluate, detect and close loops.")
-    commands = Commands(made)
+    made = program("loopclosure", "Evaluate, detect and close loops.")
+    commands = Commands(made, quiet=True)
     for command in _COMMANDS:
         command.add_to(commands)
     return made

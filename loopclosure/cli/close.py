@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.cli.data_set import add_poses, add_topics, sequence
-from loopclosure.cli.run import Commands, WrongUsage, show_progress, warn
+from loopclosure.cli.run import show_progress, warn
 from loopclosure.closing.close import close, summary, write_closed
 from loopclosure.closing.drift import drifted
 from loopclosure.closing.measure import measure, read_loops
 from loopclosure.errors import InputError
-from loopclosure.options import seed
 from loopclosure.places import intrinsics
 from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.sequences import ImageSequence
+from netspec.terminal.commands import Commands, WrongUsage
+from netspec.terminal.options import seed
 
 
 def add_to(commands: Commands) -> None:

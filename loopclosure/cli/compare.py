@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from loopclosure.cli.run import Commands, WrongUsage
+from netspec.terminal.commands import Commands, WrongUsage
 
 
 def add_to(commands: Commands) -> None:

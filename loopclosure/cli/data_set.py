@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loopclosure.cli.run import WrongUsage, show_progress, warn
-from loopclosure.options import above_zero
+from loopclosure.cli.run import show_progress, warn
 from loopclosure.places import datasets
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
@@ -16,6 +15,8 @@ from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import ImageSequence, PoseChoice, benchmark_parts, read_sequence
 from loopclosure.places.truth import Exclusion
+from netspec.terminal.commands import WrongUsage
+from netspec.terminal.options import above_zero
 
 KINDS = (*LAYOUTS, "fabmap", "images", "traverses", "nordland", "pairs")
 POSED = (*LAYOUTS, "images")

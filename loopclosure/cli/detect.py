@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from loopclosure.cli.data_set import add_selection, add_topics, selection
-from loopclosure.cli.run import Commands, WrongUsage, show_progress, warn
+from loopclosure.cli.run import show_progress, warn
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -20,6 +20,7 @@ from loopclosure.methods.features import WhitenBy
 from loopclosure.places.bags import is_bag
 from loopclosure.places.extraction import extract
 from loopclosure.places.frames import Selection
+from netspec.terminal.commands import Commands, WrongUsage
 
 # The detector's settings that --resume takes from the saved one.
 SETTINGS = (

@@ -7,10 +7,11 @@ from pathlib import Path
 
 from loopclosure import evaluate
 from loopclosure.cli.data_set import add_data_set, add_selection, data_set, selection
-from loopclosure.cli.run import Commands, show_progress
+from loopclosure.cli.run import show_progress
 from loopclosure.methods.base import METHODS, MethodContext
-from loopclosure.options import seed
 from loopclosure.places.frames import image_paths
+from netspec.terminal.commands import Commands
+from netspec.terminal.options import seed
 
 
 def add_to(commands: Commands) -> None:

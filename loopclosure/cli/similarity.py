@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 
-from loopclosure.cli.run import Commands, WrongUsage, show_progress
+from loopclosure.cli.run import show_progress
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS, top_k, write_similarity, write_top_k
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
+from netspec.terminal.commands import Commands, WrongUsage
 
 
 def add_to(commands: Commands) -> None:

@@ -17,7 +17,7 @@ from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Rel
 from loopclosure.detector.export import LOOP_SIGMAS, write_pose_graph
 from loopclosure.errors import InputError
 from loopclosure.places.trajectory import Trajectory, write_trajectory
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 # The standard deviations of a step of odometry: a share of its length and of its turn, and this much at least.
 STEP_SHARE, STEP_M, TURN_SHARE, TURN_RAD = 0.02, 0.002, 0.02, 0.002

@@ -19,7 +19,7 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 METRICS = ("euclidean", "cosine")
 # 1024 x 16384 scores in float32 are 64 MiB, for a sequence of any length.

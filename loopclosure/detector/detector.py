@@ -25,7 +25,8 @@ from loopclosure.descriptors.similarity import check_metric, squared_distances
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.precision_recall import PrecisionRecall, curve
-from loopclosure.whole_file import whole_file
+from netspec.errors import SpecError
+from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
 FIRST_CAPACITY = 256  # frames; doubled when full
@@ -272,8 +273,8 @@ class LoopDetector:
             detector._frames = _frames(arrays, detector.settings.views, check is not None)
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
             detector.loops = [_loop(found, len(detector)) for found in about["loops"]]
-        except InputError as fault:
-            raise fault if fault.file else InputError(fault.message, path) from None
+        except SpecError as fault:
+            raise fault if fault.where else InputError(fault.message, path) from None
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
             reason = " ".join(str(error).split())
             raise InputError(f"cannot be read ({reason}); expected {SAVED}", path) from None

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.detector.detector import LoopResult
 from loopclosure.errors import InputError
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 RelativePose = Callable[[int, int], np.ndarray | None]
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
+from netspec.errors import SpecError
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 POSES = (
@@ -189,7 +190,7 @@ def _reading(path: Path) -> Iterator[None]:
     """Raise InputError for whatever is raised in the block: of a damaged bag the library raises many errors."""
     try:
         yield
-    except InputError:
+    except SpecError:
         raise
     except Exception as fault:
         reason = " ".join(str(fault).split()) or type(fault).__name__

@@ -15,7 +15,7 @@ from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.pose_files import DIRECTIONS, FORMS, ORDERS
 from loopclosure.places.trajectory import Frame, Trajectory, write_groundtruth, write_rgb_list
 from loopclosure.progress import Progress, silent
-from loopclosure.whole_file import whole_folder
+from netspec.files.whole_file import whole_folder
 
 MADE_FROM = "source.txt"
 # What the commands call the sequences with poses.

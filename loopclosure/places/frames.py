@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.image_list import list_images
+from netspec.files.image_list import list_images
+from netspec.files.png import is_cut_png
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
@@ -90,17 +91,6 @@ def write_picture(path: Path, image: np.ndarray, *settings: int) -> None:
         path.write_bytes(data.tobytes())
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", path) from None
-
-
-def is_cut_png(data: bytes) -> bool:
-    """Return whether data is that of a PNG file with a part that announces more than there is.
-
-    OpenCV makes room for the 4 GiB that a part may announce before it looks at how much there is.
-    """
-    at = 8 if data.startswith(b"\x89PNG\r\n\x1a\n") else len(data)
-    while at < len(data):
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-    return at > len(data)
 
 
 def _capture(path: str | Path) -> cv2.VideoCapture:

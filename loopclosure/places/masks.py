@@ -13,6 +13,7 @@ from loopclosure.arrays import read_lists, read_npy
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_pixels
 from loopclosure.places.mat_file import read_mat
+from netspec.errors import SpecError
 
 # The FAB-MAP sets call it truth; several papers' derived files GT.
 TRUTH_KEYS = ("truth", "gt", "groundtruth", "ground_truth")
@@ -132,7 +133,7 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
     if suffix in LOSSLESS_SUFFIXES:
         try:
             return read_pixels(path, cv2.IMREAD_GRAYSCALE)
-        except InputError as fault:
+        except SpecError as fault:
             raise InputError(f"{fault.message}; expected {what}", path) from None
     raise InputError(
         f'"{suffix}" is not a known suffix for {what}; known: .mat .npy .txt .csv {" ".join(LOSSLESS_SUFFIXES)}'

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.image_list import list_images
 from loopclosure.places.intrinsics import Intrinsics, kitti_projection, read_intrinsics, yaml_numbers
 from loopclosure.places.pose_files import PoseForm, matrix_fault, moved, read_poses
 from loopclosure.places.trajectory import (
@@ -26,6 +25,7 @@ from loopclosure.places.trajectory import (
     number,
     read_rgb_list,
 )
+from netspec.files.image_list import list_images
 
 QUERIES = ("query", "queries", "Query", "Queries")
 REFERENCES = ("ref", "refs", "reference", "references", "database", "Ref", "Reference", "Database")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 # TUM's own associate.py takes 0.02 s; with 30 Hz images and motion capture at 100 Hz a gap of 0.03 s does no harm.
 MAX_DIFFERENCE_S = 0.03

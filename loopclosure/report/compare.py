@@ -16,12 +16,13 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from loopclosure.errors import InputError, printable
+from loopclosure.errors import InputError
 from loopclosure.evaluate import RECALL_AT, SOFT_ZONE
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report.files import SOFT_MEASURES, share
 from loopclosure.report.plots import COLORS, STYLE, draw_curve, frame_curves, legends_below
-from loopclosure.whole_file import whole_file
+from netspec.errors import printable
+from netspec.files.whole_file import whole_file
 
 EXPECTED = "a report.json that loopclosure evaluate wrote"
 BY_CONVENTION = ("average precision", "recall at 100 % precision", "best F1")

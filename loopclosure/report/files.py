@@ -13,7 +13,7 @@ import numpy as np
 
 from loopclosure.evaluate import RECALL_AT, SOFT_ZONE, Evaluation, Outcome
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, BestMatches, PrecisionRecall
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 # A curve in report.json has at most so many points; curve_*.csv has them all.
 POINTS = 400

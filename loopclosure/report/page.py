@@ -24,7 +24,7 @@ from loopclosure.places.trajectory import Poses
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import plots
 from loopclosure.report.files import EXPLANATION, SOFT_MEASURES, share, write_files
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 PAIRS_SHOWN = 4
 PICTURE_HEIGHT = 120  # pixels of the pictures of pairs

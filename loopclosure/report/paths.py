@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from loopclosure.closing.close import Closed
 from loopclosure.closing.drift import aligned
 from loopclosure.report.plots import COLORS, FALSE, FOUND, STYLE
-from loopclosure.whole_file import whole_file
+from netspec.files.whole_file import whole_file
 
 AXES = ("x [m]", "y [m]", "z [m]")
 

@@ -20,10 +20,10 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
-from loopclosure.errors import printable
 from loopclosure.evaluate import SOFT_ZONE, Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
+from netspec.errors import printable
 
 # Color-blind readers can distinguish these too (Okabe and Ito).
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")

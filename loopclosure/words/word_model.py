@@ -17,9 +17,10 @@ from loopclosure.arrays import check_array, from_json, read_npz
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
-from loopclosure.whole_file import whole_file
 from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
+from netspec.errors import SpecError
+from netspec.files.whole_file import whole_file
 
 FORMAT = 1
 # The stages of ``train``: done once, for any number of tested images.
@@ -86,7 +87,7 @@ class WordModel:
             tree = WordTree(*(file[name] for name in ("parent", "marginal", "given_present", "given_absent")))
             vocabulary = Vocabulary(file["centres"], from_json(Extractor, settings["extractor"]), settings["made"])
             return cls(vocabulary, file["training_words"], images, tree)
-        except InputError:
+        except SpecError:
             raise
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
             raise InputError(f"not {expected} ({' '.join(str(error).split())})", path) from None

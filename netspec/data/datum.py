@@ -14,6 +14,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from netspec.files.lfs import pointer_fault
+from netspec.files.png import is_cut_png
 from netspec.proto.schema import Datum
 
 
@@ -93,17 +94,6 @@ def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
     if pixels.dtype != np.uint8:
         raise ValueError(f"is an image of {pixels.dtype} values; only 8 bits per channel can be read")
     return pixels
-
-
-def is_cut_png(data: bytes) -> bool:
-    """Return whether data is that of a PNG file with a part that announces more than there is.
-
-    OpenCV makes room for the 4 GiB that a part may announce before it looks at how much there is.
-    """
-    at = 8 if data.startswith(b"\x89PNG\r\n\x1a\n") else len(data)
-    while at < len(data):
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-    return at > len(data)
 
 
 def planar(pixels: np.ndarray) -> np.ndarray:

@@ -1,7 +1,4 @@
-"""The images of a folder or a list, their order and their time stamps: the rule of docs/images.md.
-
-loopclosure/places/image_list.py follows the same rule; tests/laws/test_image_lists.py tests both.
-"""
+"""The images of a folder or a list, their order and their time stamps: the rule of docs/images.md."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def _command(module: str, words: list[str]) -> str:
 {MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
 import sys
 
-from netspec.__main__ import program
+from netspec.terminal.main import program
 
 sys.exit(program({module!r}, [*{words}, *sys.argv[1:]]))
 """

@@ -1,4 +1,4 @@
-"""How the commands of netspec and of lmdb_build read their arguments, log, and exit.
+"""How the commands of all programs read their arguments, log, and exit.
 
 Arguments are read as gflags reads them: one dash or two, ``-flag value`` or ``-flag=value``. A Boolean flag is
 ``-flag``, ``-noflag``, ``-flag=true`` or ``-flag=false``; it never takes the next argument. The log goes to stderr in
@@ -12,6 +12,7 @@ import argparse
 import logging
 import os
 import re
+import shlex
 import signal
 import sys
 import threading
@@ -27,6 +28,7 @@ from netspec.terminal import log
 DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
 SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: there is something to say; a file cannot be read
 SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
+CAFFES_LOG = logging.INFO, log.GlogFormatter()
 VARIABLE = "GLOG_minloglevel"
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 
@@ -50,9 +52,10 @@ def program(name: str, description: str) -> argparse.ArgumentParser:
 
 
 class Commands:
-    """The commands of a parser, each with the options that all of them share."""
+    """The commands of a parser, each with the options that all of them share; ``quiet`` ones show only warnings."""
 
-    def __init__(self, parser: argparse.ArgumentParser) -> None:
+    def __init__(self, parser: argparse.ArgumentParser, quiet: bool = False) -> None:
+        self._log = (logging.WARNING, logging.Formatter("warning: %(message)s")) if quiet else CAFFES_LOG
         self._parsers = parser.add_subparsers(
             dest="command", required=True, metavar="COMMAND", parser_class=_GflagsParser
         )
@@ -66,28 +69,30 @@ class Commands:
         log itself sets the default ``log_form`` to None, one whose faults are no FAULT sets ``fault_status``.
         """
         added = self._parsers.add_parser(name, help=summary, description=summary)
-        added.set_defaults(run=function, log_level=logging.INFO, log_form=log.GlogFormatter(), fault_status=FAULT)
+        level, form = self._log
+        added.set_defaults(run=function, log_level=level, log_form=form, fault_status=FAULT)
         added.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
         for name in ("--logtostderr", "--alsologtostderr"):  # it always does
             added.add_argument(name, action="store_true", help=argparse.SUPPRESS)
         return added
 
 
-def run(parser: argparse.ArgumentParser, words: Sequence[str], faults: tuple[type[Exception], ...] = ()) -> int:
+def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
     """Parse a command line, run the command, and return its exit status.
 
-    A SpecError, an OSError or one of ``faults`` becomes one line on stderr and status 1. Wrong usage gives status 2,
-    Ctrl-C status 130, SIGTERM 143.
+    The command finds the line itself in ``command_line``. A SpecError or an OSError becomes one line on stderr and
+    status 1. Wrong usage gives status 2, Ctrl-C status 130, SIGTERM 143.
     """
     try:
         arguments = parser.parse_args(words)
     except SystemExit as end:  # argparse has printed the error, or its help
         return int(end.code or DONE)
+    arguments.command_line = shlex.join([parser.prog, *words])
     try:
         shown = _logging(_level(arguments), arguments.log_form) if arguments.log_form else nullcontext()
         with interruptible(), shown:
             return arguments.run(arguments) or DONE
-    except (SpecError, *faults) as fault:
+    except SpecError as fault:
         print(fault, file=sys.stderr)
         return arguments.fault_status
     except WrongUsage as fault:

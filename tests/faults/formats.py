@@ -27,7 +27,6 @@ from loopclosure.descriptors.feature_file import read_features
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.places.frames import read_bgr
-from loopclosure.places.image_list import list_images
 from loopclosure.places.masks import read_coordinates, read_truth_matrix
 from loopclosure.places.trajectory import read_groundtruth, read_rgb_list
 from loopclosure.words.chow_liu import learn_tree
@@ -40,6 +39,7 @@ from netspec.data.images import read_image, read_image_list
 from netspec.data.mean import read_mean, read_mean_option, write_mean
 from netspec.data.windows import read_window_file
 from netspec.errors import SpecError
+from netspec.files.image_list import list_images
 from netspec.graph import raise_fault
 from netspec.graph.filter import with_state
 from netspec.net.build import build_net

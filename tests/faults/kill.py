@@ -27,7 +27,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 import torch  # noqa: E402
 
 import lmdb_build.cli  # noqa: E402
-import loopclosure.whole_file  # noqa: E402
 import netspec.files.whole_file  # noqa: E402
 from faults.commands import CASES, Case, remove_database  # noqa: E402
 
@@ -57,8 +56,7 @@ def start(case: Case, slowly: bool = False) -> int:
     null = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(null, stream)
-    for module in (netspec.files.whole_file, loopclosure.whole_file):
-        module._swept.clear()  # by this process: a new one knows nothing of that
+    netspec.files.whole_file._swept.clear()  # by this process: a new one knows nothing of that
     sync, status = os.fsync, 1
     if slowly:
         os.fsync = lambda descriptor: (time.sleep(0.01), sync(descriptor))[1]

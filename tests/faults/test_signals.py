@@ -1,4 +1,4 @@
-"""What SIGTERM and a second signal do to any command, of netspec and of loopclosure."""
+"""What SIGTERM and a second signal do to any command."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 CODE = """
 import argparse, sys, time
-from {module} import Commands, run
+from netspec.terminal.commands import Commands, run
 
 def endless(arguments):
     try:
@@ -29,7 +29,6 @@ parser = argparse.ArgumentParser()
 Commands(parser).add("endless", endless, "")
 sys.exit(run(parser, ["endless"]))
 """
-MODULES = ("netspec.terminal.commands", "loopclosure.cli.run")
 
 
 def start(code: str) -> subprocess.Popen[str]:
@@ -44,10 +43,9 @@ def line_of(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline().strip()
 
 
-@pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_one_line_and_its_status(module: str, number: int) -> None:
-    process = start(CODE.format(module=module, cleaning=0))
+def test_one_line_and_its_status(number: int) -> None:
+    process = start(CODE.format(cleaning=0))
     process.send_signal(number)
     _, said = process.communicate(timeout=30)
     assert (process.returncode, said) == (128 + number, "interrupted\n")
@@ -80,7 +78,7 @@ def test_one_line_while_modules_are_imported(package: str, number: int) -> None:
 
 MANGLED = """
 import argparse, sys, time
-from {module} import Commands, run
+from netspec.terminal.commands import Commands, run
 
 def loading(arguments):
     try:
@@ -95,10 +93,9 @@ sys.exit(run(parser, ["loading"]))
 """
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_one_line_where_an_import_makes_another_error_of_it(module: str) -> None:
+def test_one_line_where_an_import_makes_another_error_of_it() -> None:
     """Modules in C do: they know only that they could not be loaded."""
-    process = start(MANGLED.format(module=module))
+    process = start(MANGLED)
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=30)
     assert (process.returncode, said) == (143, "interrupted\n")
@@ -119,10 +116,9 @@ def test_one_line_from_the_first_line_of_the_program(package: str) -> None:
         assert done.returncode == 0 or (done.returncode, done.stderr) == (143, "interrupted\n")
 
 
-@pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_one_ends_at_once(module: str, number: int) -> None:
-    process = start(CODE.format(module=module, cleaning=60))
+def test_a_second_one_ends_at_once(number: int) -> None:
+    process = start(CODE.format(cleaning=60))
     process.send_signal(signal.SIGINT)
     assert line_of(process) == "ending"
     process.send_signal(number)

@@ -1,15 +1,12 @@
-"""netspec and loopclosure, which may not import each other, read images by one rule: docs/images.md."""
+"""Images of folders and lists are read by one rule: docs/images.md."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-import loopclosure.places.image_list
-import netspec.files.image_list
+from netspec.files.image_list import IMAGE_ENDINGS, SUBFOLDERS, list_images
 from paths import ROOT
 
-READERS = (netspec.files.image_list.list_images, loopclosure.places.image_list.list_images)
 #: Each: files (text where it matters), what is read, and the names that come out, with stamps where there are any.
 FOUND: dict[str, tuple[dict[str, str], str, list[str], list[float] | None]] = {
     "numbers are compared as numbers": (
@@ -101,33 +98,28 @@ def write(files: dict[str, str]) -> None:
         Path(name).write_bytes(text.encode(errors="surrogateescape"))
 
 
-@pytest.mark.parametrize("read", READERS, ids=["netspec", "loopclosure"])
 @pytest.mark.parametrize("case", FOUND)
-def test_names_order_stamps_and_paths(here: Path, case: str, read: Any) -> None:
+def test_names_order_stamps_and_paths(here: Path, case: str) -> None:
     files, source, names, stamps = FOUND[case]
     write(files)
     for given in (source, Path(source), here / source):
-        found = read(given)
+        found = list_images(given)
         assert list(found.names) == names
         assert (None if found.stamps is None else found.stamps.tolist()) == stamps
         root = here / source if (here / source).is_dir() else (here / source).parent
         assert [path.resolve() for path in found.paths] == [(root / name).resolve() for name in names]
 
 
-@pytest.mark.parametrize("read", READERS, ids=["netspec", "loopclosure"])
 @pytest.mark.parametrize("case", REFUSED)
 @pytest.mark.usefixtures("here")
-def test_what_is_refused_and_how(case: str, read: Any) -> None:
+def test_what_is_refused_and_how(case: str) -> None:
     files, source, message = REFUSED[case]
     write(files)
     with pytest.raises(ValueError, match=r"\A[^\n]+\Z") as fault:
-        read(source)
+        list_images(source)
     assert str(fault.value).startswith(message)
 
 
-def test_the_rule_is_written_down_where_both_point_to() -> None:
+def test_the_rule_is_written_down() -> None:
     text = (ROOT / "docs" / "images.md").read_text()
-    for module in (netspec.files.image_list, loopclosure.places.image_list):
-        assert "docs/images.md" in str(module.__doc__)
-        assert all(f"`{ending}`" in text for ending in module.IMAGE_ENDINGS)
-        assert all(f"`{name}`" in text for name in module.SUBFOLDERS)
+    assert all(f"`{word}`" in text for word in (*IMAGE_ENDINGS, *SUBFOLDERS))

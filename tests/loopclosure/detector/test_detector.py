@@ -8,6 +8,7 @@ from loopclosure.detector.detector import FIRST_CAPACITY, DetectorSettings, Loop
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
+from netspec.errors import SpecError
 
 
 def two_laps(places=60, dimensions=16, noise=0.02, seed=0):
@@ -162,7 +163,7 @@ def test_files_that_are_no_detector(tmp_path):
     for name in ("other.npz", "text.npz", "none.npz"):
         with pytest.raises(InputError, match=r"expected a file that LoopDetector.save wrote"):
             LoopDetector.load(tmp_path / name)
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(SpecError, match="cannot be written"):
         LoopDetector().save(tmp_path / "no" / "folder.npz")
 
 

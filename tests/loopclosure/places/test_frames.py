@@ -8,6 +8,7 @@ import pytest
 
 from loopclosure.errors import InputError
 from loopclosure.places.frames import Selection, image_paths, read_bgr, video_frames, video_length, write_picture
+from netspec.errors import SpecError
 
 
 @pytest.mark.parametrize(
@@ -60,14 +61,14 @@ def test_folders_lists_and_sequences(tmp_path):
 
 def test_broken_sources(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="contains no images"):
+    with pytest.raises(SpecError, match="contains no images"):
         image_paths(tmp_path / "empty")
     (tmp_path / "list.txt").write_text("\ngone.png\n")
-    with pytest.raises(InputError, match=r'list.txt:2:1: no such image "gone.png"'):
+    with pytest.raises(SpecError, match=r'list.txt:2:1: no such image "gone.png"'):
         image_paths(tmp_path / "list.txt")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(SpecError, match="cannot be read"):
         image_paths(tmp_path / "absent.txt")
-    with pytest.raises(InputError, match="single image"):
+    with pytest.raises(SpecError, match="single image"):
         image_paths(tmp_path / "a.png")
     with pytest.raises(InputError, match="no such image"):
         read_bgr(tmp_path / "a.png")

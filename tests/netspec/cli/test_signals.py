@@ -122,7 +122,7 @@ def test_sigterm_stops_a_training_with_a_snapshot(name: str, endless, tmp_path: 
 
 @pytest.mark.parametrize("name", ["caffe", "netspec"])
 def test_the_status_goes_by_the_name_of_the_program(name: str, endless) -> None:
-    Path(name).write_text("import sys\nfrom netspec.__main__ import program\nsys.exit(program('netspec.cli'))\n")
+    Path(name).write_text("import sys\nfrom netspec.terminal.main import program\nsys.exit(program('netspec.cli'))\n")
     process, wait_for = endless(program=(name, "train"))
     wait_for("Iteration 10 ")
     process.send_signal(signal.SIGINT)

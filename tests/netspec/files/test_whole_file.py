@@ -1,4 +1,4 @@
-"""Files that appear whole, locks, and whether a file could be written: in netspec and, the same, in loopclosure."""
+"""Files that appear whole, locks, and whether a file could be written."""
 
 import errno
 import logging
@@ -8,31 +8,14 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-import loopclosure.whole_file
-import netspec.files.whole_file
+from netspec.files import whole_file as package
 from paths import ROOT
 
-PACKAGES = (netspec.files.whole_file, loopclosure.whole_file)
 
-
-@pytest.fixture(params=PACKAGES, ids=["netspec", "loopclosure"])
-def package(request: pytest.FixtureRequest) -> ModuleType:
-    return request.param
-
-
-def test_the_two_wings_write_files_in_one_way() -> None:
-    """They may not import each other; a change of one of the modules is to be made in the other."""
-    ours, theirs = (Path(package.__file__ or "").read_text() for package in PACKAGES)
-    ours = ours.replace("from netspec.errors import SpecError, Where", "from loopclosure.errors import InputError")
-    ours = ours.replace("SpecError(message, Where(str(path)))", "InputError(message, path)")
-    assert ours.replace("SpecError", "InputError") == theirs
-
-
-def test_why_no_file_can_be_written(package: ModuleType, tmp_path: Path) -> None:
+def test_why_no_file_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     why = package.why_unwritable
     assert why(tmp_path / "new") == ""
@@ -44,7 +27,7 @@ def test_why_no_file_can_be_written(package: ModuleType, tmp_path: Path) -> None
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
 
 
-def test_a_folder_without_leave_to_write(package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_without_leave_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)  # root may write everywhere
     assert package.why_unwritable(tmp_path / "new") == "Permission denied"
     (tmp_path / "old").touch()
@@ -53,7 +36,7 @@ def test_a_folder_without_leave_to_write(package: ModuleType, tmp_path: Path, mo
     assert package.why_unwritable(tmp_path / "old") == "Permission denied"
 
 
-def test_a_failed_write_leaves_what_was_there(package: ModuleType, tmp_path: Path) -> None:
+def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("old")
 
@@ -68,7 +51,7 @@ def test_a_failed_write_leaves_what_was_there(package: ModuleType, tmp_path: Pat
 
 
 def test_the_file_and_its_folder_are_on_disk_before_the_block_ends(
-    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[tuple[bool, list[str]]] = []
 
@@ -83,7 +66,7 @@ def test_the_file_and_its_folder_are_on_disk_before_the_block_ends(
 
 
 def test_a_folder_that_cannot_be_synced_is_no_fault_and_said_once(
-    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(path: Path) -> None:
         raise PermissionError(errno.EACCES, "Access is denied")  # as on Windows
@@ -100,7 +83,7 @@ def test_a_folder_that_cannot_be_synced_is_no_fault_and_said_once(
     assert record.getMessage().startswith("folders cannot be brought to disk here (Permission denied)")
 
 
-def test_where_files_have_no_locks(package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_files_have_no_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(package, "fcntl", None)
     with package.whole_file(tmp_path / "file") as unfinished:
         unfinished.write_text("new")
@@ -111,15 +94,13 @@ def test_where_files_have_no_locks(package: ModuleType, tmp_path: Path, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
 
 
-def test_why_unwritable_where_file_systems_tell_nothing(
-    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_why_unwritable_where_file_systems_tell_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "statvfs")  # as on Windows
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert package.why_unwritable(tmp_path / "file") == os.strerror(errno.EACCES)
 
 
-def test_a_link_stays_a_link(package: ModuleType, tmp_path: Path) -> None:
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "there" / "file")
     with package.whole_file(tmp_path / "link") as unfinished:
@@ -128,7 +109,7 @@ def test_a_link_stays_a_link(package: ModuleType, tmp_path: Path) -> None:
     assert (tmp_path / "there" / "file").read_text() == "new"
 
 
-def test_a_pipe_gets_the_bytes_and_stays_a_pipe(package: ModuleType, tmp_path: Path) -> None:
+def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     read: list[str] = []
     reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_text()))
@@ -143,7 +124,7 @@ def test_a_pipe_gets_the_bytes_and_stays_a_pipe(package: ModuleType, tmp_path: P
 # What killed runs leave
 
 
-def start(package: ModuleType, code: str, folder: Path) -> subprocess.Popen[str]:
+def start(code: str, folder: Path) -> subprocess.Popen[str]:
     """Run code until it has printed a line."""
     command = [sys.executable, "-c", f"from {package.__name__} import *\n{code}\nprint(flush=True); input()"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -160,11 +141,9 @@ held[0].__enter__(), held[1].__enter__().write_text("half")
 """
 
 
-def test_what_a_killed_run_left_is_swept_by_the_next(
-    package: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_killed_run_left_is_swept_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / ".mine.unfinished").touch()
-    with start(package, HALF, tmp_path) as process:
+    with start(HALF, tmp_path) as process:
         monkeypatch.setattr(package, "_swept", set())
         with package.whole_file(tmp_path / "other") as unfinished:
             unfinished.touch()
@@ -176,8 +155,8 @@ def test_what_a_killed_run_left_is_swept_by_the_next(
     assert sorted(path.name for path in tmp_path.iterdir()) == [".mine.unfinished", "other"]
 
 
-def test_a_lock_dies_with_its_process(package: ModuleType, tmp_path: Path) -> None:
-    with start(package, 'held = only_one("x.lock", ""); held.__enter__()', tmp_path) as process:
+def test_a_lock_dies_with_its_process(tmp_path: Path) -> None:
+    with start('held = only_one("x.lock", ""); held.__enter__()', tmp_path) as process:
         message = rf"x\.lock: is held by another run \(process {process.pid}\); choose another name"
         with pytest.raises(ValueError, match=message), package.only_one(tmp_path / "x.lock", "choose another name"):
             pass

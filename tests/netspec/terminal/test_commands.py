@@ -179,7 +179,7 @@ def test_the_logger_is_left_as_it_was() -> None:
 # How a command ends
 
 
-class Fault(ValueError):
+class Fault(SpecError):
     """The error of another package."""
 
 
@@ -201,7 +201,7 @@ def test_each_end_has_its_status_and_one_line(
     def fail(arguments: argparse.Namespace) -> None:
         raise error
 
-    assert run(command(fail), ["convert"], (Fault,)) == status
+    assert run(command(fail), ["convert"]) == status
     assert capsys.readouterr().err == said
     assert not log.logger.handlers or all(type(h) is not logging.StreamHandler for h in log.logger.handlers)
 
@@ -211,4 +211,4 @@ def test_a_fault_of_the_program_is_not_hidden() -> None:
         raise AssertionError("a mistake in the program")
 
     with pytest.raises(AssertionError):
-        run(command(fail), ["convert"], (Fault,))
+        run(command(fail), ["convert"])

@@ -1,4 +1,4 @@
-"""Numbers that options of the commands take, here and in lmdb_build."""
+"""Numbers that options of the commands take."""
 
 from __future__ import annotations
 
