@@ -1,10 +1,12 @@
 """Fast and Faster R-CNN and R-FCN: rbgirshick/caffe-fast-rcnn, daijifeng001/caffe-rfcn.
 
-The anchors' targets, and proposals that are Python layers of py-faster-rcnn, run with ``--allow-python-layers``.
+The Python layers of py-faster-rcnn are here too, by module and class. Where ``--allow-python-layers`` is given and
+their module can be imported, the module's code runs instead.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from functools import reduce
@@ -15,6 +17,7 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.dialects._boxes import as_array
+from netspec.dialects._faster import RATIOS, SCALES, AnchorTarget, ProposalTarget, RoIData, settings
 from netspec.dialects._proposals import all_anchors, base_anchors, moved, suppress
 from netspec.layers import Layer, common, register
 from netspec.layers.base import Shape, rounded
@@ -316,7 +319,7 @@ class Proposal(Layer):
     @override
     def setup(self) -> None:
         """Make the anchors of one pixel."""
-        param = value(self.param, "proposal_param")
+        self.settings = param = value(self.param, "proposal_param")
         for name in ("feat_stride", "base_size", "pre_nms_topn", "post_nms_topn"):
             if getattr(param, name) < 1:
                 raise self.error(f"{name} must be at least 1", "proposal_param", name)
@@ -336,13 +339,13 @@ class Proposal(Layer):
             raise self.error(f"found boxes of shape {deltas}, expected {expected}", "bottom", 1)
         if image[:1] != (1,) or math.prod(image) not in (3, 4):
             raise self.error(f"found an image's sizes of shape {image}, expected (1, 3) or (1, 4)", "bottom", 2)
-        most = value(self.param, "proposal_param").post_nms_topn
+        most = self.settings.post_nms_topn
         return [(most, 5), (most,)][: self.num_tops]
 
     @override
     def forward(self, scores: torch.Tensor, deltas: torch.Tensor, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the regions and their scores."""
-        param = value(self.param, "proposal_param")
+        param = self.settings
         count, (height, width) = len(self.anchors), scores.shape[2:]
         sizes = as_array(image).reshape(-1)
         anchors = all_anchors(self.anchors, param.feat_stride, height, width)
@@ -355,7 +358,36 @@ class Proposal(Layer):
         order = order[suppress(boxes[order], param.nms_thresh, param.post_nms_topn)]
         regions = np.concatenate([np.zeros((len(order), 1), np.float32), boxes[order]], axis=1)
         tops = (torch.from_numpy(regions), torch.from_numpy(found[order]))
+        self.top_shapes = [tuple(top.shape) for top in tops[: self.num_tops]]
         return tuple(top.to(scores) for top in tops[: self.num_tops])
+
+
+@register("rpn.proposal_layer.ProposalLayer", "python_param")
+class ProposalLayer(Proposal):
+    """Proposal with the settings of py-faster-rcnn, whose Python layer rpn.proposal_layer.ProposalLayer it is.
+
+    In training 2000 of 12000 regions stay, in testing 300 of 6000; param_str has feat_stride and scales.
+
+    bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
+    bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor
+    bottom[2]  (1, 3): height, width, scale of the image
+    top[0]     regions (n, 5): 0, x1, y1, x2, y2
+    top[1]     optional: their scores (n,)
+    Fork: rbgirshick/py-faster-rcnn, lib/rpn/proposal_layer.py
+    """
+
+    @override
+    def setup(self) -> None:
+        found = settings(self, feat_stride=1)
+        self.settings = param = copy.deepcopy(value(self.param, "proposal_param"))
+        param.feat_stride = int(found["feat_stride"])
+        param.pre_nms_topn, param.post_nms_topn = (12000, 2000) if self.phase == TRAIN else (6000, 300)
+        self.anchors = base_anchors(param.base_size, RATIOS, found.get("scales", SCALES))
+
+
+register("rpn.anchor_target_layer.AnchorTargetLayer", "python_param")(AnchorTarget)
+register("rpn.proposal_target_layer.ProposalTargetLayer", "python_param")(ProposalTarget)
+register("roi_data_layer.layer.RoIDataLayer", "python_param")(RoIData)
 
 
 @register("SmoothL1Loss", "smooth_l1_loss_param")

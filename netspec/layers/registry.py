@@ -7,12 +7,13 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.layers.base import Layer
 from netspec.proto.dialect.files import DialectFile, announce_known, find_file, known_files, switch_on, waiting
 from netspec.proto.dialect.registry import advice_for, deactivate, dialects_with_type
+from netspec.proto.schema import LayerParameter
 
 _LAYERS: dict[str, type[Layer]] = {}
 L = TypeVar("L", bound=type[Layer])
@@ -49,6 +50,19 @@ def layer_class(type_name: str) -> type[Layer] | None:
             switch_on(find_file(dialects[0]))
             run_dialects()
     return _LAYERS.get(type_name)
+
+
+def class_of(param: LayerParameter, allow_python: bool = False) -> type[Layer] | None:
+    """Return the class of a layer, or None: that of its type.
+
+    A Python layer that a dialect knows by its module and class, ``"rpn.proposal_layer.ProposalLayer"``, is the
+    dialect's, unless Python code is allowed to run and its module is there.
+    """
+    if param.type != "Python":
+        return layer_class(param.type)
+    python: Any = layer_class("Python")
+    known = layer_class(f"{param.python_param.module}.{param.python_param.layer}")
+    return python if known is None or (allow_python and python.is_there(param)) else known
 
 
 def run_dialects() -> None:

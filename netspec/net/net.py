@@ -26,7 +26,7 @@ from netspec.files.limits import amount, is_out_of_memory
 from netspec.files.limits import memory as memory_of_machine
 from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
-from netspec.layers import layer_class, unknown_type
+from netspec.layers import class_of, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.net.chains import chains
 from netspec.net.ignored_fields import unused_fields
@@ -120,7 +120,7 @@ class Net(torch.nn.Module):
         for i, (node, param) in enumerate(zip(self.plan.nodes, self.param.layer, strict=True)):
             tie = _Tie(self.plan, i, partial(self._take, options, i))
             log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
-            cls = layer_class(node.type)
+            cls = class_of(param, options.allow_python)
             if cls is None:
                 options.report(SpecError(unknown_type(node.type), tie.at("type")))
                 continue

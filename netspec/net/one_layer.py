@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from netspec.errors import SpecError
 from netspec.exact import SMALL, check_choice
-from netspec.layers import Context, Layer, Random, layer_class, unknown_type
+from netspec.layers import Context, Layer, Random, class_of, unknown_type
 from netspec.layers.base import Shape
 from netspec.net.net import Array
 from netspec.proto.reader import read_text
@@ -71,7 +71,7 @@ def make_layer(text: str, shapes: Sequence[Shape], tops: int | None = None, **co
     net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Place(place.where), (place,)))
     (param,) = net.layer
     at = partial(source.at, 0, layer=param.name, type=param.type)
-    cls = layer_class(param.type)
+    cls = class_of(param)
     if cls is None:
         raise SpecError(unknown_type(param.type), at("type"))
     param.bottom.extend(f"bottom{i}" for i in range(len(param.bottom), len(shapes)))

@@ -43,6 +43,8 @@ def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int
             return "it runs on a GPU"
         if layer.is_input:
             return f'"{node.name}" is an input'
+        if node.bottoms and node.tops and (layer.counted_axis is not None or not layer.promises):
+            return f'"{node.name}" finds out the shapes of its tops in each pass'
         if any(blob.dtype != torch.float32 for blob in layer.blobs):
             return f'"{node.name}" does not compute in float32'
     readers = Counter(v for node in plan.nodes for v in node.bottoms)

@@ -69,6 +69,15 @@ def importable() -> Iterator[None]:
                 sys.modules.pop(name, None)
 
 
+def can_import(module: str) -> bool:
+    """Say whether code would find a module, without running it; a package that it lies in is imported."""
+    with importable():
+        try:
+            return importlib.util.find_spec(module) is not None
+        except Exception:  # its package's code may raise anything
+            return False
+
+
 @cache
 def _is_installed(directory: str) -> bool:
     """Say whether Python, run in a directory, finds a caffe; a mere folder of that name (Caffe's sources) is none."""

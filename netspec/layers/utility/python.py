@@ -18,7 +18,8 @@ from netspec.errors import SpecError, did_you_mean
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.layers.utility.live_blobs import Blob
-from netspec.layers.utility.pycaffe_shim import importable
+from netspec.layers.utility.pycaffe_shim import can_import, importable
+from netspec.proto.schema import LayerParameter
 from netspec.terminal import log
 
 
@@ -138,6 +139,11 @@ class Python(Layer):
             except ValueError as fault:
                 raise self._fault("resume", f"what it remembers is not JSON ({fault})") from None
             self._call("resume", found)
+
+    @staticmethod
+    def is_there(param: LayerParameter) -> bool:
+        """Return whether the module of a Python layer would be found."""
+        return can_import(param.python_param.module)
 
     def _load(self) -> Any:
         """Return an instance of the layer's class."""

@@ -1,0 +1,243 @@
+"""Faster R-CNN's layers that were Python code: beside plain loops, and a training that finds what it saw."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import netspec
+from netspec.dialects._faster import settings
+from netspec.dialects._proposals import all_anchors, base_anchors
+from netspec.errors import SpecError
+from netspec.layers import Layer
+from netspec.proto.schema import TEST, TRAIN
+
+Build = Callable[..., Layer]
+
+PYTHON = "type: 'Python' python_param {{ module: '{}' layer: '{}' param_str: \"{}\" }}"
+ANCHORS = PYTHON.format("rpn.anchor_target_layer", "AnchorTargetLayer", "'feat_stride': 16")
+REGIONS = PYTHON.format("rpn.proposal_target_layer", "ProposalTargetLayer", "'num_classes': 4")
+TRUTH = torch.tensor([[20.0, 30, 120, 150, 2], [150, 40, 400, 300, 3], [10, 10, 40, 40, 1]])
+IMAGE = torch.tensor([[320.0, 480, 1.5]])
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    width = min(a[2], b[2]) - max(a[0], b[0]) + 1
+    height = min(a[3], b[3]) - max(a[1], b[1]) + 1
+    if width <= 0 or height <= 0:
+        return 0.0
+    area, other = ((c[2] - c[0] + 1) * (c[3] - c[1] + 1) for c in (a, b))
+    return width * height / (area + other - width * height)
+
+
+def move(box: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    """The box that a target describes: what the proposals do with what is learned."""
+    sizes = box[2:] - box[:2] + 1
+    center = box[:2] + sizes / 2 + delta[:2] * sizes
+    half = np.exp(delta[2:]) * sizes / 2
+    return np.array([*(center - half), *(center + half - 1)])
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("'feat_stride': 16", {"feat_stride": 16}),
+        ("'feat_stride': 16 \n'scales': !!python/tuple [4, 8.5]", {"feat_stride": 16, "scales": [4, 8.5]}),
+        ("{'feat_stride': 8, 'scales': (2, 4), 'allowed_border': 0}", {"scales": [2, 4], "allowed_border": 0}),
+        ("feat_stride: 16\n", {"feat_stride": 16}),
+    ],
+)
+def test_what_param_str_says(build: Build, text: str, found: dict[str, object]) -> None:
+    escaped = text.replace("\n", "\\n")
+    param = PYTHON.format("rpn.anchor_target_layer", "AnchorTargetLayer", escaped)
+    layer = build("rcnn", param, (1, 18, 20, 30), (3, 5), (1, 3), tops=4)
+    assert found.items() <= settings(layer).items()
+
+
+def test_a_stride_must_be_given(build: Build) -> None:
+    with pytest.raises(SpecError, match=r"param_str has no feat_stride of at least 1; found 'x'"):
+        build("rcnn", ANCHORS.replace("'feat_stride': 16", "x"), (1, 18, 20, 30), (3, 5), (1, 3), tops=4)
+
+
+def test_anchors_that_show_an_object_are_moved_onto_it(build: Build) -> None:
+    scores = torch.zeros(1, 18, 20, 30)
+    layer = build("rcnn", ANCHORS, scores.shape, TRUTH.shape, IMAGE.shape, phase=TRAIN, tops=4)
+    labels, moves, inner, outer = (top.numpy() for top in layer.run(scores, TRUTH, IMAGE))
+    assert labels.shape == (1, 1, 9 * 20, 30)
+    by_anchor = labels.reshape(9, 20, 30).transpose(1, 2, 0).reshape(-1)
+    deltas, inside, outside = (
+        a.reshape(9, 4, 20, 30).transpose(2, 3, 0, 1).reshape(-1, 4) for a in (moves, inner, outer)
+    )
+    anchors = all_anchors(base_anchors(16, (0.5, 1, 2), (8, 16, 32)), 16, 20, 30)
+    truth = TRUTH.numpy()
+    table = np.array([[iou(anchor, true) for true in truth] for anchor in anchors])
+    within = (anchors[:, :2] >= 0).all(1) & (anchors[:, 2] < 480) & (anchors[:, 3] < 320)
+    best = np.where(within[:, None], table, -1).max(axis=0)
+    objects = within & ((table.max(axis=1) >= 0.7) | np.isclose(table, best).any(axis=1))
+    assert 3 <= objects.sum() <= 128
+    assert set(np.flatnonzero(by_anchor == 1)) == set(np.flatnonzero(objects))
+    assert (by_anchor >= 0).sum() == min(256, int(objects.sum() + (within & ~objects & (table.max(1) < 0.3)).sum()))
+    assert (by_anchor[~within] == -1).all()
+    assert (table[by_anchor == 0].max(axis=1) < 0.3).all()
+    for k in np.flatnonzero(objects):
+        np.testing.assert_allclose(move(anchors[k], deltas[k]), truth[table[k].argmax(), :4], atol=1e-3)
+    assert (inside == (by_anchor == 1)[:, None]).all()
+    np.testing.assert_allclose(outside, (by_anchor >= 0)[:, None] / np.float32((by_anchor >= 0).sum()) * np.ones(4))
+
+
+def test_an_image_without_a_true_box_is_background(build: Build) -> None:
+    scores, none = torch.zeros(1, 18, 20, 30), torch.zeros(0, 5)
+    layer = build("rcnn", ANCHORS, scores.shape, (3, 5), IMAGE.shape, phase=TRAIN, tops=4)
+    labels = layer.run(scores, none, IMAGE)[0]
+    assert (labels == 0).sum() == 256
+    assert not (labels == 1).any()
+    layer = build("rcnn", REGIONS, (5, 5), (3, 5), phase=TRAIN, tops=5)
+    regions, labels, *_ = layer.run(torch.tensor([[0.0, 0, 0, 9, 9]]), none)
+    assert regions.shape == (1, 5)
+    assert labels.tolist() == [0]
+
+
+def test_regions_that_show_an_object_are_moved_onto_it(build: Build) -> None:
+    rng = np.random.default_rng(0)
+    near = TRUTH[rng.integers(0, 3, 300), :4] + torch.from_numpy(rng.uniform(-30, 30, (300, 4)))
+    low, high = torch.minimum(near[:, :2], near[:, 2:]), torch.maximum(near[:, :2], near[:, 2:])
+    proposals = torch.cat([torch.zeros(300, 1), low, high], dim=1).float()
+    layer = build("rcnn", REGIONS, proposals.shape, TRUTH.shape, phase=TRAIN, tops=5)
+    regions, labels, moves, inner, outer = (top.numpy() for top in layer.run(proposals, TRUTH))
+    assert len(regions) == 128
+    assert layer.top_shapes[0] == (128, 5)
+    truth = TRUTH.numpy()
+    count = int((labels > 0).sum())
+    assert count == 32  # a quarter
+    assert not labels[count:].any()
+    for k in range(128):
+        table = [iou(regions[k, 1:], true) for true in truth]
+        own = truth[int(np.argmax(table))]
+        weights = np.zeros(16)
+        if k < count:
+            assert max(table) >= 0.5
+            assert labels[k] == own[4]
+            columns = slice(4 * int(own[4]), 4 * int(own[4]) + 4)
+            weights[columns] = 1
+            delta = moves[k, columns] * [0.1, 0.1, 0.2, 0.2]
+            np.testing.assert_allclose(move(regions[k, 1:], delta), own[:4], atol=1e-2)
+        else:
+            assert max(table) < 0.5
+        assert (inner[k] == weights).all()
+        assert (outer[k] == weights).all()
+
+
+def test_proposals_of_the_python_layer_are_the_dialects(build: Build) -> None:
+    text = PYTHON.format("rpn.proposal_layer", "ProposalLayer", "'feat_stride': 16")
+    torch.manual_seed(1)
+    bottoms = torch.rand(1, 18, 20, 30), torch.randn(1, 36, 20, 30) / 5, IMAGE
+    shapes = [b.shape for b in bottoms]
+    for phase, before, after in ((TEST, 6000, 300), (TRAIN, 12000, 2000)):
+        plain = f"type: 'Proposal' proposal_param {{ pre_nms_topn: {before} post_nms_topn: {after} }}"
+        expected = build("rcnn", plain, *shapes, phase=phase).run(*bottoms)[0]
+        assert torch.equal(build("rcnn", text, *shapes, phase=phase).run(*bottoms)[0], expected)
+
+
+def test_code_that_may_run_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "rpn").mkdir()
+    (tmp_path / "rpn" / "proposal_layer.py").write_text("raise ValueError('this is mine')")
+    net = 'layer {{ name: "p" top: "x" {} }}'
+    text = net.format(PYTHON.format("rpn.proposal_layer", "ProposalLayer", "'feat_stride': 16"))
+    (tmp_path / "net.prototxt").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SpecError, match="found 0 bottom blob"):
+        netspec.load_net("net.prototxt")
+    with pytest.raises(SpecError, match="this is mine"):
+        netspec.load_net("net.prototxt", allow_python=True)
+
+
+TINY = """
+layer { name: "input-data" type: "Python" top: "data" top: "im_info" top: "gt_boxes"
+  python_param { module: "roi_data_layer.layer" layer: "RoIDataLayer" param_str: "'num_classes': 3" } }
+layer { name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
+  convolution_param { num_output: 16 kernel_size: 8 stride: 8 weight_filler { type: "xavier" } } }
+layer { name: "relu1" type: "ReLU" bottom: "conv1" top: "conv1" }
+layer { name: "conv2" type: "Convolution" bottom: "conv1" top: "conv2"
+  convolution_param { num_output: 32 kernel_size: 4 pad: 1 stride: 2 weight_filler { type: "xavier" } } }
+layer { name: "relu2" type: "ReLU" bottom: "conv2" top: "conv2" }
+layer { name: "rpn" type: "Convolution" bottom: "conv2" top: "rpn"
+  convolution_param { num_output: 32 kernel_size: 5 pad: 2 weight_filler { type: "xavier" } } }
+layer { name: "rpn_relu" type: "ReLU" bottom: "rpn" top: "rpn" }
+layer { name: "rpn_cls_score" type: "Convolution" bottom: "rpn" top: "rpn_cls_score"
+  convolution_param { num_output: 18 kernel_size: 1 weight_filler { type: "gaussian" std: 0.01 } } }
+layer { name: "rpn_bbox_pred" type: "Convolution" bottom: "rpn" top: "rpn_bbox_pred"
+  convolution_param { num_output: 36 kernel_size: 1 weight_filler { type: "gaussian" std: 0.01 } } }
+layer { name: "rpn_cls_score_reshape" type: "Reshape" bottom: "rpn_cls_score" top: "rpn_cls_score_reshape"
+  reshape_param { shape { dim: 0 dim: 2 dim: -1 dim: 0 } } }
+layer { name: "rpn-data" type: "Python" bottom: "rpn_cls_score" bottom: "gt_boxes" bottom: "im_info" bottom: "data"
+  top: "rpn_labels" top: "rpn_bbox_targets" top: "rpn_bbox_inside_weights" top: "rpn_bbox_outside_weights"
+  python_param { module: "rpn.anchor_target_layer" layer: "AnchorTargetLayer" param_str: "'feat_stride': 16" } }
+layer { name: "rpn_loss_cls" type: "SoftmaxWithLoss" bottom: "rpn_cls_score_reshape" bottom: "rpn_labels"
+  top: "rpn_cls_loss" propagate_down: 1 propagate_down: 0 loss_weight: 1
+  loss_param { ignore_label: -1 normalize: true } }
+layer { name: "rpn_loss_bbox" type: "SmoothL1Loss" bottom: "rpn_bbox_pred" bottom: "rpn_bbox_targets"
+  bottom: "rpn_bbox_inside_weights" bottom: "rpn_bbox_outside_weights" top: "rpn_loss_bbox" loss_weight: 1
+  smooth_l1_loss_param { sigma: 3.0 } }
+layer { name: "rpn_cls_prob" type: "Softmax" bottom: "rpn_cls_score_reshape" top: "rpn_cls_prob" }
+layer { name: "rpn_cls_prob_reshape" type: "Reshape" bottom: "rpn_cls_prob" top: "rpn_cls_prob_reshape"
+  reshape_param { shape { dim: 0 dim: 18 dim: -1 dim: 0 } } }
+layer { name: "proposal" type: "Python" bottom: "rpn_cls_prob_reshape" bottom: "rpn_bbox_pred" bottom: "im_info"
+  top: "rpn_rois"
+  python_param { module: "rpn.proposal_layer" layer: "ProposalLayer" param_str: "'feat_stride': 16" } }
+layer { name: "roi-data" type: "Python" bottom: "rpn_rois" bottom: "gt_boxes"
+  top: "rois" top: "labels" top: "bbox_targets" top: "bbox_inside_weights" top: "bbox_outside_weights"
+  python_param { module: "rpn.proposal_target_layer" layer: "ProposalTargetLayer" param_str: "'num_classes': 3" } }
+layer { name: "roi_pool" type: "ROIPooling" bottom: "conv2" bottom: "rois" top: "pool"
+  roi_pooling_param { pooled_w: 4 pooled_h: 4 spatial_scale: 0.0625 } }
+layer { name: "fc" type: "InnerProduct" bottom: "pool" top: "fc"
+  inner_product_param { num_output: 64 weight_filler { type: "xavier" } } }
+layer { name: "relu_fc" type: "ReLU" bottom: "fc" top: "fc" }
+layer { name: "cls_score" type: "InnerProduct" bottom: "fc" top: "cls_score"
+  inner_product_param { num_output: 3 weight_filler { type: "gaussian" std: 0.01 } } }
+layer { name: "bbox_pred" type: "InnerProduct" bottom: "fc" top: "bbox_pred"
+  inner_product_param { num_output: 12 weight_filler { type: "gaussian" std: 0.001 } } }
+layer { name: "loss_cls" type: "SoftmaxWithLoss" bottom: "cls_score" bottom: "labels" top: "loss_cls" loss_weight: 1 }
+layer { name: "loss_bbox" type: "SmoothL1Loss" bottom: "bbox_pred" bottom: "bbox_targets" bottom: "bbox_inside_weights"
+  bottom: "bbox_outside_weights" top: "loss_bbox" loss_weight: 1 }
+"""
+
+
+@pytest.mark.slow
+def test_a_small_faster_rcnn_learns_five_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(5)
+    entries = []
+    for i in range(5):
+        image = rng.integers(90, 130, (120, 160, 3)).astype(np.uint8)
+        x, y, kind = int(rng.integers(5, 80)), int(rng.integers(5, 50)), 1 + i % 2
+        image[y : y + 60, x : x + 60] = (240, 30, 30) if kind == 1 else (30, 30, 240)
+        cv2.imwrite(f"{i}.png", image)
+        entries.append({"image": f"{i}.png", "boxes": [[x, y, x + 59, y + 59]], "gt_classes": [kind]})
+    Path("train.prototxt").write_text(TINY)
+    Path("solver.prototxt").write_text(
+        'train_net: "train.prototxt" base_lr: 0.002 lr_policy: "fixed" momentum: 0.9 max_iter: 100 random_seed: 3\n'
+        "snapshot_after_train: false display: 0"
+    )
+    solver = netspec.load_solver("solver.prototxt")
+    solver.net.layers[0].set_roidb(entries)
+    losses = []
+    for _ in range(80):
+        solver.step(1)
+        losses.append(solver.loss)
+    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:5])
+    net = solver.net
+    net.keep = ["rois", "labels", "cls_score", "bbox_pred", "gt_boxes"]
+    right = []
+    for _ in entries:
+        net()
+        rois, labels, scores, moves, truth = (net.blobs[name].detach().numpy() for name in net.keep)
+        objects = np.flatnonzero(labels)
+        right += list(scores[objects].argmax(axis=1) == labels[objects])
+        (true,) = truth
+        best = objects[scores[objects].max(axis=1).argmax()]
+        delta = moves[best].reshape(3, 4)[int(true[4])] * [0.1, 0.1, 0.2, 0.2]
+        assert iou(move(rois[best, 1:], delta), true[:4]) > 0.6
+    assert np.mean(right) > 0.8
