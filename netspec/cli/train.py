@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -180,7 +181,9 @@ def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
     prefix = solver.param.snapshot_prefix
     if not has_locks():
         log.logger.warning(f'no file locks here: nothing stops another training from writing over "{prefix}"')
-    return only_one(f"{prefix}.lock", f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
+    folder, name = os.path.split(prefix)
+    lock = os.path.join(folder, f".{name}.lock")
+    return only_one(lock, f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
 
 
 def _board(solver: Solver, folder: str | None) -> AbstractContextManager[object]:

@@ -13,6 +13,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -29,6 +30,8 @@ except ImportError:  # Windows: there, a file that is open cannot be removed
 
 NO_NUL = "a name has no character NUL"
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
+_MARK = re.compile(rb"a lock of netspec, held by process (\d+)\n")
+_AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # no link, and no pipe that nobody writes to
 _swept: set[Path] = set()
 
 
@@ -36,8 +39,9 @@ _swept: set[Path] = set()
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path`` to write to; it is renamed once the block is done and all is on disk.
 
-    A symbolic link stays one; a pipe or a device gets the bytes. If the block fails, the temporary file is removed, and
-    what was at ``path`` is still there. Raises SpecError if it cannot be written.
+    A symbolic link stays one; a pipe or a device gets the bytes. A file that is replaced passes on its mode and owner.
+    If the block fails, the temporary file is removed, and what was at ``path`` is still there. Raises SpecError if it
+    cannot be written.
     """
     if "\0" in str(path):
         raise _fault(f"cannot be written: {NO_NUL}", path)
@@ -47,9 +51,12 @@ def whole_file(path: str | Path) -> Iterator[Path]:
             with _copied_to(real) as unfinished:
                 yield unfinished
             return
+        before = real.stat() if real.is_file() else None
         with _temporary(real) as unfinished:
-            with _created(unfinished) as held:
+            with _created(unfinished, 0o666 if before is None else 0o600) as held:
                 yield unfinished
+                if before is not None and hasattr(os, "fchown"):  # Windows has none
+                    _pass_on(before, held)
                 os.fsync(held)
                 if fcntl is not None:
                     unfinished.replace(real)  # while it is locked, so that no sweep removes it
@@ -89,21 +96,33 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 def only_one(path: str | Path, advice: str) -> Iterator[None]:
     """Hold the lock file ``path`` within the block; it is released whichever way the process ends.
 
-    Where the system or the file system has no locks, nothing is locked. Raises SpecError, which ends with ``advice``,
-    if another process holds it or it cannot be made.
+    A lock that a killed run left is taken; a file that is no lock is left as it is. Where the system or the file system
+    has no locks, nothing is locked. Raises SpecError, which ends with ``advice``, if another process holds it or it
+    cannot be made.
     """
     path = Path(path)
+    mark = f"a lock of netspec, held by process {os.getpid()}\n".encode()
     try:
-        held, locked = _open_locked(path, os.O_CREAT | os.O_RDWR)
+        try:
+            held, locked = _open_locked(path, os.O_CREAT | os.O_EXCL | os.O_RDWR)
+            os.write(held, mark)
+        except FileExistsError:
+            if path.is_symlink() or not path.is_file():
+                raise _fault("is no lock of netspec; move it away", path) from None
+            held, locked = _open_locked(path, os.O_RDWR)
     except OSError as fault:
         raise _fault(f"cannot be written: {fault.strerror}", path) from None
     try:
+        os.lseek(held, 0, os.SEEK_SET)
+        owner = _MARK.fullmatch(os.read(held, 100))
         if not locked:
-            owner = os.read(held, 20).decode(errors="replace").strip()
-            of = f" (process {owner})" if owner.isdigit() else ""
+            of = f" (process {int(owner[1])})" if owner else ""
             raise _fault(f"is held by another run{of}; {advice}", path)
+        if not owner:
+            raise _fault("is no lock of netspec; move it away", path)
         os.ftruncate(held, 0)
-        os.write(held, f"{os.getpid()}\n".encode())
+        os.lseek(held, 0, os.SEEK_SET)
+        os.write(held, mark)
         try:
             yield
         finally:
@@ -168,22 +187,34 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _created(path: Path) -> Iterator[int]:
+def _created(path: Path, mode: int) -> Iterator[int]:
     """Create a file and lock it; yield its descriptor."""
-    held, _ = _open_locked(path, os.O_CREAT | os.O_EXCL | os.O_RDWR)
+    held, _ = _open_locked(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
     try:
         yield held
     finally:
         os.close(held)
 
 
-def _open_locked(path: Path, flags: int) -> tuple[int, bool]:
+def _pass_on(before: os.stat_result, held: int) -> None:
+    """Give a file the owner and the mode of the one that it replaces; another group gets no rights."""
+    mode = stat.S_IMODE(before.st_mode)
+    with suppress(OSError):
+        os.fchown(held, before.st_uid, -1)
+    with suppress(OSError):
+        os.fchown(held, -1, before.st_gid)
+    if os.fstat(held).st_gid != before.st_gid:
+        mode &= ~0o070
+    os.fchmod(held, mode)
+
+
+def _open_locked(path: Path, flags: int, mode: int = 0o666) -> tuple[int, bool]:
     """Open a file and lock it; return its descriptor, and False if another process holds the lock.
 
     Another process may remove the file before it is locked here: then it is opened again.
     """
     while True:
-        held = os.open(path, flags, 0o666)
+        held = os.open(path, flags | _AS_IT_IS, mode)
         locked = _lock(held) is not False
         with suppress(FileNotFoundError):
             if not locked or os.path.samestat(os.fstat(held), path.stat()):
@@ -220,11 +251,12 @@ def _is_abandoned(path: Path) -> bool:
     if fcntl is None:
         return True
     try:
-        held = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        held = os.open(path, os.O_RDONLY | _AS_IT_IS)
     except OSError:
         return False
     try:
-        return _lock(held) is True
+        kind = os.fstat(held).st_mode
+        return (stat.S_ISREG(kind) or stat.S_ISDIR(kind)) and _lock(held) is True
     finally:
         os.close(held)
 

@@ -158,14 +158,16 @@ def test_nothing_is_written_by_a_net_that_is_only_timed_or_checked(output_net: C
 def test_two_trainings_on_one_prefix(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     case = CASES["train"]
     case.prepare()
-    with whole_file.only_one("out/x.lock", ""):
+    with whole_file.only_one("out/.x.lock", ""):
         assert case.main(case.words) == 1
     line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("out/x.lock: is held by another run")
+    assert line.startswith("out/.x.lock: is held by another run")
     assert line.endswith('give each training a snapshot_prefix of its own, not "out/x" to both')
     assert not contents()
+    Path("out/x.lock").write_text("another program's")
     assert case.main(case.words) == 0
-    assert not Path("out/x.lock").exists()
+    assert Path("out/x.lock").read_text() == "another program's"
+    assert not Path("out/.x.lock").exists()
 
 
 def test_snapshots_over_2_gib_are_refused_at_the_start(

@@ -162,5 +162,66 @@ def test_a_lock_dies_with_its_process(tmp_path: Path) -> None:
             pass
         process.send_signal(signal.SIGKILL)
     with package.only_one(tmp_path / "x.lock", "choose another name"):
-        assert (tmp_path / "x.lock").read_text() == f"{os.getpid()}\n"
+        assert (tmp_path / "x.lock").read_text() == f"a lock of netspec, held by process {os.getpid()}\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_leaves_what_others_made_as_it_was(tmp_path: Path) -> None:
+    theirs, target, link = tmp_path / "poetry", tmp_path / "target", tmp_path / "link"
+    theirs.write_text("[[package]]\n")
+    link.symlink_to(target)
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "folder").mkdir()
+    for name in ("poetry", "link", "fifo", "folder"):
+        with pytest.raises(ValueError, match=f"{name}: is no lock of netspec"), package.only_one(tmp_path / name, ""):
+            pass
+    assert theirs.read_text() == "[[package]]\n"
+    assert link.is_symlink()
+    assert not target.exists()
+
+
+def test_a_lock_that_a_killed_run_left_is_taken(tmp_path: Path) -> None:
+    with start("held = only_one('x', ''); held.__enter__()", tmp_path) as process:
+        process.kill()
+    assert (tmp_path / "x").exists()
+    with package.only_one(tmp_path / "x", ""):
+        assert str(os.getpid()) in (tmp_path / "x").read_text()
+    assert not (tmp_path / "x").exists()
+
+
+def test_what_is_named_like_a_leftover_and_is_none_neither_blocks_nor_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(package, "_swept", set())
+    os.mkfifo(tmp_path / ".x.01234567.unfinished")
+    (tmp_path / ".y.01234567.unfinished").symlink_to("nowhere")
+    with package.whole_file(tmp_path / "file") as unfinished:
+        unfinished.write_text("new")
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_mode_and_owner_of_what_is_replaced_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, link = tmp_path / "file", tmp_path / "link"
+    path.touch()
+    link.symlink_to(path)
+    for mode in (0o600, 0o755, 0o664):
+        path.chmod(mode)
+        with package.whole_file(link) as unfinished:
+            assert unfinished.stat().st_mode & 0o777 & ~mode == 0  # nobody else may read it meanwhile either
+            unfinished.write_text("new")
+        assert path.stat().st_mode & 0o7777 == mode
+    if os.geteuid() == 0:
+        os.chown(path, 1234, 4321)
+        with package.whole_file(path) as unfinished:
+            unfinished.write_text("new")
+        assert (path.stat().st_uid, path.stat().st_gid) == (1234, 4321)
+
+    def refused(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "fchown", refused)
+    path.chmod(0o660)
+    os.chown(path, -1, 4322 if os.geteuid() == 0 else -1)
+    with package.whole_file(path) as unfinished:
+        unfinished.write_text("new")
+    assert os.geteuid() or path.stat().st_mode & 0o777 == 0o600  # the group is another one
