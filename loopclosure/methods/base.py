@@ -97,9 +97,10 @@ METHODS: dict[str, str] = {
     "features": "loopclosure.methods.features:features",
     "describe": "loopclosure.methods.described:described",
     "verified": "loopclosure.methods.verified:verified",
+    "auto": "loopclosure.methods.auto:auto",
     "detector": "loopclosure.methods.online:online",
 }
-REFINERS = ("seqslam", "verified")
+REFINERS = ("seqslam", "verified", "auto")
 
 # The argument after the colon, the context, the inner method.
 Factory = Callable[[str, MethodContext, "Method | None"], Method]

@@ -1,0 +1,235 @@
+"""Loops without settings: ``auto+METHOD`` on the command line, and what ``loopclosure detect`` does.
+
+The scores of METHOD are searched for sequences, and decoys tell which matches are loops
+(:mod:`loopclosure.methods.decoys`). Matches are verified by geometry where that can work here: it must find many of the
+matches and none of the pairs that the scores call unlike. Then what is verified is a loop even where sequences tell
+nothing, and what sequences find without any verified pair on it is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from loopclosure.detector.verification import LEAST_MATCHES, Agreement, GeometricCheck, Pairs
+from loopclosure.errors import InputError
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
+from loopclosure.methods.decoys import Found, best_setting
+from loopclosure.methods.settings import configure
+from loopclosure.places.frames import read_gray
+from loopclosure.progress import Progress, silent, timed
+
+PRECISION = 0.99
+SAMPLE = 40  # matches, and unlike pairs, that tell whether verification works
+# The share of what sequences accept, or without sequences the number of matches, that verification must find.
+LEAST_SHARE, LEAST_FOUND = 0.5, 3
+WINDOW = 5  # references beside a line, and at least so many queries along it, that a verified pair vouches for
+
+Agree = Callable[[int, int], Agreement]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is a loop, and why.
+
+    match     (Q,) each query's best reference, -1 without one
+    score     (Q,) its score, that of a sequence where sequences are used; -inf without one
+    verdicts  Q words: "accepted", "no candidate", "below threshold", "not verified" (rejected)
+    inliers   (Q,) of the match, -1 where it was not verified
+    unverifiable  how many matches had too few points to be verified or rejected
+    reasons   three sentences: what was chosen, and why
+    """
+
+    match: np.ndarray
+    score: np.ndarray
+    verdicts: list[str]
+    inliers: np.ndarray
+    unverifiable: int
+    reasons: list[str]
+
+    @property
+    def accepted(self) -> np.ndarray:
+        """Which queries (Q,) close a loop with their match."""
+        return np.array([verdict == "accepted" for verdict in self.verdicts], bool)
+
+    def counts(self) -> str:
+        """Say in one sentence what became of all queries."""
+        words = [f"{self.verdicts.count(word)} {word}" for word in dict.fromkeys(self.verdicts)]
+        best = f"; best score {self.score.max():.4g}" if np.any(np.isfinite(self.score)) else ""
+        return f"queries: {', '.join(words)}; {self.unverifiable} could not be verified{best}"
+
+
+def answer(
+    scores: np.ndarray,
+    allowed: np.ndarray,
+    two: bool,
+    precision: float = PRECISION,
+    check: GeometricCheck | None = None,
+    agree: Agree | None = None,
+    progress: Progress = silent,
+) -> Answer:
+    """Decide which best matches of scores (Q, R), higher = more alike, are loops.
+
+    allowed    (Q, R) bool: the candidates
+    two        two traverses, in the order of time each, or one sequence with itself
+    precision  the share of what is accepted that should be right
+    check, agree  verification of a query and a reference, by number; None: there are no images
+    """
+    if not 0 < precision < 1:
+        raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
+    known = np.where(allowed & np.isfinite(scores), scores, -np.inf)
+    single = known.argmax(axis=1)
+    score = known.max(axis=1)
+    there = np.isfinite(score)
+    match = np.where(there, single, -1)
+    accepted = np.zeros(len(match), bool)
+    found = best_setting(scores, np.isfinite(known), two, precision)
+    reasons = [_sequences_said(found, precision)]
+    if found is not None:
+        match, score, accepted = found.match.copy(), found.targets, found.accepted(precision)
+        there = match >= 0
+    verdicts = np.where(accepted, "accepted", np.where(there, "below threshold", "no candidate")).astype(object)
+    inliers = np.full(len(match), -1)
+    unverifiable = 0
+    if check is None or agree is None:
+        reasons += ["verification: not tried, there are no images", _total_said(accepted, there)]
+        return Answer(match, score, verdicts.tolist(), inliers, 0, reasons)
+    works, said = _verification_works(known, match, score, accepted, check, agree)
+    reasons.append(said)
+    if works:
+        few = np.zeros(len(match), bool)
+        for query in progress(np.flatnonzero(there), "verification", int(np.count_nonzero(there))):
+            for reference in dict.fromkeys((int(match[query]), int(single[query]))):
+                agreement = agree(int(query), reference)
+                inliers[query] = check.enough(agreement)
+                few[query] = agreement.matches < LEAST_MATCHES
+                if inliers[query]:
+                    match[query] = reference
+                    break
+        unverifiable = int(np.count_nonzero(few & there & (inliers <= 0)))
+        verified = inliers > 0
+        supported = _supported(match, verified, found)
+        verdicts[accepted & ~supported] = "not verified"
+        verdicts[there & ~accepted & ~supported] = "not verified" if found is None else "below threshold"
+        verdicts[verified | (accepted & supported)] = "accepted"
+        accepted = verdicts == "accepted"
+        if found is not None:
+            score = np.where(there, found.scores[np.arange(len(match)), match], -np.inf)
+            score = np.where(np.isnan(score), -np.inf, score)
+    reasons.append(_total_said(accepted, there))
+    return Answer(match, score, verdicts.tolist(), inliers, unverifiable, reasons)
+
+
+def _sequences_said(found: Found | None, precision: float) -> str:
+    if found is None:
+        return "sequences: none is better than the same ones backwards, so that images are compared one by one"
+    return (
+        f"{found.setting}: a score of {found.threshold(precision):.4g} or more, since backwards the best of a query is "
+        f"{np.median(found.decoys):.4g} in the middle and {found.decoys.max():.4g} at most"
+    )
+
+
+def _total_said(accepted: np.ndarray, there: np.ndarray) -> str:
+    count = np.count_nonzero(accepted)
+    if count:
+        return f"{count} of {np.count_nonzero(there)} queries with a candidate close a loop"
+    return "nothing here tells loops from chance: none is accepted (a threshold of your own accepts more)"
+
+
+def _verification_works(
+    known: np.ndarray, match: np.ndarray, score: np.ndarray, accepted: np.ndarray, check: GeometricCheck, agree: Agree
+) -> tuple[bool, str]:
+    """Try matches and unlike pairs; return whether verification tells them apart, and a sentence."""
+    likely = np.flatnonzero(accepted) if accepted.any() else np.argsort(-score, kind="stable")[:SAMPLE]
+    likely = likely[match[likely] >= 0]
+    if not len(likely):
+        return False, "verification: not tried, no query has a candidate"
+    likely = likely[np.unique(np.linspace(0, len(likely) - 1, SAMPLE).round().astype(int))]
+    same = sum(check.enough(agree(int(query), int(match[query]))) > 0 for query in likely)
+    wide = np.flatnonzero(np.count_nonzero(np.isfinite(known), axis=1) >= 8)
+    wide = wide[np.unique(np.linspace(0, len(wide) - 1, SAMPLE).round().astype(int))] if len(wide) else wide
+    unlike = 0
+    for query in wide:
+        order = np.argsort(known[query], kind="stable")
+        candidates = order[np.isfinite(known[query, order])]
+        # One of the least alike quarter, another quarter of them each time.
+        reference = candidates[int(query) % max(1, len(candidates) // 4)]
+        unlike += check.enough(agree(int(query), int(reference))) > 0
+    tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(wide)} unlike pairs"
+    if unlike > 1:
+        return False, f"{tried}: something is the same in all images, so that it is not used"
+    if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
+        return False, f"{tried}: these images cannot be verified, so that nothing is rejected for it"
+    return True, f"{tried}: what is verified is a loop, and what has no verified pair near it is none"
+
+
+def _supported(match: np.ndarray, verified: np.ndarray, found: Found | None) -> np.ndarray:
+    """Return the queries (Q,) that are verified or, of sequences, have a verified match on the line through their own.
+
+    The line has the length and the velocities of the sequences, and is ``WINDOW`` references wide to each side.
+    """
+    supported = verified.copy()
+    if found is None:
+        return supported
+    sequence, numbers = found.setting.sequence, np.arange(len(match))
+    for step in range(1, max(WINDOW, sequence.length // 2) + 1):
+        for sign in (-1, 1):
+            other = numbers + sign * step
+            inside = np.flatnonzero((other >= 0) & (other < len(match)))
+            moved = (match[other[inside]] - match[inside]) * sign
+            low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW
+            supported[inside[(moved >= low) & (moved <= high) & verified[other[inside]]]] = True
+    return supported
+
+
+@dataclass
+class Auto:
+    """The loops of another method's scores, chosen without truth; only what is accepted gets a score.
+
+    precision       the share of what is accepted that should be right
+    exclude_frames  in one sequence, references within this many frames of the query are not candidates
+    """
+
+    inner: Method
+    check: GeometricCheck = field(default_factory=GeometricCheck)
+    precision: float = PRECISION
+    exclude_frames: int = 0
+    pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
+
+    @property
+    def name(self) -> str:
+        """The inner method's name after ``auto+``."""
+        return f"auto+{self.inner.name}"
+
+    def score(self, images: Images, progress: Progress) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says; NaN for what is not accepted."""
+        found = self.inner.score(images, progress)
+        seconds = dict(found.seconds)
+        two = images.references is not None
+        references = images.queries if images.references is None else images.references
+        allowed = np.isfinite(found.scores)
+        if not two:
+            allowed &= earlier(len(images.queries), self.exclude_frames)
+
+        def agree(query: int, reference: int) -> Agreement:
+            return self.pairs.agreement(self.check, images.queries[query], references[reference])
+
+        with timed(seconds, "choice and verification"):
+            decided = answer(found.scores, allowed, two, self.precision, self.check, agree, progress)
+        scores = np.full(found.scores.shape, np.nan)
+        loops = np.flatnonzero(decided.accepted)
+        scores[loops, decided.match[loops]] = decided.score[loops]
+        notes = [*found.notes, *decided.reasons, decided.counts()]
+        return MethodResult(scores, seconds, notes, found.training_stages)
+
+
+def auto(argument: str, context: MethodContext, inner: Method | None) -> Auto:
+    """Build ``auto[:setting=value,...]+METHOD``."""
+    if inner is None:
+        raise InputError("auto needs a method whose scores it judges; write auto+METHOD, as in auto+features:F.npz")
+    plain = Auto(inner, exclude_frames=context.exclude_frames, pairs=context.pairs)
+    method, check = configure("auto", argument, plain, plain.check)
+    method.check = check
+    return method

@@ -1,0 +1,145 @@
+"""Which matches are loops, told from the scores alone: sequences against the same sequences backwards.
+
+A match that repeats a stretch of road lies on a line of similar pairs, in the direction in which time runs. Searched
+for with the references in reverse order, the same matrix has lines too, as similar as different places get on this
+camera, but (nearly) none of the same place. So the best reverse line of each query is a decoy: what its best forward
+line would score if it had no loop. How decoys are distributed says how many of the forward lines above a score are
+wrong, without truth: target-decoy competition as in Elias and Gygi, "Target-decoy search strategy" (Nature Methods
+2007), with an exponential tail (the peaks over a threshold of extreme-value theory), whose scale is widened by the
+uncertainty of the few independent decoys there are.
+
+A camera that turns back and forth over the same things makes decoys as good as loops. Then little is accepted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopclosure.methods.seqslam import SequenceSettings, standardize, trajectory_costs
+
+LENGTHS = (10, 30, 60)
+# Velocities, as shares of the ratio of the lengths: even motion, and stops and spurts.
+EVEN, UNEVEN = (0.8, 1.2, 0.1), (0.5, 2.0, 0.1875)
+TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so many:
+LEAST_TAIL = 5
+# Fewer matches than this are not told from one chance sequence.
+LEAST_ACCEPTED = 10
+# A shorter sequence is preferred to a longer one that accepts only this much more: it ends nearer to where a loop ends.
+NEARLY = 0.95
+# Neighbors of a query, so many before and after, may fit its match better.
+REACH = 4
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How sequences are searched; ``standardized``: rows and columns of the scores first."""
+
+    sequence: SequenceSettings
+    standardized: bool = False
+
+    def __str__(self) -> str:
+        s = self.sequence
+        scaled = ", rows and columns standardized" if self.standardized else ""
+        return f"sequences of {s.length} frames at {s.slowest:.3g} to {s.fastest:.3g} references a query{scaled}"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search found.
+
+    scores   (Q, R) of the line through each pair, higher = more alike; NaN for what is no candidate
+    match    (Q,) each query's best reference, -1 without one
+    targets  (Q,) its score, -inf without one
+    decoys   (Q,) the best score of a reverse line, -inf without one
+    near     (Q,) bool: of the queries just before and after, none that is far fits the match better. Where a loop ends,
+             the line through its last place is the best one for a while
+    """
+
+    setting: Setting
+    scores: np.ndarray
+    match: np.ndarray
+    targets: np.ndarray
+    decoys: np.ndarray
+    near: np.ndarray
+
+    def threshold(self, precision: float) -> float:
+        """Return the least score above which at least this share of the best matches is right; inf if none is."""
+        return threshold(self.targets, self.decoys, precision, self.setting.sequence.length / 2)
+
+    def accepted(self, precision: float) -> np.ndarray:
+        """Return which best matches (Q,) are loops; none if they are too few to tell."""
+        accepted = (self.targets >= self.threshold(precision)) & self.near
+        return accepted if np.count_nonzero(accepted) >= LEAST_ACCEPTED else np.zeros_like(accepted)
+
+
+def threshold(targets: np.ndarray, decoys: np.ndarray, precision: float, together: float = 1.0) -> float:
+    """Return the least score t such that of the targets >= t the share of wrong ones is at most 1 - ``precision``.
+
+    targets, decoys  (Q,) best scores of each query, -inf without one; a wrong target is distributed as a decoy
+    together         how many neighboring decoys tell no more than one
+    """
+    decoys = np.sort(decoys[np.isfinite(decoys)])[::-1]
+    scores = np.sort(targets[np.isfinite(targets)])[::-1]
+    tail = max(LEAST_TAIL, int(TAIL * len(decoys)))
+    if len(decoys) < 4 * LEAST_TAIL:
+        return np.inf
+    level = decoys[tail]
+    scale = (decoys[:tail] - level).mean() * (1 + np.sqrt(together / tail)) + 1e-12
+    wrong = np.where(scores > level, tail / len(decoys) * np.exp(-np.maximum(scores - level, 0) / scale), 1.0)
+    good = np.flatnonzero(len(scores) * wrong <= (1 - precision) * np.arange(1, len(scores) + 1))
+    return float(scores[good[-1]]) if len(good) else np.inf
+
+
+def settings(queries: int, references: int, two: bool) -> Iterator[Setting]:
+    """Yield the settings worth trying, the simplest first; ``two`` traverses, or one sequence with itself."""
+    ratio = references / queries if two else 1.0
+    for length in LENGTHS:
+        if 2.5 * length > min(queries, references / ratio):
+            continue
+        for slowest, fastest, step in (EVEN, UNEVEN):
+            sequence = SequenceSettings(length, slowest * ratio, fastest * ratio, step * ratio, contrast=0)
+            for standardized in (False, True)[: 1 + two]:
+                yield Setting(sequence, standardized)
+
+
+def search(scores: np.ndarray, allowed: np.ndarray, setting: Setting, two: bool) -> Found:
+    """Search scores (Q, R), higher = more alike, for lines through ``allowed`` (Q, R) pairs."""
+    distances = np.where(allowed, -scores, np.nan)
+    if setting.standardized:
+        distances = standardize(distances)
+    forward = np.where(allowed, -trajectory_costs(distances, setting.sequence), np.nan)
+    reverse = np.where(allowed, -trajectory_costs(distances[:, ::-1], setting.sequence)[:, ::-1], np.nan)
+    best = np.where(np.isnan(forward), -np.inf, forward)
+    match, targets = best.argmax(axis=1), best.max(axis=1)
+    decoys = np.where(np.isnan(reverse), -np.inf, reverse).max(axis=1)
+    ratio = len(best[0]) / len(best) if two else 1.0
+    owner = _owner(best, match, setting.sequence.length)
+    near = np.abs(owner - np.arange(len(best))) <= max(REACH, 1 / ratio)
+    return Found(setting, forward, np.where(np.isneginf(targets), -1, match), targets, decoys, near)
+
+
+def _owner(best: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
+    """Return the query (Q,) that fits each query's match best, of those that are at most ``length`` away."""
+    owner = np.arange(len(best))
+    score = best[owner, match]
+    for step in (*range(-length, 0), *range(1, length + 1)):
+        other = np.arange(len(best)) + step
+        there = np.flatnonzero((other >= 0) & (other < len(best)))
+        value = best[other[there], match[there]]
+        better = there[value > score[there]]
+        owner[better], score[better] = other[better], best[other[better], match[better]]
+    return owner
+
+
+def best_setting(scores: np.ndarray, allowed: np.ndarray, two: bool, precision: float) -> Found | None:
+    """Return the search that finds the most loops at this precision; None if none finds any."""
+    chosen, most = None, 0
+    for setting in settings(*scores.shape, two):
+        found = search(scores, allowed, setting, two)
+        count = np.count_nonzero(found.accepted(precision))
+        if count * NEARLY > most:
+            chosen, most = found, count
+    return chosen

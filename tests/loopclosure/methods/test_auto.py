@@ -1,0 +1,180 @@
+"""Loops without settings: what sequences, decoys and verification decide, on drives whose truth is known."""
+
+import numpy as np
+import pytest
+
+from loopclosure.detector.verification import Agreement, GeometricCheck
+from loopclosure.errors import InputError
+from loopclosure.methods.auto import answer
+from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
+from loopclosure.methods.decoys import threshold
+from loopclosure.progress import silent
+
+SIZE = 64
+
+
+def drive(frames, seed):
+    """Descriptors (frames, 64) of length 1 that change slowly: neighbors are alike."""
+    steps = np.random.default_rng(seed).normal(size=(frames + 6, SIZE))
+    rows = sum(steps[k : k + frames] for k in range(6))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def again(rows, noise, seed):
+    """The same places in other weather."""
+    seen = rows + noise / np.sqrt(SIZE) * np.random.default_rng(seed).normal(size=rows.shape)
+    return seen / np.linalg.norm(seen, axis=1, keepdims=True)
+
+
+def alike(a, b):
+    return a @ b.T
+
+
+def everything(scores):
+    return np.ones(scores.shape, bool)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_traverses_of_one_road_are_matched(seed):
+    road = drive(150, seed)
+    scores = alike(again(road, 1.5, seed + 50), road)
+    found = answer(scores, everything(scores), two=True)
+    assert np.count_nonzero(found.accepted) > 0.9 * 150
+    assert np.all(np.abs(found.match - np.arange(150))[found.accepted] <= 3)
+    assert len(found.reasons) == 3
+    assert found.reasons[0].startswith("sequences of ")
+    assert "accepted" in found.counts()
+    assert "best score" in found.counts()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_roads_that_share_no_place_have_no_loop(seed):
+    scores = alike(drive(150, seed), drive(120, seed + 100))
+    found = answer(scores, everything(scores), two=True)
+    assert not found.accepted.any()
+    assert "none is accepted" in found.reasons[2]
+    assert found.counts().startswith("queries: 150 below threshold; 0 could not be verified; best score ")
+
+
+def test_a_drive_against_keyframes():
+    road = drive(200, 1)
+    scores = alike(again(road, 1.0, 2), road[::4])
+    found = answer(scores, everything(scores), two=True)
+    assert np.count_nonzero(found.accepted) > 0.9 * 200
+    assert np.all(np.abs(4 * found.match - np.arange(200))[found.accepted] <= 8)
+
+
+def test_one_drive_that_comes_back_once():
+    road = drive(400, 3)
+    rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
+    scores = alike(rows, rows)
+    allowed = np.tri(len(rows), k=-31, dtype=bool)
+    found = answer(scores, allowed, two=False)
+    loops = np.zeros(len(rows), bool)
+    loops[400:480] = True
+    assert np.count_nonzero(found.accepted & loops) > 0.8 * 80
+    right = np.abs(found.match - np.arange(len(rows)) + 300) <= 5
+    assert np.mean(right[found.accepted]) >= 0.99
+
+
+def test_too_few_frames_tell_nothing():
+    scores = alike(drive(12, 1), drive(12, 1))
+    assert not answer(scores, everything(scores), two=True).accepted.any()
+
+
+def test_what_is_verified_is_a_loop_and_a_sequence_without_it_is_none():
+    road = drive(150, 6)
+    scores = alike(again(road, 1.0, 7), road)
+    check, good, bad = GeometricCheck(), Agreement(60, 50, 20), Agreement(40, 9, 20)
+
+    def first_half(query, reference):
+        return good if query < 75 and abs(query - reference) <= 3 else bad
+
+    found = answer(scores, everything(scores), True, 0.99, check, first_half)
+    assert found.accepted[:70].all()
+    assert not found.accepted[90:].any()
+    assert set(found.verdicts[90:]) <= {"not verified", "below threshold"}
+    assert found.reasons[1].startswith("verification: ")
+
+    nothing = answer(scores, everything(scores), True, 0.99, check, lambda *_: bad)
+    assert np.count_nonzero(nothing.accepted) > 0.9 * 150
+    assert "cannot be verified" in nothing.reasons[1]
+
+    everywhere = answer(scores, everything(scores), True, 0.99, check, lambda *_: good)
+    assert "40 of 40 unlike pairs: something is the same in all images" in everywhere.reasons[1]
+    assert np.count_nonzero(everywhere.accepted) > 0.9 * 150
+
+
+def test_single_images_are_verified_where_sequences_tell_nothing():
+    """A camera that looks at five things in random order."""
+    rng = np.random.default_rng(8)
+    seen = rng.integers(0, 5, 200)
+    rows = again(drive(5, 9)[seen], 0.3, 10)
+    scores = alike(rows, rows)
+    points = Agreement(60, 50, 20), Agreement(3, 0, 20)
+    found = answer(
+        scores,
+        np.tri(200, k=-6, dtype=bool),
+        False,
+        0.99,
+        GeometricCheck(),
+        lambda a, b: points[0] if seen[a] == seen[b] and a % 10 else points[1],
+    )
+    assert "one by one" in found.reasons[0]
+    right = seen[found.match] == seen
+    assert right[found.accepted].all()
+    assert np.count_nonzero(found.accepted) > 150
+    assert found.unverifiable > 0
+
+
+def test_a_threshold_counts_decoys():
+    rng = np.random.default_rng(0)
+    wrong, decoys = rng.exponential(size=(2, 4000))
+    targets = np.concatenate([wrong, 14 + rng.normal(size=1000)])
+    level = threshold(targets, np.concatenate([decoys, rng.exponential(size=1000)]), 0.99)
+    assert 4.0 < level < 9.0
+    assert np.mean(wrong[wrong >= level] < 14) * np.count_nonzero(wrong >= level) <= 20
+    assert threshold(wrong, decoys, 0.99) > np.sort(wrong)[-20]
+    assert threshold(wrong, decoys[:3], 0.99) == np.inf
+
+
+class Fixed:
+    name = "fixed"
+
+    def __init__(self, scores):
+        self.scores = scores
+
+    def score(self, images, progress):
+        return MethodResult(self.scores)
+
+
+def test_as_a_method(tmp_path, monkeypatch):
+    road = drive(150, 11)
+    scores = alike(again(road, 1.0, 12), road)
+    method = make_method("auto:precision=0.9+thumbnails", MethodContext())
+    assert method.name == "auto+thumbnails"
+    assert method.precision == 0.9
+    method.inner = Fixed(scores)
+    monkeypatch.setattr(type(method.pairs), "agreement", lambda *_: Agreement(0, 0, 20))
+    paths = [tmp_path / f"{i}.png" for i in range(150)]
+    result = method.score(Images(paths, paths), silent)
+    assert np.count_nonzero(np.isfinite(result.scores)) > 0.9 * 150
+    assert any(note.startswith("sequences of") for note in result.notes)
+    assert any(note.startswith("queries: ") for note in result.notes)
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("auto", r"write auto\+METHOD"),
+        ("auto:length=3+thumbnails", 'auto has no setting "length=3"'),
+    ],
+)
+def test_settings_that_make_no_sense(spec, message):
+    with pytest.raises(InputError, match=message):
+        make_method(spec)
+
+
+def test_a_precision_that_makes_no_sense():
+    with pytest.raises(InputError, match="precision is 2"):
+        answer(np.eye(3), np.ones((3, 3), bool), True, 2.0)
