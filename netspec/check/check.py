@@ -31,7 +31,7 @@ from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.checks import check_prefix, check_settings
 from netspec.solver.nets import TRAIN_NET, seed_of, solver_nets
-from netspec.solver.solver import choose_device
+from netspec.solver.options import choose_device
 from netspec.terminal import log
 
 

@@ -21,6 +21,7 @@ from netspec.pycaffe.errors import caffes_errors
 from netspec.pycaffe.net import Net
 from netspec.solver import solver as core_solver
 from netspec.solver.nets import TRAIN_NET
+from netspec.solver.options import TrainingOptions
 from netspec.solver.update import rule_faults
 from netspec.terminal import log
 
@@ -35,11 +36,11 @@ class _Training(core_solver.Solver):
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
 
     @override
-    def _build(self, described: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
+    def build(self, described: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
         if role == TRAIN_NET and mode.multiprocess():
             rank, ranks = mode.solver_rank(), mode.solver_count()
             role = f"rank {rank}" if rank else role
-        return super()._build(described, role, device, rank, ranks)
+        return super().build(described, role, device, rank, ranks)
 
     @override
     def check_inputs(self) -> None:
@@ -100,15 +101,14 @@ class Solver:
         if self.type_name:
             param.type = self.type_name
         with caffes_errors():
-            self._training = _Training(
-                param,
-                node,
-                device=mode.device(),
+            options = TrainingOptions(
+                mode.device(),
                 allow_python=True,
                 exact=mode.exact(),
                 seed=mode.solver_seed(),
                 nan="warn",  # as Caffe goes on: a script may look for itself
             )
+            self._training = _Training(param, node, options)
         self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
         self._training.on_start = lambda: self._call(0)
         self._training.on_gradients = lambda: self._call(1)

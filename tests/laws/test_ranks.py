@@ -12,6 +12,7 @@ from netspec.layers import Context, layer_class
 from netspec.layers.data.files import ReadingLayer
 from netspec.proto.schema import TRAIN
 from netspec.proto.text import parse_net_text, parse_solver_text
+from netspec.solver.options import TrainingOptions
 from netspec.solver.solver import Solver
 from paths import GOLDEN
 
@@ -99,4 +100,4 @@ def training(ranks: int, batch: int = BATCH) -> Solver:
     net = layer_text("ImageData, shuffled", batch) + 'layer { type: "Silence" bottom: "data" bottom: "label" }'
     text = f'net_param {{ {net} }} base_lr: 1 lr_policy: "fixed" random_seed: 7 solver_mode: CPU '
     param, node = parse_solver_text(text + "test_iter: 1 test_iter: 1 test_interval: 1", "solver.prototxt")
-    return Solver(param, node, device=torch.device("cpu"), others=[torch.device("cpu")] * (ranks - 1))
+    return Solver(param, node, TrainingOptions(torch.device("cpu"), [torch.device("cpu")] * (ranks - 1)))

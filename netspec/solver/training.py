@@ -1,0 +1,236 @@
+"""What a training has: its settings, its nets, its history, and where it stands.
+
+Caffe: src/caffe/solver.cpp (Solver::Init); the sites in the log calls are the lines of that file that print the same.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from netspec.errors import SpecError, Where
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.net.segments import missing_tool
+from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
+from netspec.process import waiting
+from netspec.proto.binary import split_paths
+from netspec.proto.schema import SolverParameter
+from netspec.proto.source_map import Place
+from netspec.proto.text import write_text
+from netspec.solver import nets, update
+from netspec.solver.blocks import Blocks
+from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
+from netspec.solver.extra import Remembered
+from netspec.solver.nan import bad_parameter, bad_top
+from netspec.solver.options import TrainingOptions, choose_device
+from netspec.solver.precision import FP16
+from netspec.solver.replicas import Replicas
+from netspec.solver.tally import Outputs
+from netspec.solver.threads import dependence
+from netspec.terminal import log
+
+_CREATING = {
+    "net": ("solver.cpp:102", "Creating training net from {}"),
+    "net_param": ("solver.cpp:97", "Creating training net specified in {}."),
+    "train_net": ("solver.cpp:92", "Creating training net from {}"),
+    "train_net_param": ("solver.cpp:88", "Creating training net specified in {}."),
+}
+
+
+class Training:
+    """The nets of a solver, and the state of their training.
+
+    ``iteration`` is the number of updates done; ``net`` is the training net, ``test_nets`` the others; ``scores`` has,
+    for each test net, the mean of each output element in its last test. ``on_start()`` is called before the passes of
+    each iteration, ``on_gradients()`` between them and the update, ``on_iteration()`` after it; ``on_test(i)`` after
+    test net i was run, ``on_snapshot(model)`` after weights and state were written, with the path of the weights.
+    ``last_snapshot`` is the path of the last state of this run, or "".
+    """
+
+    param: Any
+    node: Place
+    options: TrainingOptions
+    action: Callable[[], str | None]
+    clock: Callable[[], float]
+
+    on_start: Callable[[], object] = staticmethod(lambda: None)
+    on_gradients: Callable[[], object] = staticmethod(lambda: None)
+    on_iteration: Callable[[], object] = staticmethod(lambda: None)
+    on_test: Callable[[int], object] = staticmethod(lambda i: None)
+    on_snapshot: Callable[[str], object] = staticmethod(lambda model: None)
+
+    net: Net
+    test_nets: list[Net]
+    count_of_tests: int  # in a process that is not the root there are no test nets
+    replicas: Replicas
+    blocks: Blocks
+
+    iteration = 0
+    current_step = 0
+    stopped = False
+    last_snapshot = ""
+    losses: deque[float]
+    losses_before: tuple[float, ...] = ()  # of a training that is resumed
+    states_before_test: tuple[Remembered, ...] = ()
+    _told_nan = False
+
+    def __init__(
+        self,
+        param: Any,
+        node: Place | None = None,
+        options: TrainingOptions | None = None,
+        *,
+        action: Callable[[], str | None] = lambda: None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError.
+
+        ``action`` is called between iterations, also those of a test: "stop" ends the training, "snapshot" takes one.
+        ``clock`` gives the seconds for "iter/s".
+        """
+        self.param, self.node, self.options = param, node or Place(Where("<solver>")), options or TrainingOptions()
+        self.action, self.clock = action, clock
+        log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
+        check_settings(param, self.node)
+        options = self.options
+        if param.snapshot and options.processes.is_root:
+            check_prefix(param, self.node)
+        self.device = options.device or choose_device(param, self.node)
+        if options.compiled and (lack := missing_tool(self.device)):
+            raise SpecError(f"--compile: {lack}", self.node.where)
+        self.seed = self._chosen_seed()
+        rule = update.find_rule(param.type)
+        assert rule is not None, "check_settings refuses unknown types"
+        self.rule = rule
+        self.scores: list[Outputs] = []
+        self.losses: deque[float] = deque(maxlen=param.average_loss)
+        self._build_nets()
+        self._check_size()
+        self._say_doubts()
+        self.blocks = Blocks(self.net.learnable, self.rule.sets)
+        log.info("solver.cpp:57", "Solver scaffolding done.")
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse to be copied or pickled. Raises TypeError."""
+        raise TypeError("a Solver cannot be copied or pickled: take a snapshot(), and load_solver(snapshot=...) it")
+
+    @property
+    def history(self) -> list[torch.Tensor]:
+        """The values that the update rule keeps, for each learnable parameter, set after set."""
+        return self.blocks.history
+
+    @property
+    def exact(self) -> str:
+        """Which sums are Caffe's to the last bit."""
+        return self.options.exact_sums
+
+    @property
+    def loss(self) -> float:
+        """The training loss, a mean over the last ``average_loss`` iterations of this call of :meth:`step`."""
+        return sum(self.losses) / len(self.losses) if self.losses else 0.0
+
+    def _chosen_seed(self) -> int:
+        given = self.options.processes.seed if self.options.seed is None else self.options.seed
+        drawn = int.from_bytes(os.urandom(4), "little") if given is None else given
+        return self.param.random_seed if self.param.random_seed >= 0 else drawn
+
+    def _build_nets(self) -> None:
+        train, *tests = nets.solver_nets(self.param, self.node)
+        site, sentence = _CREATING[train.origin.split()[0]]
+        log.info(site, sentence.format(train.origin))
+        processes, others = self.options.processes, self.options.others
+        rank, ranks = processes.rank, processes.count * (1 + len(others))
+        self.net = self.build(train, f"rank {rank}" if rank else train.label, self.device, rank, ranks)
+        with log.silent():  # Caffe logs only the root
+            replicas = [self.build(train, f"rank {k}", other, k, ranks) for k, other in enumerate(others, 1)]
+        self.replicas = Replicas(self.net, replicas, processes)
+        self.test_nets = []
+        self.count_of_tests = len(tests)
+        for i, test in enumerate(tests if processes.is_root else ()):
+            log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
+            self.test_nets.append(self.build(test, test.label, self.device))
+
+    def build(self, described: nets.SolverNet, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> Net:
+        """Build a net and load the weights to start from.
+
+        Each ``role`` has its own random numbers, except for the records: nets that train in parallel share their order.
+        """
+        options = BuildOptions(
+            device,
+            seed=nets.seed_of(self.seed, role),
+            data_seed=self.seed if ranks > 1 else None,
+            allow_python=self.options.allow_python,
+            rank=rank,
+            ranks=ranks,
+            exact=self.exact,
+            accumulate_in_place=True,
+            passes=(),
+            compiled=self.options.compiled,
+        )
+        net = build_net(described.net, described.source, options)
+        files = [path for paths in self.param.weights for path in split_paths(paths)]
+        for path in files:
+            log.info("solver.cpp:72", f"Finetuning from {path}")
+        if files:
+            load_weights(net, files, self.options.strict)
+        return net
+
+    def _check_size(self) -> None:
+        """Raise SpecError now, not after days, where a snapshot could not be written."""
+        writes = self.param.snapshot or self.param.snapshot_after_train
+        if not writes or self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5"):
+            return
+        history = self.rule.sets * sum(item.parameter.nbytes for item in self.net.learnable)
+        size = max(binary_bytes(self.net, self.param.snapshot_diff), history)
+        if size > MOST_BYTES:
+            message = f"a snapshot cannot be written: {too_large(size)}"
+            raise SpecError(message, self.node.find("snapshot_format"))
+
+    def _say_doubts(self) -> None:
+        """Warn of fields without effect, and of what makes the training slow or its bits depend on the machine."""
+        read = frozenset[str]().union(*(layer.solver_reads for net in self.test_nets for layer in net.layers))
+        for line in fields_without_effect(self.param, self.node, read):
+            log.warning("solver.cpp:45", line)
+        if said := dependence(self.net, torch.get_num_threads()):
+            log.info("solver.cpp:57", said)
+        if self.device.type == "cpu" and (said := waiting.too_late(torch.get_num_threads())):
+            log.info("solver.cpp:57", said)
+        if self.options.precision == FP16 and self.device.type == "cpu":
+            log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs")
+
+    def check_inputs(self) -> None:
+        """Raise SpecError where a net has inputs: nobody would fill them."""
+        for net in (self.net, *self.test_nets):
+            for fault in net.missing_inputs():
+                raise fault
+
+    def is_due(self, interval: int) -> bool:
+        """Return whether this iteration is one of every ``interval``; never for 0."""
+        return interval > 0 and self.iteration % interval == 0
+
+    def tell_nan(self, what: str) -> None:
+        """Stop, or warn, and say where the NaN or infinity is."""
+        found = bad_parameter(self.net)
+        if not found and self.options.nan == "stop":
+            found = bad_top(self.net, self.param.iter_size, f"iteration {self.iteration}")
+        first = f"; the first NaN or infinity is in {found}" if found else ""
+        message = f"Iteration {self.iteration}: {what}{first}"
+        if self.options.nan == "stop":
+            kept = f"; the last good snapshot is {self.last_snapshot}" if self.last_snapshot else ""
+            raise SpecError(f"{message}{kept}; lower base_lr, or go on with --nan warn", self.node.where)
+        if not self._told_nan:
+            log.logger.warning(f"{message}; the training goes on")
+        self._told_nan = True
+
+    def close(self) -> None:
+        """Close the files and stop the threads of all nets."""
+        for net in (self.net, *self.test_nets):
+            net.close()
+        self.replicas.close()
