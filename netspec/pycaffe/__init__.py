@@ -39,5 +39,7 @@ from netspec.pycaffe.solver import (
 
 __version__ = "1.0.0"  # of the Caffe whose interface this is
 
+from netspec.pycaffe import _caffe, pycaffe
+
 logs.start()
 pycaffe_shim.offer(sys.modules[__name__])

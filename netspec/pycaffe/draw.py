@@ -1,6 +1,6 @@
 """Nets as pictures: a graph of layers and blobs, drawn by Graphviz.
 
-Needs pydot (the extra ``pycaffe``), and for pictures Graphviz' program ``dot``.
+Needs pydot (the extra ``pycaffe``), and for pictures other than PNG and SVG Graphviz' program ``dot``.
 Caffe: python/caffe/draw.py
 """
 
@@ -8,8 +8,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from google.protobuf import text_format
+
 from netspec.errors import SpecError
 from netspec.files.whole_file import whole_file
+from netspec.proto.schema import TEST, TRAIN, PhaseValue
+from netspec.proto.text import parse_net_text
 from netspec.pycaffe import extras
 from netspec.pycaffe.proto import caffe_pb2
 
@@ -40,7 +44,7 @@ def draw_net(
 ) -> bytes:
     """Return the picture of a net in a format of Graphviz.
 
-    Raises SpecError where a picture is asked for and there is no Graphviz.
+    Without Graphviz, a PNG or an SVG is the picture of ``netspec draw``; SpecError is raised for other formats.
     """
     graph = get_pydot_graph(caffe_net, rankdir, phase=phase, display_lrm=display_lrm)
     if ext in _TEXT_FORMATS:
@@ -48,9 +52,22 @@ def draw_net(
     try:
         return graph.create(format=ext)
     except FileNotFoundError:
-        raise SpecError(
-            f"drawing a .{ext} needs Graphviz' program dot: install graphviz, or write to a file that ends in .dot"
-        ) from None
+        if ext not in ("png", "svg"):
+            raise SpecError(
+                f"drawing a .{ext} needs Graphviz' program dot: install graphviz, or write a .png, .svg or .dot"
+            ) from None
+    return _own_picture(caffe_net, ext, phase)
+
+
+def _own_picture(caffe_net: Any, ext: str, phase: int | None) -> bytes:
+    from netspec.draw.diagram import diagram_of  # here, as it and matplotlib take a while to load
+    from netspec.draw.picture import picture_of
+    from netspec.draw.png import png_of
+    from netspec.draw.svg import svg_of
+
+    net, source = parse_net_text(text_format.MessageToString(caffe_net), caffe_net.name or "net")
+    picture = picture_of(diagram_of(net, source, [TRAIN, TEST] if phase is None else [PhaseValue(phase)]))
+    return png_of(picture) if ext == "png" else svg_of(picture).encode()
 
 
 def get_pydot_graph(

@@ -158,9 +158,10 @@ class Transformer:
         self.raw_scale[in_] = scale
 
     def set_mean(self, in_: str, mean: Array) -> None:
-        """Set what is subtracted: a value for each channel (K,), or an image (H, W) or (K, H, W) of the input's size.
+        """Set what is subtracted: a value for each channel (K,), or an image (H, W) or (K, H, W).
 
-        Raises ValueError for another shape.
+        An image of another size than the input's is resized, as Caffe does. Raises ValueError for another number of
+        channels or axes.
         """
         self._check_input(in_)
         mean = np.asarray(mean)
@@ -171,8 +172,11 @@ class Transformer:
             mean = mean[:, np.newaxis, np.newaxis]
         elif mean.ndim not in (2, 3):
             raise ValueError(f"Mean shape invalid: found {mean.shape}.")
-        elif (1,) * (3 - mean.ndim) + mean.shape != shape:
-            raise ValueError(f"Mean shape incompatible with input shape: found {mean.shape}, expected {shape}.")
+        elif (image := mean.reshape((1,) * (3 - mean.ndim) + mean.shape)).shape != shape:
+            if len(image) != shape[0]:
+                raise ValueError(f"Mean channels incompatible with input: found {len(image)}, expected {shape[0]}.")
+            low, span = mean.min(), np.ptp(mean) or 1
+            mean = resize_image(((image - low) / span).transpose(1, 2, 0), shape[1:]).transpose(2, 0, 1) * span + low
         self.mean[in_] = mean
 
     def set_input_scale(self, in_: str, scale: float) -> None:
@@ -238,7 +242,11 @@ def oversample(images: Sequence[Array] | Array, crop_dims: Extents) -> Array:
 
 
 def __getattr__(name: str) -> Any:
-    """Give what scripts take from Caffe's module because it imports it: ``caffe.io.resize``, ``caffe.io.skimage``."""
+    """Give what scripts take from Caffe's module because it imports it: ``resize``, ``zoom``, ``skimage``."""
+    if name == "zoom":
+        from scipy.ndimage import zoom
+
+        return zoom
     if name == "resize":
         return extras.load("skimage.transform", "pycaffe", "caffe.io.resize").resize
     if name == "skimage":

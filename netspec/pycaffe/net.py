@@ -5,6 +5,7 @@ Caffe: python/caffe/_caffe.cpp, python/caffe/pycaffe.py
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -28,7 +29,7 @@ from netspec.pycaffe.named import Named
 from netspec.pycaffe.passes import Passes
 from netspec.terminal import log
 
-FilePath = str | Path
+FilePath = str | bytes | Path
 Arrays = dict[str, np.ndarray]
 
 
@@ -60,11 +61,10 @@ class Net:
         stages: Iterable[str] | None = None,
         weights: FilePath | None = None,
     ) -> None:
-        if isinstance(phase, (str, Path)):
+        if isinstance(phase, (str, bytes, Path)):
             phase, weights, level = _older_form(network_file, phase, level)
-        for path in (network_file, *([] if weights is None else [weights])):
-            if not Path(path).is_file():
-                raise RuntimeError(f"Could not open file {path}")
+        network_file = file_of(network_file)
+        weights = None if weights is None else file_of(weights)
         with caffes_errors():
             net, source = parse_net(network_file)
             self._hold(
@@ -87,21 +87,20 @@ class Net:
         self._layer_names = names
         self._blob_names = list(passes.names)
         self._blobs = list(passes.blobs)
-        self.blobs: Named[Blob] = Named("blob", zip(passes.names, passes.blobs, strict=True))
+        self._blobs_dict: Named[Blob] = Named("blob", zip(passes.names, passes.blobs, strict=True))
         self.layers: list[Any] = [
             layer.code if isinstance(layer, Python) else Layer(layer.type, blobs)
             for layer, blobs in zip(net.layers, passes.params, strict=True)
         ]
-        self.layer_dict: Named[Any] = Named("layer", zip(names, self.layers, strict=True))
-        self.params: Named[BlobVec] = Named(
+        self._layer_dict: Named[Any] = Named("layer", zip(names, self.layers, strict=True))
+        self._params_dict: Named[BlobVec] = Named(
             "layer with parameters", ((name, blobs) for name, blobs in zip(names, passes.params, strict=True) if blobs)
         )
-        self.top_names = self._names_of(passes.top_ids)
-        self.bottom_names = self._names_of(passes.bottom_ids)
-        self.inputs: list[str] = list(net.inputs)
-        self.outputs: list[str] = list(net.outputs)
-        self._inputs = [self._blob_names.index(name) for name in self.inputs]
-        self._outputs = [self._blob_names.index(name) for name in self.outputs]
+        self._top_names = self._names_of(passes.top_ids)
+        self._bottom_names = self._names_of(passes.bottom_ids)
+        self._input_list, self._output_list = list(net.inputs), list(net.outputs)
+        self._inputs = [self._blob_names.index(name) for name in net.inputs]
+        self._outputs = [self._blob_names.index(name) for name in net.outputs]
         weights = {
             b: w
             for ids, row in zip(passes.top_ids, net.loss_weights, strict=True)
@@ -112,6 +111,43 @@ class Net:
     def _names_of(self, ids: Sequence[Sequence[int]]) -> Named[list[str]]:
         names = [[self._blob_names[b] for b in row] for row in ids]
         return Named("layer", zip(self._layer_names, names, strict=True))
+
+    # Properties as Caffe's are: programs look for them on the class.
+
+    @property
+    def blobs(self) -> Named[Blob]:
+        """Blob name -> blob."""
+        return self._blobs_dict
+
+    @property
+    def params(self) -> Named[BlobVec]:
+        """Layer name -> its learnable blobs; without the layers that have none."""
+        return self._params_dict
+
+    @property
+    def layer_dict(self) -> Named[Any]:
+        """Layer name -> layer."""
+        return self._layer_dict
+
+    @property
+    def top_names(self) -> Named[list[str]]:
+        """Layer name -> the names of its tops."""
+        return self._top_names
+
+    @property
+    def bottom_names(self) -> Named[list[str]]:
+        """Layer name -> the names of its bottoms."""
+        return self._bottom_names
+
+    @property
+    def inputs(self) -> list[str]:
+        """The names of the blobs that no layer makes."""
+        return self._input_list
+
+    @property
+    def outputs(self) -> list[str]:
+        """The names of the blobs that no layer reads."""
+        return self._output_list
 
     @property
     def blob_loss_weights(self) -> Named[float]:
@@ -267,10 +303,11 @@ class Net:
             raise RuntimeError(f"set_input_arrays may only be called if the first layer is a MemoryDataLayer; {kind}")
         layer.set_input_arrays(data, labels)
 
+    _set_input_arrays = set_input_arrays  # the name in Caffe's compiled part
+
     def copy_from(self, weights: FilePath) -> None:
         """Copy the weights of a .caffemodel, binary or HDF5, into the layers of the same names."""
-        if not Path(weights).is_file():
-            raise RuntimeError(f"Could not open file {weights}")
+        weights = file_of(weights)
         self.passes.upload()
         with caffes_errors():
             load_weights(self.passes.net, weights)
@@ -286,12 +323,12 @@ class Net:
     def save(self, path: FilePath) -> None:
         """Write the layers and their weights in binary form, whatever the file's name ends with."""
         self.passes.upload()
-        write_binary(self.passes.net, path)
+        write_binary(self.passes.net, os.fsdecode(path))
 
     def save_hdf5(self, path: FilePath, write_diff: bool = False) -> None:
         """Write the weights as HDF5; with ``write_diff`` their gradients too."""
         self.passes.upload()
-        write_hdf5(self.passes.net, path, write_diff)
+        write_hdf5(self.passes.net, os.fsdecode(path), write_diff)
 
     # Of 2014, when phase and mode were a net's
 
@@ -311,12 +348,21 @@ class Net:
         mode.set_device(device_id)
 
 
+def file_of(path: FilePath) -> str:
+    """Return the path of a file as text; Caffe takes bytes too. Raises RuntimeError where there is no such file."""
+    text = os.fsdecode(path)
+    if not os.path.isfile(text):
+        raise RuntimeError(f"Could not open file {text}")
+    return text
+
+
 def _older_form(network_file: FilePath, weights: FilePath, phase: int | None) -> tuple[int, FilePath, int]:
     """Return phase, weights and level of ``Net(file, weights, phase)``."""
     phase = pycaffe_shim.TEST if phase is None else phase
     log.warning("_caffe.cpp:154", "DEPRECATION WARNING - deprecated use of Python interface")
     log.warning("_caffe.cpp:155", 'Use this instead (with the named "weights" parameter):')
-    log.warning("_caffe.cpp:156", f"Net('{network_file}', {phase}, weights='{weights}')")
+    named = os.fsdecode(network_file), os.fsdecode(weights)
+    log.warning("_caffe.cpp:156", f"Net('{named[0]}', {phase}, weights='{named[1]}')")
     return phase, weights, 0
 
 

@@ -7,6 +7,7 @@ Caffe: src/caffe/parallel.cpp, python/caffe/_caffe.cpp
 
 from __future__ import annotations
 
+import os
 import tempfile
 import time
 import uuid
@@ -21,8 +22,8 @@ from netspec.solver.replicas import Replicas
 
 
 def has_nccl() -> bool:
-    """Return whether several processes can train side by side."""
-    return distributed.is_available()
+    """Return whether torch has NVIDIA's NCCL. Without it several processes train side by side too, on CPUs."""
+    return distributed.is_available() and distributed.is_nccl_available()
 
 
 class NCCL:
@@ -31,20 +32,20 @@ class NCCL:
     Every process makes its own, having set its ``set_solver_rank``; the constructor waits for the others.
     """
 
-    def __init__(self, solver: Solver, uid: str) -> None:
+    def __init__(self, solver: Solver, uid: bytes) -> None:
         count = mode.solver_count()
         if count == 1:
             processes = Processes()
         elif distributed.is_initialized():
             processes = Processes(mode.solver_rank(), count)
         else:
-            processes = join(count, mode.solver_rank(), f"file://{Path(tempfile.gettempdir(), uid)}")
+            processes = join(count, mode.solver_rank(), f"file://{Path(tempfile.gettempdir(), os.fsdecode(uid))}")
         self._replicas = Replicas(solver._training.net, (), processes)
 
     @staticmethod
-    def new_uid() -> str:
+    def new_uid() -> bytes:
         """Return a name for a group of processes."""
-        return f"netspec-{uuid.uuid4().hex}"
+        return f"netspec-{uuid.uuid4().hex}".encode()
 
     def bcast(self) -> None:
         """Give every process the root's weights."""

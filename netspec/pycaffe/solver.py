@@ -5,9 +5,9 @@ Caffe: python/caffe/_caffe.cpp, src/caffe/solver.cpp
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -18,7 +18,7 @@ from netspec.proto.text import parse_solver
 from netspec.pycaffe import mode
 from netspec.pycaffe.debug import debug_info
 from netspec.pycaffe.errors import caffes_errors
-from netspec.pycaffe.net import Net
+from netspec.pycaffe.net import FilePath, Net
 from netspec.solver import solver as core_solver
 from netspec.solver.nets import TRAIN_NET
 from netspec.solver.options import TrainingOptions
@@ -96,7 +96,8 @@ class Solver:
 
     type_name: ClassVar[str] = ""
 
-    def __init__(self, solver_file: str | Path) -> None:
+    def __init__(self, solver_file: FilePath) -> None:
+        solver_file = os.fsdecode(solver_file)
         param, node = parse_solver(solver_file)
         if self.type_name:
             param.type = self.type_name
@@ -138,10 +139,10 @@ class Solver:
         """The learning rate of the iteration to come."""
         return self._training.learning_rate
 
-    def solve(self, resume_file: str | Path | None = None) -> None:
+    def solve(self, resume_file: FilePath | None = None) -> None:
         """Train up to max_iter, from a .solverstate on where one is given."""
         if resume_file:
-            log.info("solver.cpp:296", f"Restoring previous solver status from {resume_file}")
+            log.info("solver.cpp:296", f"Restoring previous solver status from {os.fsdecode(resume_file)}")
             self.restore(resume_file)
         with caffes_errors():
             self._training.solve()
@@ -151,10 +152,10 @@ class Solver:
         with caffes_errors():
             self._training.step(int(iterations))
 
-    def restore(self, state_file: str | Path) -> None:
+    def restore(self, state_file: FilePath) -> None:
         """Go on from a .solverstate, and from its weights."""
         self.net.passes.upload()
-        self._training.restore(state_file)
+        self._training.restore(os.fsdecode(state_file))
 
     def snapshot(self) -> None:
         """Write the weights and the state, as snapshot_prefix says."""
@@ -222,8 +223,9 @@ class AdamSolver(Solver):
 _SOLVERS = (SGDSolver, NesterovSolver, AdaGradSolver, RMSPropSolver, AdaDeltaSolver, AdamSolver)
 
 
-def get_solver(solver_file: str | Path) -> Solver:
+def get_solver(solver_file: FilePath) -> Solver:
     """Return the solver of the type that the file has."""
+    solver_file = os.fsdecode(solver_file)
     param, node = parse_solver(solver_file)
     for fault in rule_faults(param, node):
         raise fault

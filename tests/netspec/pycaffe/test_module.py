@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import netspec.pycaffe as caffe
 from netspec.pycaffe import mode
@@ -29,11 +30,38 @@ def test_submodules_have_the_same_names(name: str) -> None:
     module = importlib.import_module(f"netspec.pycaffe.{name}")
     assert module.Net is caffe.Net
     assert module.SGDSolver is caffe.SGDSolver
+    assert getattr(caffe, name) is module
+
+
+def test_values_of_params_have_the_type_of_the_compiled_module(net_of: Callable[..., caffe.Net]) -> None:
+    assert {type(blobs) for blobs in net_of(SMALL).params.values()} == {caffe._caffe.BlobVec}
+
+
+def test_what_caffe_has_on_the_class_of_nets() -> None:
+    for name in ("blobs", "params", "layer_dict", "inputs", "outputs", "top_names", "bottom_names"):
+        assert isinstance(getattr(caffe.Net, name), property)
+    assert caffe.Net._set_input_arrays is caffe.Net.set_input_arrays
+
+
+def test_paths_may_be_bytes(write: Callable[..., str], tmp_path: Path) -> None:
+    path = write(SMALL).encode()
+    net = caffe.Net(path, caffe.TEST)
+    for save in (net.save, net.save_hdf5):
+        save(bytes(tmp_path / "w"))
+        assert caffe.Net(path, bytes(tmp_path / "w"), caffe.TEST).params.keys() == net.params.keys()
+    solver = write('net: "net.prototxt" base_lr: 0.1 lr_policy: "fixed"', "solver.prototxt").encode()
+    with pytest.raises(RuntimeError, match="Could not open file nowhere"):
+        caffe.Net(b"nowhere", caffe.TEST)
+    assert caffe.get_solver(solver).iter == 0
 
 
 def test_a_group_of_processes_has_a_name_of_its_own() -> None:
-    if caffe.has_nccl():
-        assert caffe.NCCL.new_uid() != caffe.NCCL.new_uid()
+    assert isinstance(caffe.NCCL.new_uid(), bytes)
+    assert caffe.NCCL.new_uid() != caffe.NCCL.new_uid()
+
+
+def test_nccl_is_there_where_torch_has_it() -> None:
+    assert caffe.has_nccl() == torch.distributed.is_nccl_available()
 
 
 def test_timer() -> None:
