@@ -98,34 +98,57 @@ def write_databases(
     check_size: bool = False,
     workers: int | None = None,
     progress: Progress = silent,
+    skip: bool = False,
 ) -> None:
     """Write entries, in order, into new databases, which appear when they are complete.
 
     ``paths`` names one database, or, with encoded images, one for each image of an entry. ``root`` is put in front of
     image names, with a slash between. Images are read by ``workers`` processes (None: one per core). Raises SpecError,
     with the line in the list, for an image that is missing, unreadable, or differs in size from its partner (with
-    ``check_size``: from the first).
+    ``check_size``: from the first). With ``skip`` an entry that cannot be read is logged and left out, as Caffe's
+    convert_imageset does, unless that is every entry; the keys of the others stay.
     """
     assert len(paths) == (1 if options.encoding is None else len(entries[0].images))
-    work = partial(_records, root=root if root.endswith("/") or not root else root + "/", options=options)
+    work = partial(_try, root=root if root.endswith("/") or not root else root + "/", options=options)
     first: tuple[int, ...] | None = None
+    written, skipped = 0, None
     with ExitStack() as stack:
         results = stack.enter_context(_Workers(workers or os.cpu_count() or 1)).ordered(work, entries)
         writers = [stack.enter_context(Writer(path, backend)) for path in paths]
-        for number, (records, shape) in enumerate(progress(results, "records", len(entries))):
+        for number, result in enumerate(progress(results, "records", len(entries))):
             entry = entries[number]
+            if isinstance(result, SpecError):
+                if not skip:
+                    raise result
+                log.error("io.cpp:80", str(result))
+                skipped = skipped or result
+                continue
+            records, shape = result
             first = first or shape
             if check_size and shape != first:
                 message = f"gives {times(shape)}, but the first line gives {times(first)} (-check_size)"
                 raise SpecError(f'"{entry.images[0]}" {message}', entry.where)
             for writer, record in zip(writers, records, strict=True):
                 writer.put(key(number, entry).encode(), record)
-            if (number + 1) % 1000 == 0:
-                log.info("convert_imageset.cpp:147", f"Processed {number + 1} files.")
+            written += 1
+            if written % 1000 == 0:
+                log.info("convert_imageset.cpp:147", f"Processed {written} files.")
+        if skipped and not written:
+            raise skipped
         for writer in writers:  # all of them before the first one appears
             writer.commit()
-    if len(entries) % 1000:
-        log.info("convert_imageset.cpp:153", f"Processed {len(entries)} files.")
+    if written % 1000:
+        log.info("convert_imageset.cpp:153", f"Processed {written} files.")
+    if skipped:
+        count = len(entries) - written
+        log.warning("convert_imageset.cpp:121", f"Skipped {count} of {len(entries)} images, which cannot be read")
+
+
+def _try(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tuple[int, ...]] | SpecError:
+    try:
+        return _records(entry, root, options)
+    except SpecError as fault:
+        return fault
 
 
 def _records(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tuple[int, ...]]:

@@ -1,6 +1,7 @@
 """The files of MNIST and of CIFAR-10 to databases of Datums, as Caffe's examples have them.
 
-Caffe: examples/mnist/convert_mnist_data.cpp, examples/cifar10/convert_cifar_data.cpp
+Caffe: examples/mnist/convert_mnist_data.cpp, examples/siamese/convert_mnist_siamese_data.cpp,
+examples/cifar10/convert_cifar_data.cpp
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 
 from loopclosure.progress import Progress, silent
 from netspec.data.database import Writer
+from netspec.data.random_words import words
 from netspec.errors import SpecError, Where
 from netspec.files.lfs import pointer_fault
 from netspec.proto.schema import Datum
@@ -21,8 +23,19 @@ IMAGES, LABELS = 2051, 2049  # the first number of a file of MNIST
 CIFAR_SHAPE = (3, 32, 32)
 
 
-def convert_mnist(images: str, labels: str, database: str, backend: str = "lmdb", progress: Progress = silent) -> None:
-    """Write the images and labels of two files of MNIST into a new database. Raises SpecError."""
+def convert_mnist(
+    images: str,
+    labels: str,
+    database: str,
+    backend: str = "lmdb",
+    progress: Progress = silent,
+    in_pairs: bool = False,
+) -> None:
+    """Write the images and labels of two files of MNIST into a new database. Raises SpecError.
+
+    ``in_pairs`` writes as many pairs of images chosen at random, the same ones each time: a pair is a Datum of two
+    channels, with label 1 where both show the same digit, else 0.
+    """
     pixels, classes = read_idx(images, IMAGES), read_idx(labels, LABELS)
     if len(pixels) != len(classes):
         message = (
@@ -31,8 +44,11 @@ def convert_mnist(images: str, labels: str, database: str, backend: str = "lmdb"
         raise SpecError(message, Where(labels))
     log.info("convert_mnist_data.cpp:83", f"A total of {len(pixels)} items.")
     log.info("convert_mnist_data.cpp:84", f"Rows: {pixels.shape[1]} Cols: {pixels.shape[2]}")
+    records = zip(pixels[:, None], classes, strict=True)
+    if in_pairs:
+        chosen = words(1, "convert/mnist_pairs", 0, len(pixels))[:, :2] % len(pixels)
+        records = ((pixels[pair], classes[pair[0]] == classes[pair[1]]) for pair in chosen)
     with Writer(database, backend) as writer:
-        records = zip(pixels[:, None], classes, strict=True)
         for number, (image, label) in enumerate(progress(records, "images", len(pixels))):
             writer.put(f"{number:08d}".encode(), _datum(image, int(label)))
     log.info("convert_mnist_data.cpp:103", f"Processed {len(pixels)} files.")

@@ -1,6 +1,6 @@
 """``lmdb-build convert``, ``imageset``, ``mean``, ``mnist`` and ``cifar``: arguments and log of Caffe's tools.
 
-Caffe: tools/convert_imageset.cpp, tools/compute_image_mean.cpp, examples/mnist, examples/cifar10
+Caffe: tools/convert_imageset.cpp, tools/compute_image_mean.cpp, examples/mnist, examples/siamese, examples/cifar10
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ def add_to(commands: Commands) -> None:
 
     p = commands.add("imageset", _convert_images, "write the images of a list into a database (convert_imageset)")
     p.description = (
-        "Write one Datum per image into a database that Caffe reads. A line of LISTFILE is: subfolder/file.png 7"
+        "Write one Datum per image into a database that Caffe reads. A line of LISTFILE is: subfolder/file.png 7."
+        " Images that cannot be read are left out, and counted in the last line."
     )
     _add_flags(p)
 
@@ -49,6 +50,7 @@ def add_to(commands: Commands) -> None:
 
     p = commands.add("mnist", _mnist, "write the files of MNIST into a database (convert_mnist_data)")
     _add_backend(p)
+    p.add_argument("--pairs", action="store_true", help="write pairs chosen at random (convert_mnist_siamese_data)")
     p.add_argument("IMAGES", help="the file of images, unpacked: train-images-idx3-ubyte")
     p.add_argument("LABELS", help="the file of labels, unpacked: train-labels-idx1-ubyte")
     p.add_argument("DB_NAME", help="the database to write; it must not exist")
@@ -88,7 +90,7 @@ def _convert_pairs(arguments: argparse.Namespace) -> None:
 
 
 def _convert_images(arguments: argparse.Namespace) -> None:
-    _convert(arguments, read_single_list, [arguments.DB_NAME], image_key, "images")
+    _convert(arguments, read_single_list, [arguments.DB_NAME], image_key, "images", skip=True)
 
 
 def _convert(
@@ -97,6 +99,7 @@ def _convert(
     databases: list[str],
     key: Callable[[int, Entry], str],
     what: str,
+    skip: bool = False,
 ) -> None:
     if not arguments.shuffle:
         refuse(arguments, ("seed",), "is for --shuffle")
@@ -126,6 +129,7 @@ def _convert(
         arguments.check_size,
         arguments.workers,
         bar,
+        skip,
     )
 
 
@@ -141,7 +145,8 @@ def _mean(arguments: argparse.Namespace) -> None:
 
 
 def _mnist(arguments: argparse.Namespace) -> None:
-    convert_mnist(arguments.IMAGES, arguments.LABELS, arguments.DB_NAME.rstrip("/"), arguments.backend, bar)
+    name = arguments.DB_NAME.rstrip("/")
+    convert_mnist(arguments.IMAGES, arguments.LABELS, name, arguments.backend, bar, arguments.pairs)
 
 
 def _cifar(arguments: argparse.Namespace) -> None:

@@ -21,7 +21,7 @@ def add_to(commands: Commands) -> None:
     p.usage = "netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]"
     p.add_argument("--shadow-caffe", action="store_true", help="use netspec also where a real Caffe is installed")
     p.add_argument("--python2", action="store_true", help="translate from Python 2, also what runs as Python 3")
-    p.add_argument("--write-py3", type=Path, metavar="FILE", help="keep the translation of a script in Python 2")
+    p.add_argument("--write-py3", type=Path, metavar="FILE", help="only write a script of Python 2 as Python 3")
     p.add_argument("-m", dest="module", action="store_true", help="run a module, as python -m does")
 
     p = commands.add(
@@ -47,13 +47,19 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def _run(arguments: argparse.Namespace) -> None:
     from netspec.scripts.program import Options, run_module, run_script
+    from netspec.scripts.sources import write_translation
 
     if not arguments.program:
         raise WrongUsage("the following arguments are required: SCRIPT, or -m MODULE")
     if arguments.minloglevel is not None:
         os.environ[VARIABLE] = str(arguments.minloglevel)
-    options = Options(arguments.shadow_caffe, arguments.python2, arguments.write_py3)
+    options = Options(arguments.shadow_caffe, arguments.python2)
     name, *own = arguments.program
+    if arguments.write_py3:
+        if arguments.module or arguments.shadow_caffe or own:
+            raise WrongUsage("--write-py3 takes a script, and nothing runs")
+        write_translation(name, arguments.write_py3, arguments.python2)
+        return
     if arguments.module:
         run_module(name, own, options)
     run_script(name, own, options)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import TYPE_CHECKING
 
 from netspec.errors import SpecError
+
+if TYPE_CHECKING:  # the command line reads zooms without numpy
+    import numpy as np
 
 
 def read_zooms(zooms: str | float) -> tuple[float, ...]:

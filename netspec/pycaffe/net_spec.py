@@ -17,6 +17,8 @@ from functools import cache
 from typing import Any
 
 from netspec.errors import did_you_mean
+from netspec.proto.dialect.files import announce_known
+from netspec.proto.dialect.registry import advice_for, dialects_with_field, dialects_with_type
 from netspec.pycaffe.proto import caffe_pb2
 
 Name = Callable[["Top | Function"], str]
@@ -72,11 +74,17 @@ class Function:
         return layer
 
     def _unknown(self, layer: Any, own: str, name: str) -> str:
-        known = list(layer.DESCRIPTOR.fields_by_name)
+        messages = [layer.DESCRIPTOR]
         if own:
-            known += layer.DESCRIPTOR.fields_by_name[own].message_type.fields_by_name
+            messages.append(layer.DESCRIPTOR.fields_by_name[own].message_type)
         places = f"{own} and LayerParameter have" if own else "LayerParameter has"
-        return f'layer of type "{self.type_name}": {places} no field "{name}"{did_you_mean(name, known)}'
+        announce_known()
+        with_field = {d for message in messages for d in dialects_with_field(message.full_name, name)}
+        with_type = dialects_with_type(self.type_name)
+        advice = advice_for(name, tuple(sorted(with_field))) or advice_for(self.type_name, with_type)
+        known = [field for message in messages for field in message.fields_by_name]
+        hint = f"; {advice}" if advice else did_you_mean(name, known)
+        return f'layer of type "{self.type_name}": {places} no field "{name}"{hint}'
 
 
 def to_proto(*tops: Top) -> Any:

@@ -40,6 +40,7 @@ _COMMANDS: dict[str, tuple[str, list[str]]] = {
 }
 _EXAMPLES: dict[str, tuple[str, list[str]]] = {  # in the build folder only
     "examples/mnist/convert_mnist_data": (_BUILD, ["mnist"]),
+    "examples/siamese/convert_mnist_siamese_data": (_BUILD, ["mnist", "--pairs", "--backend=leveldb"]),
     "examples/cifar10/convert_cifar_data": (_BUILD, ["cifar"]),
 }
 _ASIDE = ".before-netspec"  # what a file in the way is called meanwhile

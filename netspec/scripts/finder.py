@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.abc
-import importlib.util
 import sys
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec, PathFinder
@@ -55,12 +54,33 @@ class CaffeFinder(importlib.abc.MetaPathFinder):
         """Return the spec of netspec's module, of another one beside Caffe's sources, or None for Python to look on."""
         if fullname == NAME:
             return self._whole()
-        if not fullname.startswith(f"{NAME}.") or not _is_ours(sys.modules.get(NAME)):
+        parent, _, leaf = fullname.rpartition(".")
+        ours = getattr(sys.modules.get(parent), "__name__", "")
+        if ours != HOME and not ours.startswith(f"{HOME}."):
             return None
-        home = HOME + fullname.removeprefix(NAME)
-        if home in sys.modules or importlib.util.find_spec(home):
-            return ModuleSpec(fullname, _Alias(home))
-        return PathFinder.find_spec(fullname, _source_folders())
+        home = f"{ours}.{leaf}"
+        if home in sys.modules or PathFinder.find_spec(home, path):
+            return None if fullname == home else ModuleSpec(fullname, _Alias(home))
+        if fullname != home:
+            return self._in_a_tree(fullname)
+        outside = NAME + home.removeprefix(HOME)  # `from caffe import x` imports by our own name
+        return ModuleSpec(fullname, _Alias(outside)) if self._search(outside) else None
+
+    def _in_a_tree(self, fullname: str) -> ModuleSpec:
+        spec = self._search(fullname)
+        if spec is None:
+            advice = 'Python files of a Caffe tree are found where its folder "python" is on sys.path or PYTHONPATH'
+            raise ModuleNotFoundError(f"No module named '{fullname}'; {advice}", name=fullname)
+        return spec
+
+    def _search(self, fullname: str) -> ModuleSpec | None:
+        """Return the spec of a module of Caffe's sources on the path, as the other finders have it, or None."""
+        inside = Path(*fullname.split(".")[:-1])
+        trees = [Path(entry) for entry in sys.path if (Path(entry) / NAME / "pycaffe.py").is_file()]
+        folders = [str(tree / inside) for tree in trees]
+        others = (finder for finder in sys.meta_path if finder is not self)
+        found = (finder.find_spec(fullname, folders) for finder in others if hasattr(finder, "find_spec"))
+        return next((spec for spec in found if spec is not None), None)
 
     def _whole(self) -> ModuleSpec | None:
         found = None if self.shadow else real_caffe()
@@ -84,12 +104,3 @@ class _Alias(importlib.abc.Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         module.__spec__ = self.spec
-
-
-def _is_ours(module: ModuleType | None) -> bool:
-    return module is not None and module.__name__ == HOME
-
-
-def _source_folders() -> list[str]:
-    """Return the folders of Caffe's sources on the path: forks keep modules of their own in them."""
-    return [str(folder) for entry in sys.path if (folder := Path(entry) / NAME).joinpath("pycaffe.py").is_file()]

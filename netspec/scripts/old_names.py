@@ -12,16 +12,28 @@ import importlib
 import importlib.abc
 import importlib.util
 import inspect
+import os
+import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 from typing import Any
 
+from netspec.terminal.commands import VARIABLE
 
-def install() -> None:
-    """Give the names to modules that are imported already, and to others when they are imported."""
+
+def install(also: Mapping[str, Callable[[Any], None]], quiet: bool = False) -> None:
+    """Give the names to modules that are imported already, and to others when they are imported.
+
+    ``also`` are functions for further modules, which are called with the module. Unless ``quiet``, a NumPy that is too
+    new for old programs gets one warning, in this process and none that it forks.
+    """
+    _PATCHES.update(also)
+    if not quiet and os.environ.get(VARIABLE, "0") in ("", "0", "1"):
+        process = os.getpid()
+        _PATCHES["numpy"] = lambda np: (_numpy(np), _warn_if_too_new(np) if os.getpid() == process else None)
     for name, value in (("clock", time.perf_counter),):
         _give(time, name, value)
     for name in collections.abc.__all__:
@@ -94,6 +106,50 @@ def _numpy(np: Any) -> None:
     _give(np, "typeDict", getattr(np, "sctypeDict", {}))
     _give(np, "msort", lambda a: np.sort(a, axis=0))
     np.fromstring = _fromstring(np)
+    _let_threshold_be_nan(np)
+
+
+_TOO_NEW = "NumPy {} takes no array of one element for a number, as old programs expect: pip install 'numpy<2.4'"
+
+
+def _is_too_new(np: Any) -> bool:
+    return tuple(map(int, np.__version__.split(".")[:2])) >= (2, 4)
+
+
+def _warn_if_too_new(np: Any) -> None:
+    if _is_too_new(np):
+        print(f"netspec run: warning: {_TOO_NEW.format(np.__version__)}", file=sys.stderr)
+
+
+def remedy(fault: BaseException) -> str:
+    """Return what to do about a fault that an old program meets and a new one would not; or an empty string."""
+    text = str(fault)
+    np = sys.modules.get("numpy")
+    one_element = "only 0-dimensional arrays can be converted", "setting an array element with a sequence"
+    if np and _is_too_new(np) and text.startswith(one_element):
+        return _TOO_NEW.format(np.__version__)
+    if unknown := re.search(r'has no (?:field named )?"(\w+)"', text):
+        registry, files = (importlib.import_module(f"netspec.proto.dialect.{name}") for name in ("registry", "files"))
+        files.announce_known()
+        named = {d.name for d in registry.known() if any(unknown[1] == field for _, field in d.fields())}
+        return registry.advice_for(unknown[1], tuple(sorted(named)))
+    caffe = sys.modules.get("netspec.pycaffe")
+    if isinstance(fault, FileNotFoundError) and caffe and isinstance(fault.filename, str):
+        beside = os.path.relpath(fault.filename, os.path.dirname(str(caffe.__file__)))
+        if not beside.startswith(os.pardir):
+            return f"this is python/caffe/{beside} of Caffe's sources: put a copy at {fault.filename}"
+    return ""
+
+
+def _let_threshold_be_nan(np: Any) -> None:
+    """Let set_printoptions(threshold="nan") mean that arrays are printed whole."""
+    new = np.set_printoptions
+
+    def set_printoptions(precision: Any = None, threshold: Any = None, *arguments: Any, **named: Any) -> None:
+        whole = threshold == "nan" or threshold != threshold
+        new(precision, sys.maxsize if whole else threshold, *arguments, **named)
+
+    np.set_printoptions = set_printoptions
 
 
 def _fromstring(np: Any) -> Callable[..., Any]:

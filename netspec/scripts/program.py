@@ -6,6 +6,7 @@ import builtins
 import importlib.util
 import linecache
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -15,16 +16,15 @@ from types import ModuleType, TracebackType
 from typing import NoReturn
 
 from netspec.errors import SpecError
-from netspec.scripts import finder, old_names, sources
+from netspec.scripts import old_names, sources, workers
 
 
 @dataclass(frozen=True)
 class Options:
-    """How to run: in the place of a real Caffe, as Python 2 in any case, and where to keep the translation."""
+    """How to run: in the place of a real Caffe, as Python 2 in any case."""
 
     shadow: bool = False
     python2: bool = False
-    translation: Path | None = None
 
 
 def run_script(path: str, arguments: Sequence[str], options: Options) -> NoReturn:
@@ -32,16 +32,13 @@ def run_script(path: str, arguments: Sequence[str], options: Options) -> NoRetur
 
     Raises SpecError where the file cannot be read.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as fault:
-        raise SpecError(f"{path}: cannot be read: {fault.strerror}") from None
-    _prepare(os.path.dirname(os.path.realpath(path)), options)
+    data = sources.bytes_of(path)
+    reader = _prepare(os.path.dirname(os.path.realpath(path)), options)
     sys.argv = [path, *arguments]
     path = os.path.abspath(path)
     main = ModuleType("__main__")
     main.__dict__.update(__file__=path, __cached__=None, __builtins__=builtins)
-    _execute(data, main, path, options)
+    _execute(data, main, path, reader)
 
 
 def run_module(name: str, arguments: Sequence[str], options: Options) -> NoReturn:
@@ -49,7 +46,7 @@ def run_module(name: str, arguments: Sequence[str], options: Options) -> NoRetur
 
     Raises SpecError where there is no such module.
     """
-    _prepare(os.getcwd(), options)
+    reader = _prepare(os.getcwd(), options)
     sys.argv = ["-m", *arguments]
     try:
         spec = importlib.util.find_spec(name)
@@ -63,22 +60,25 @@ def run_module(name: str, arguments: Sequence[str], options: Options) -> NoRetur
     sys.argv[0] = path
     main = ModuleType("__main__")
     main.__dict__.update(__file__=path, __cached__=None, __builtins__=builtins, __spec__=spec, __package__=spec.parent)
-    _execute(Path(path).read_bytes(), main, path, options)
+    _execute(Path(path).read_bytes(), main, path, reader)
 
 
-def _prepare(folder: str, options: Options) -> None:
+def _prepare(folder: str, options: Options) -> sources.Reader:
     sys.path[0] = folder
-    old_names.install()
-    sources.install()
-    finder.install(options.shadow)  # the last is asked first
+    reader = sources.Reader(folder, options.python2)
+    workers.prepare(reader, options.shadow)
+    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+        if callable(signal.getsignal(number)):  # netspec's own; a program's workers are ended by SIGTERM
+            signal.signal(number, usual)
+    return reader
 
 
-def _execute(data: bytes, main: ModuleType, path: str, options: Options) -> NoReturn:
+def _execute(data: bytes, main: ModuleType, path: str, reader: sources.Reader) -> NoReturn:
     """Run a file's bytes as ``__main__``, and end."""
     sys.modules["__main__"] = main
     status = 0
     try:
-        code = sources.main_code(data, path, options.python2, options.translation)
+        code = reader.main_code(data, path)
     except SyntaxError as fault:
         _show(fault, None)
         raise SystemExit(1) from None
@@ -107,3 +107,5 @@ def _show(fault: BaseException, trace: TracebackType | None) -> None:
     else:
         linecache.checkcache()
         traceback.print_exception(type(fault), fault, trace)
+    if remedy := old_names.remedy(fault):
+        print(f"netspec run: {remedy}", file=sys.stderr)

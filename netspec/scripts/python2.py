@@ -1,25 +1,25 @@
-"""Python 2: how to recognize it, how to make it Python 3, and what the result needs to compute the same.
+"""Python 2: how to recognize it, and how to make it Python 3 that computes the same.
 
 The translation is 2to3's (lib2to3 where Python still has it, else fissix, its fork), and adds what that leaves out:
-the quotient of whole numbers is rounded down, ``round`` gives a float and rounds halves away from zero, ``file`` opens.
+the quotient of whole numbers is rounded down, ``round`` gives a float and rounds halves away from zero, ``file`` opens
+(netspec/scripts/as_python2.py).
 """
 
 from __future__ import annotations
 
 import ast
-import builtins
 import functools
 import importlib
 import importlib.util
+import inspect
 import io
-import math
-import numbers
 import re
 import tokenize
 import warnings
 from typing import Any
 
 from netspec.errors import SpecError, Where
+from netspec.scripts import as_python2
 
 # ---- Recognizing ----
 
@@ -61,19 +61,32 @@ def is_python2(data: bytes, path: str) -> bool:
     return not _has_python3(tree) and _has_python2(tree)
 
 
+def is_python3(data: bytes, path: str) -> bool:
+    """Say whether a file that Python 3 can read has what Python 2 could not read."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return _has_python3(ast.parse(data, path))
+
+
 def _has_python3(tree: ast.AST) -> bool:
-    """Say whether a file has what Python 2 could not read."""
     new = (ast.JoinedStr, ast.AnnAssign, ast.Nonlocal, ast.AsyncFunctionDef, ast.NamedExpr, ast.MatMult, ast.YieldFrom)
-    future_print = any(
-        isinstance(node, ast.ImportFrom)
-        and node.module == "__future__"
-        and any(alias.name == "print_function" for alias in node.names)
+    future = {
+        alias.name
         for node in ast.walk(tree)
-    )
+        if isinstance(node, ast.ImportFrom) and node.module == "__future__"
+        for alias in node.names
+    }
+    future_print = "print_function" in future
+    if "annotations" in future:
+        return True
     for node in ast.walk(tree):
         if isinstance(node, new):
             return True
         if isinstance(node, ast.arguments) and (node.kwonlyargs or any(a.annotation for a in node.args)):
+            return True
+        if isinstance(node, ast.FunctionDef) and node.returns:
+            return True
+        if isinstance(node, ast.Call) and _name(node.func) == "super" and not node.args:
             return True
         if isinstance(node, ast.Call) and _name(node.func) == "print" and node.keywords and not future_print:
             return True
@@ -139,8 +152,8 @@ _HELPERS = ("cmp", "file", "open", "round")  # builtins that are others in Pytho
 
 
 @functools.cache
-def translated(data: bytes, path: str) -> str:
-    """Return Python 2 source as Python 3.
+def translated(data: bytes, path: str, alone: bool = False) -> str:
+    """Return Python 2 source as Python 3; ``alone`` puts what it needs into the text, in the place of an import.
 
     Raises SyntaxError where it is not Python 2 either, SpecError where neither lib2to3 nor fissix is there.
     """
@@ -158,7 +171,7 @@ def translated(data: bytes, path: str) -> str:
         raise SyntaxError(f"this is neither Python 3 nor Python 2: {fault}") from None
     helpers = [] if "division" in tree.future_features else _floor_quotients(tree, package)
     helpers += _used_builtins(tree)
-    return _with_import(str(tree), helpers)
+    return _with_helpers(str(tree), helpers, alone)
 
 
 @functools.cache
@@ -209,10 +222,10 @@ def _floor_quotients(tree: Any, package: str) -> list[str]:
     used: set[str] = set()
 
     def call(name: str, left: Any, right: Any) -> Any:
-        used.add(name)
+        used.add(f"py2_{name}")
         prefix, left.prefix = left.prefix, ""
         right.prefix = right.prefix or " "
-        return util.Call(util.Name(f"_py2_{name}"), [left, util.Comma(), right], prefix=prefix)
+        return util.Call(util.Name(f"py2_{name}"), [left, util.Comma(), right], prefix=prefix)
 
     for node in list(tree.post_order()):
         operators = [str(child).strip() for child in node.children[1::2]]
@@ -236,7 +249,7 @@ def _floor_quotients(tree: Any, package: str) -> list[str]:
             again = target.clone()
             again.prefix = " "
             node.append_child(call("idiv", again, value))
-    return [f"{name} as _py2_{name}" for name in sorted(used)]
+    return sorted(used)
 
 
 def _is_float(node: Any) -> bool:
@@ -253,11 +266,18 @@ def _used_builtins(tree: Any) -> list[str]:
     return sorted({leaf.value for leaf in named if str(leaf.prev_sibling) != "." and str(leaf.next_sibling) != "="})
 
 
-def _with_import(text: str, helpers: list[str]) -> str:
-    """Return a text with an import of helpers, behind the docstring and the imports from __future__."""
+def _with_helpers(text: str, helpers: list[str], alone: bool) -> str:
+    """Return a text with helpers, behind the docstring and the imports from __future__."""
     if not helpers:
         return text
-    line = f"from netspec.scripts.python2 import {', '.join(helpers)}  # as Python 2 has it\n"
+    line = f"from netspec.scripts.as_python2 import {', '.join(helpers)}  # as Python 2 has it\n"
+    if alone:
+        functions = {getattr(as_python2, name) for name in helpers}
+        if any(name.startswith("py2_") for name in helpers):
+            functions.add(as_python2.py2_is_whole)
+        parts = [inspect.getsource(function) for function in sorted(functions, key=lambda function: function.__name__)]
+        line = "\n\n".join(["import builtins\nimport math\nimport numbers\n", *parts])
+        line += "\n\nfile = open\n" if "file" in helpers else "\n\n"
     last = 0
     for node in ast.parse(text).body:
         docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and last == 0
@@ -268,46 +288,3 @@ def _with_import(text: str, helpers: list[str]) -> str:
     if not last:  # behind the comments at the top: one may declare the encoding
         last = next((number for number, line in enumerate(lines) if not line.startswith("#")), 0)
     return "".join([*lines[:last], line, *lines[last:]])
-
-
-# ---- What a translation needs ----
-
-
-def div(left: Any, right: Any) -> Any:
-    """Return left / right, rounded down where both are whole numbers or arrays of them."""
-    return left // right if _is_whole(left) and _is_whole(right) else left / right
-
-
-def idiv(left: Any, right: Any) -> Any:
-    """Do left /= right as :func:`div` has it, and return the result; an array is changed in place."""
-    if _is_whole(left) and _is_whole(right):
-        left //= right
-    else:
-        left /= right
-    return left
-
-
-def round(number: Any, ndigits: int = 0) -> float:
-    """Return a number rounded to so many digits, halves away from zero, as a float."""
-    scale = 10.0**ndigits
-    return math.copysign(math.floor(abs(number) * scale + 0.5) / scale, number)
-
-
-def cmp(left: Any, right: Any) -> int:
-    """Return -1, 0 or 1."""
-    return (left > right) - (left < right)
-
-
-def open(file: Any, mode: str = "r", *arguments: Any, **named: Any) -> Any:
-    """Open a file; text may have any bytes in it."""
-    if "b" not in mode and not arguments and not named:
-        named = {"encoding": "utf-8", "errors": "surrogateescape"}
-    return builtins.open(file, mode, *arguments, **named)
-
-
-file = open
-
-
-def _is_whole(value: Any) -> bool:
-    kind = getattr(getattr(value, "dtype", None), "kind", "")
-    return kind in "iub" if kind else isinstance(value, numbers.Integral)

@@ -12,6 +12,7 @@ import pytest
 
 from lmdb_build.cli import main
 from lmdb_build.databases import read_pairs, read_single_list
+from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
 from netspec.errors import SpecError
 from paths import ROOT
@@ -231,6 +232,24 @@ def test_what_cannot_be_converted_is_refused(
     (tmp_path / "l").write_text(text + "\n")
     arguments = ["-workers=1", *flags, str(root), f"{tmp_path}/l"]
     check_refused(tmp_path, capsys, convert_pairs_lmdb, arguments, message.format(root=root))
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_images_that_cannot_be_read_are_left_out_as_in_caffe(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
+) -> None:
+    (tmp_path / "text.png").write_text("no image")
+    (tmp_path / "l").write_text(f"{PNG}0.png 1\nnix.png 2\n{tmp_path}/text.png 3\n{PNG}1.png 4\n")
+    arguments = ["-workers", workers, "", f"{tmp_path}/l", str(tmp_path / "written")]
+    assert convert_imageset(arguments) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert [sum(word in line for line in lines) for word in ("read: No such file", "cannot be decoded")] == [1, 1]
+    assert lines[-2].endswith("Processed 2 files.")
+    assert lines[-1].endswith("Skipped 2 of 4 images, which cannot be read")
+    reader = open_reader(str(tmp_path / "written"))
+    assert [reader.key(i)[:8] for i in range(len(reader))] == [b"00000000", b"00000003"]
+    (tmp_path / "none").write_text("nix.png 2\n")
+    check_refused(tmp_path, capsys, convert_imageset, [PNG, f"{tmp_path}/none"], 'none:1:1: image "')
 
 
 def test_a_label_that_is_no_number_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

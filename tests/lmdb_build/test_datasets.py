@@ -39,6 +39,24 @@ def test_mnist(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["mnist", *files, str(tmp_path / "db")]) == 1  # it is there
 
 
+def test_pairs_of_mnist(tmp_path: Path) -> None:
+    images, labels = CHANCE.integers(0, 256, (60, 5, 4), np.uint8), CHANCE.integers(0, 3, 60, np.uint8)
+    files = [idx(tmp_path / "images", images), idx(tmp_path / "labels", labels)]
+    label_of = {image.tobytes(): label for image, label in zip(images, labels, strict=True)}
+    for name in ("db", "again"):
+        assert main(["mnist", "--pairs", *files, str(tmp_path / name)]) == 0
+    found = records(tmp_path / "db")
+    assert found == records(tmp_path / "again")
+    firsts, same = set(), []
+    for i, (key, record) in enumerate(found):
+        datum = parse_datum(record)
+        first, second = (channel.tobytes() for channel in datum_to_array(datum))
+        assert (key, datum.channels, datum.label) == (b"%08d" % i, 2, label_of[first] == label_of[second])
+        firsts.add(first)
+        same.append(datum.label)
+    assert (len(found), len(firsts) > 30, 5 < sum(same) < 40) == (60, True, True)
+
+
 def test_mnist_is_what_caffe_writes(tmp_path: Path) -> None:
     """Files of MNIST made from a database of Caffe's give that database again."""
     golden = shared("golden/examples/mnist/mnist_test_lmdb")

@@ -146,6 +146,12 @@ def dialects_with_field(message: str, field: str) -> tuple[str, ...]:
     return tuple(d.name for d in _known.values() if (message, field) in d.fields())
 
 
+def dialects_with_message(name: str) -> tuple[str, ...]:
+    """Return the known dialects that have a message or an enum of their own."""
+    files = {d.name: d.declarations for d in _known.values()}
+    return tuple(d for d, file in files.items() if any(m.name == name for m in (*file.message_type, *file.enum_type)))
+
+
 def dialects_with_type(layer_type: str) -> tuple[str, ...]:
     """Return the known dialects that have a layer type."""
     return tuple(d.name for d in _known.values() if layer_type in d.layer_types)

@@ -14,7 +14,9 @@ from google.protobuf import message_factory
 from google.protobuf.internal.enum_type_wrapper import EnumTypeWrapper
 
 from netspec.errors import did_you_mean
+from netspec.proto.dialect.files import announce_known
 from netspec.proto.dialect.merged import merged_file
+from netspec.proto.dialect.registry import advice_for, dialects_with_message
 
 
 def __getattr__(name: str) -> Any:
@@ -25,7 +27,10 @@ def __getattr__(name: str) -> Any:
         return [public for public in names if not public.startswith("_")]
     if name in names:
         return names[name]
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{did_you_mean(name, list(names))}")
+    announce_known()
+    advice = advice_for(name, dialects_with_message(name))
+    hint = f"; {advice}" if advice else did_you_mean(name, list(names))
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
 
 
 def __dir__() -> list[str]:

@@ -11,7 +11,9 @@ from google.protobuf import descriptor_pool, text_format
 from netspec.dialects import use_dialect
 from netspec.proto import schema
 from netspec.proto.dialect.registry import deactivate
+from netspec.pycaffe.net_spec import layers, params
 from netspec.pycaffe.proto import caffe_pb2
+from netspec.scripts import old_names
 
 
 @pytest.fixture
@@ -99,3 +101,23 @@ def test_without_the_dialect_its_messages_are_gone(ssd: None) -> None:
     assert not hasattr(caffe_pb2, "LabelMap")
     use_dialect("ssd")
     assert caffe_pb2.LayerParameter is before
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("caffe_pb2.ResizeParameter", "ResizeParameter"),
+        ("P.Resize.WARP", "ResizeParameter"),
+        ("L.Permute(L.Input(), order=[1]).to_proto()", "Permute"),
+        ("L.Convolution(L.Input(), permute_param=dict(order=[1])).to_proto()", "permute_param"),
+        ("caffe_pb2.SolverParameter(eval_type='detection')", "eval_type"),
+        ("text_format.Merge('layer { permute_param { order: 1 } }', caffe_pb2.NetParameter())", "permute_param"),
+    ],
+)
+def test_what_only_a_dialect_has_names_it(line: str, name: str) -> None:
+    names = {"caffe_pb2": caffe_pb2, "L": layers, "P": params, "text_format": text_format}
+    with pytest.raises(Exception, match=r"ha(s|ve) no ") as caught:
+        eval(line, names)
+    said = f"{caught.value}; {old_names.remedy(caught.value)}"
+    assert f'dialect "ssd" has "{name}"; add --plugin ssd' in said
+    assert "did you mean" not in said

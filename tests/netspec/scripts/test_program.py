@@ -99,7 +99,7 @@ def test_caffe_and_its_submodules_are_found(run: Run) -> None:
 
 def test_a_module_that_caffe_has_not(run: Run) -> None:
     fault = run("s.py", rc=1, s="import caffe.nothing").stderr
-    assert "No module named 'caffe.nothing'" in fault
+    assert "No module named 'caffe.nothing'; Python files of a Caffe tree are found where its folder " in fault
 
 
 def test_a_real_caffe_is_used_unless_asked(run: Run) -> None:
@@ -111,14 +111,108 @@ def test_a_real_caffe_is_used_unless_asked(run: Run) -> None:
 
 
 def test_caffes_sources_without_the_compiled_part_are_no_real_caffe(run: Run) -> None:
-    files = {
-        "python/caffe/__init__.py": "from .pycaffe import Net",
-        "python/caffe/pycaffe.py": "from ._caffe import Net",
-        "python/caffe/of_a_fork.py": "value = 3",
-    }
-    script = "import sys\nsys.path.insert(0, 'python')\nimport caffe\nfrom caffe.of_a_fork import value\n"
-    done = run("s.py", s=script + "print(caffe.__name__, value)", files=files)
-    assert (done.stdout, done.stderr) == ("netspec.pycaffe 3\n", "")
+    done = run("s.py", s=f"{TREE}import caffe\nprint(caffe.__name__)", files=SOURCES)
+    assert (done.stdout, "is used" in done.stderr) == ("netspec.pycaffe\n", False)
+
+
+SOURCES = {
+    "python/caffe/__init__.py": "from .pycaffe import Net",
+    "python/caffe/pycaffe.py": "from ._caffe import Net",
+    "python/caffe/of_a_fork.py": "from caffe import layers as L\nvalue = 3",
+    "python/caffe/old.py": "print 'two'\nvalue = 7/2",
+    "python/caffe/proto/more.py": "value = 4",
+    "python/caffe/test/test_it.py": "value = 5",
+}
+TREE = "import sys\nsys.path.insert(0, 'python')\n"
+
+
+IN_A_TREE = """
+from caffe import of_a_fork
+import caffe.of_a_fork, caffe.old, caffe.proto.more, caffe.test.test_it
+assert of_a_fork is caffe.of_a_fork and of_a_fork.value == 3
+assert (caffe.old.value, caffe.proto.more.value, caffe.test.test_it.value) == (3, 4, 5)
+assert not hasattr(caffe, "nothing") and caffe.io.__name__ == "netspec.pycaffe.io"
+"""
+
+
+def test_python_files_of_a_caffe_tree_are_found_below_caffe(run: Run) -> None:
+    assert run("s.py", s=TREE + IN_A_TREE, files=SOURCES).stdout == "two\n"
+
+
+SPAWN = """
+import multiprocessing as mp, sys
+import caffe
+
+def phases(_):
+    import helper
+    return len({caffe.TRAIN, caffe.TEST}), helper.half(3), 3 / 2
+
+if __name__ == "__main__":
+    for kind in sys.argv[1:]:
+        pool = mp.get_context(kind).Pool(1)
+        %s
+        pool.terminate()
+"""
+
+
+@pytest.mark.parametrize(
+    ("shown", "half", "kinds"),
+    [
+        ("print pool.map(phases, [0])", 1, ["spawn", "fork"]),
+        ("print(pool.map(phases, [0]))", 1.5, ["forkserver"]),
+    ],
+)
+def test_workers_that_are_started_anew_see_what_the_program_sees(
+    run: Run, shown: str, half: float, kinds: list[str]
+) -> None:
+    files = {"helper.py": "def half(n):\n    return n / 2", "of.a.pool.py": SPAWN % shown}
+    done = run("of.a.pool.py", *kinds, files=files)
+    assert done.stdout == f"[(2, {half}, {half})]\n" * len(kinds)
+    assert done.stderr.count("of.a.pool.py is Python 2") == (half == 1)
+    assert "Traceback" not in done.stderr  # of a worker that the pool ends
+
+
+ONE = """
+import sys, math
+import numpy as np
+w = np.ones((3, 1), np.float32)
+print("%.2f %s %d" % (w[0], "a", w[1]), "%.1f" % w[2], float(w[0]) + int(w[1]), math.sqrt(w[0]))
+np.set_printoptions(threshold="nan")
+print(len(str(np.zeros(2000))) > 2000)
+for fault in (lambda: "%d" % "a", lambda: float([1]), lambda: "%.2f" % np.ones(2)):
+    try:
+        fault()
+    except TypeError as e:
+        print(e)
+"""
+
+
+def test_arrays_of_one_element_are_numbers(run: Run) -> None:
+    *printed, first, second, third = run("s.py", s=ONE).stdout.splitlines()
+    assert printed == ["1.00 a 1 1.0 2.0 1.0", "True"]
+    assert first.startswith("%d format")
+    assert second.startswith("float() argument must be")
+    assert third.startswith("only ")
+
+
+def test_a_numpy_that_is_too_new_is_named(run: Run) -> None:
+    import numpy as np
+
+    if tuple(map(int, np.__version__.split(".")[:2])) < (2, 4):
+        pytest.skip("this NumPy takes arrays of one element for numbers")
+    said = f"NumPy {np.__version__} takes no array of one element for a number, as old programs expect: pip install "
+    done = run("s.py", rc=1, s="import numpy as np\na = np.zeros(3)\na[0] = np.ones(1)")
+    first, *_, last = done.stderr.splitlines()
+    assert first.startswith(f"netspec run: warning: {said}")
+    assert last.startswith(f"netspec run: {said}")
+    assert run("s.py", s="print(1)").stderr == ""
+
+
+def test_a_file_that_caffe_has_beside_its_code_is_named(run: Run) -> None:
+    script = "import caffe, os, numpy\nnumpy.load(os.path.dirname(caffe.__file__) + '/imagenet/ilsvrc_2012_mean.npy')"
+    last = run("s.py", rc=1, s=script).stderr.splitlines()[-1]
+    said = "netspec run: this is python/caffe/imagenet/ilsvrc_2012_mean.npy of Caffe's sources: put a copy at /"
+    assert last.startswith(said)
 
 
 def test_a_dialect_is_there_before_the_script(run: Run) -> None:

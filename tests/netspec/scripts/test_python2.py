@@ -1,5 +1,6 @@
 """Scripts in Python 2: which are recognized, and that their translation computes what they did."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,9 @@ import pytest
 
 from netspec.errors import SpecError
 from netspec.scripts import python2
-from netspec.scripts.python2 import cmp, div, idiv, is_python2, round, translated
+from netspec.scripts.as_python2 import cmp, py2_div, py2_idiv, round
+from netspec.scripts.python2 import is_python2, translated
+from paths import ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -108,23 +111,68 @@ if __name__ == '__main__':
 
 def test_a_whole_script(tmp_path: Path) -> None:
     (tmp_path / "old.py").write_bytes(SCRIPT)
-    words = [sys.executable, "-m", "netspec", "run", "--write-py3", "new.py", "old.py"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    run = [sys.executable, "-m", "netspec", "run"]
+    done = subprocess.run([*run, "old.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         *("3 3.5 1.5 4", "[0, 0, 1, 1, 2] [0, 0, 0, 0, 1] [0.0, 0.0, 0.5, 0.5, 1.0]"),
         *("3.0 ['a', 'b'] [1]", "3 -4 500.0 0.25 -1 2", "1"),
     ]
-    (line,) = done.stderr.splitlines()
-    assert line.endswith("old.py is Python 2, and runs translated to Python 3; the translation is in new.py")
-    again = subprocess.run([sys.executable, "new.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    said = "old.py is Python 2, and runs translated to Python 3; --write-py3 FILE writes the translation"
+    assert said in done.stderr
+    (tmp_path / "binary.txt").unlink()
+    words = [*run, "--write-py3", "new.py", "old.py"]
+    written = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (written.returncode, written.stdout, written.stderr) == (0, "", "")
+    assert not (tmp_path / "binary.txt").exists()  # nothing has run
+    assert "netspec" not in (tmp_path / "new.py").read_text()
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    command = [sys.executable, "new.py"]
+    again = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=alone)
     assert again.stdout == done.stdout, again.stderr
+
+
+@pytest.mark.parametrize("words", [["--shadow-caffe", "s.py"], ["-m", "s"], ["s.py", "argument"]])
+def test_a_translation_that_is_only_written_takes_nothing_for_a_run(words: list[str], tmp_path: Path) -> None:
+    (tmp_path / "s.py").write_text("print 1")
+    command = [sys.executable, "-m", "netspec", "run", "--write-py3", "n.py", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, "--write-py3 takes a script, and nothing runs" in done.stderr) == (2, True)
+
+
+HALF = "def half(n):\n    return n / 2\n"
+
+
+def test_modules_around_a_program_are_python_2_with_it(tmp_path: Path) -> None:
+    """Numbers would be others in silence: nothing in these modules is of one language only."""
+    places = ("bin/beside.py", "bin/pack/below.py", "lib/put.py", "lib/sub/deep.py", "given/elsewhere.py")
+    for place in places:
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).write_text(HALF)
+    (tmp_path / "bin/three.py").write_text("def half(n: int):\n    return n / 2\n")
+    (tmp_path / "bin/true.py").write_text(f"from __future__ import division\n{HALF}")
+    program = "import sys; sys.path.insert(0, 'lib')\n"
+    program += "import beside, pack.below, put, sub.deep, three, true, elsewhere\n"
+    names = ("beside", "pack.below", "put", "sub.deep", "three", "true", "elsewhere")
+    halves = ", ".join(f"{name}.half(3)" for name in names)
+    (tmp_path / "bin/two.py").write_text(f"{program}print {halves}")
+    (tmp_path / "bin/new.py").write_text(f"{program}print({halves})")
+    expected = {
+        ("two.py",): "1 1 1 1 1.5 1.5 1.5\n",
+        ("new.py",): "1.5 1.5 1.5 1.5 1.5 1.5 1.5\n",
+        ("new.py", "--python2"): "(1, 1, 1, 1, 1.5, 1.5, 1)\n",
+    }
+    env = {**os.environ, "PYTHONPATH": f"{tmp_path / 'given'}{os.pathsep}{ROOT}"}
+    for (name, *options), printed in expected.items():
+        command = [sys.executable, "-m", "netspec", "run", *options, f"bin/{name}"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=env)
+        assert done.stdout == printed, done.stderr
 
 
 def test_with_true_division_it_stays(tmp_path: Path) -> None:
     text = translated(b"from __future__ import division\nprint 7/2, round(0.5)\n", "s.py")
     assert "7/2" in text
-    assert "from netspec.scripts.python2 import round  # as Python 2 has it\n" in text
+    assert "from netspec.scripts.as_python2 import round  # as Python 2 has it\n" in text
 
 
 def test_modules_of_the_script_too_and_nothing_is_left_for_plain_python(tmp_path: Path) -> None:
@@ -161,15 +209,15 @@ def test_nothing_to_translate_is_said(tmp_path: Path) -> None:
 
 
 def test_quotients() -> None:
-    assert (div(7, 2), div(-7, 2), div(7, 2.0), div(True, 2)) == (3, -4, 3.5, 0)
-    assert isinstance(div(np.int64(7), 2), np.integer)
-    assert div(np.float32(7), 2) == 3.5
+    assert (py2_div(7, 2), py2_div(-7, 2), py2_div(7, 2.0), py2_div(True, 2)) == (3, -4, 3.5, 0)
+    assert isinstance(py2_div(np.int64(7), 2), np.integer)
+    assert py2_div(np.float32(7), 2) == 3.5
     array = np.arange(4)
-    assert div(array, 2).tolist() == [0, 0, 1, 1]
-    assert idiv(array, 2) is array
+    assert py2_div(array, 2).tolist() == [0, 0, 1, 1]
+    assert py2_idiv(array, 2) is array
     assert array.tolist() == [0, 0, 1, 1]
     floats = np.ones(2)
-    assert idiv(floats, 4) is floats
+    assert py2_idiv(floats, 4) is floats
     assert floats.tolist() == [0.25, 0.25]
 
 
