@@ -17,6 +17,7 @@ from netspec.cli import (
     export,
     extract,
     fmt,
+    layers,
     lint,
     look,
     lsp,
@@ -29,10 +30,15 @@ from netspec.cli import (
 from netspec.cli.run import Commands
 from netspec.terminal.commands import program, run
 
-_FAMILIES = (
-    *(train, measure, check, draw, diff, fmt, lint, lsp, extract, plot, watch, data, look, export),
-    *(run_script, bug_report, caffe_tools),
-)
+# The headings of ``netspec --help``, and the modules whose commands stand below each.
+_GROUPS = {
+    "Caffe's programs": (train, measure, caffe_tools),
+    "look at nets": (check, lint, draw, diff, fmt, layers, look),
+    "look at data and trainings": (data, plot, watch),
+    "use a net elsewhere": (extract, export),
+    "old programs": (run_script,),
+    "editor, shell, help": (lsp, completion, bug_report),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     made = program("netspec", "Run Caffe's prototxt in PyTorch, with Caffe's numbers.")
     commands = Commands(made)
-    for family in _FAMILIES:
-        family.add_to(commands)
-    completion.add_to(commands, parser)
+    for commands.heading, modules in _GROUPS.items():
+        for module in modules:
+            module.add_to(commands)
     return made

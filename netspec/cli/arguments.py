@@ -14,7 +14,21 @@ from netspec.exact import CHOICES, SMALL
 from netspec.graph.steps import PASSES
 from netspec.proto.binary import split_paths
 from netspec.terminal import log
-from netspec.terminal.commands import refuse
+from netspec.terminal.commands import WrongUsage, refuse
+
+
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """Add NET, and Caffe's name for it, ``--model``; :func:`model` returns the one that was given."""
+    parser.add_argument("net", nargs="?", metavar="NET", help="the net's prototxt")
+    parser.add_argument("--model", help="the same, as Caffe's programs name it")
+
+
+def model(arguments: argparse.Namespace) -> str:
+    """Return the net's prototxt."""
+    named = arguments.net or arguments.model
+    if not named or (arguments.net and arguments.model):
+        raise WrongUsage(f"name one net: {arguments.prog} net.prototxt")
+    return named
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -62,24 +76,23 @@ def _passes(text: str) -> tuple[str, ...]:
 
 
 def add_engine(parser: argparse.ArgumentParser) -> None:
-    """Add ``--engine``, ``--precision``, ``--cache`` and ``--no-cache``."""
+    """Add ``--engine``, ``--precision`` and ``--cache``."""
     parser.add_argument("--engine", choices=ENGINES, default=TORCH, help=f"what runs the net (default: {TORCH})")
     parser.add_argument(
         "--precision", choices=PRECISIONS, default=FP32, help=f"of the engine's arithmetic (default: {FP32})"
     )
     parser.add_argument(
-        "--cache", metavar="DIR", help="keep nets exported for an engine here (default: the user's cache folder)"
+        "--cache",
+        metavar="DIR|none",
+        help="keep nets exported for an engine here, or do not keep them (default: the user's cache folder)",
     )
-    parser.add_argument("--no-cache", action="store_true", help="export the net anew, and do not keep it")
 
 
 def choice(arguments: argparse.Namespace) -> Choice:
     """Return the engine that is asked for."""
     if arguments.engine == TORCH:
-        refuse(arguments, ("cache", "no_cache"), f"is for engines that run exported nets; {TORCH} does not")
-    elif arguments.no_cache:
-        refuse(arguments, ("cache",), "and --no-cache contradict each other")
-    return Choice.of(arguments.engine, arguments.precision, False if arguments.no_cache else arguments.cache)
+        refuse(arguments, ("cache",), f"is for engines that run exported nets; {TORCH} does not")
+    return Choice.of(arguments.engine, arguments.precision, False if arguments.cache == "none" else arguments.cache)
 
 
 def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
@@ -189,13 +202,13 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
     """Return the net of ``--model``, on the device of ``--gpu``; the sites are where Caffe logs the device."""
     from netspec.net.build import load_net
 
-    chosen = device(arguments.gpu)
+    path, chosen = model(arguments), device(arguments.gpu)
     if chosen.type == "cpu":
         log.info(cpu_site, "Use CPU.")
     else:
         log.info(gpu_site, f"Use GPU with device ID {chosen.index}")
     return load_net(
-        arguments.model,
+        path,
         phase,
         level=arguments.level,
         stages=arguments.stage.split(","),  # without --stage an empty one, as in Caffe
@@ -223,4 +236,4 @@ def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:
     from netspec.engines.net import with_engine
 
     paths = split_paths(weights) if weights else []
-    return with_engine(net, chosen, arguments.model, paths, arguments.level, arguments.stage.split(","))
+    return with_engine(net, chosen, model(arguments), paths, arguments.level, arguments.stage.split(","))

@@ -6,7 +6,7 @@ import argparse
 import logging
 
 from netspec.cli.arguments import add_shapes, device, positive
-from netspec.cli.run import Commands
+from netspec.cli.run import BUILT, READ, Commands
 from netspec.errors import SpecError
 from netspec.files.whole_file import whole_file
 from netspec.terminal import log
@@ -16,7 +16,7 @@ from netspec.terminal.commands import WrongUsage
 def add_to(commands: Commands) -> None:
     """Add the commands."""
     p = commands.add(
-        "extract_features", _extract_features, "write blobs to databases of float Datums (extract_features)"
+        "extract_features", _extract_features, "write blobs to databases of float Datums (extract_features)", net=BUILT
     )
     p.set_defaults(log_level=logging.WARNING)  # Caffe's tool does not log how it builds the net
     p.add_argument("weights", help="the trained weights")
@@ -36,13 +36,12 @@ def add_to(commands: Commands) -> None:
         ("upgrade_net_proto_binary", _upgrade_net_binary, "a .caffemodel"),
         ("upgrade_solver_proto_text", _upgrade_solver_text, "a solver's prototxt"),
     ):
-        p = commands.add(name, function, f"write {what} in the current format")
+        text_net = name == "upgrade_net_proto_text"
+        p = commands.add(name, function, f"write {what} in the current format", net=READ if text_net else 0)
         p.add_argument("input", metavar="IN")
         p.add_argument("output", metavar="OUT")
-        if name == "upgrade_net_proto_text":
+        if text_net:
             add_shapes(p, "of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input")
-
-    commands.add("layers", _layers, "list the layer types, each with its description", quiet=True)
 
 
 def _extract_features(arguments: argparse.Namespace) -> None:
@@ -112,12 +111,3 @@ def _upgrade_solver_text(arguments: argparse.Namespace) -> None:
 def _write(path: str, data: bytes) -> None:
     with whole_file(path) as unfinished:
         unfinished.write_bytes(data)
-
-
-def _layers(arguments: argparse.Namespace) -> None:
-    from netspec.layers import layer_class, layer_types
-
-    for name in layer_types():
-        cls = layer_class(name)
-        first = ((cls and cls.__doc__) or "").strip().splitlines()[0]
-        print(f"{name:28} {first}")

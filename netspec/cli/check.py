@@ -7,7 +7,7 @@ import json
 import sys
 
 from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, stages
-from netspec.cli.run import Commands
+from netspec.cli.run import BUILT, Commands
 from netspec.errors import printable
 from netspec.process.garbage import no_collection
 from netspec.proto.binary import is_net_binary
@@ -18,7 +18,11 @@ from netspec.terminal.commands import refuse
 def add_to(commands: Commands) -> None:
     """Add the command."""
     p = commands.add(
-        "check", _check, "build a net, or a solver's nets, and report every error; nothing is written", quiet=True
+        "check",
+        _check,
+        "build a net, or a solver's nets, and report every error; nothing is written",
+        quiet=True,
+        net=BUILT,
     )
     p.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt, or a .caffemodel")
     add_state(p, phase="TEST")

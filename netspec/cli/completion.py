@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from netspec.cli.run import Commands
@@ -13,9 +13,9 @@ SHELLS = ("bash", "zsh", "fish")
 WORDS = (None, str, Path)  # the types of values that may be names of files
 
 
-def add_to(commands: Commands, parser: Callable[[], argparse.ArgumentParser]) -> None:
-    """Add the command; ``parser`` makes the parser of all commands."""
-    p = commands.add("completion", lambda arguments: _print(arguments.shell, parser()), "print a shell's completion")
+def add_to(commands: Commands) -> None:
+    """Add the command."""
+    p = commands.add("completion", _print, "print a shell's completion")
     p.description = """Print what makes a shell complete the commands of netspec.
     bash: netspec completion bash > ~/.local/share/bash-completion/completions/netspec;
     zsh: netspec completion zsh > a file _netspec in a folder of $fpath;
@@ -24,15 +24,18 @@ def add_to(commands: Commands, parser: Callable[[], argparse.ArgumentParser]) ->
     p.set_defaults(log_form=None)
 
 
-def _print(shell: str, parser: argparse.ArgumentParser) -> None:
+def _print(arguments: argparse.Namespace) -> None:
+    from netspec.cli import parser  # which makes the parser of all commands, this one among them
+
     try:
         import shtab
     except ImportError:
         raise SpecError("completion needs shtab: pip install shtab, or 'netspec-caffe[completion]'") from None
-    for action in _actions(parser):
+    made = parser()
+    for action in _actions(made):
         if action.nargs != 0 and not action.choices and action.type in WORDS:
             vars(action)["complete"] = shtab.FILE
-    print(shtab.complete(parser, shell=shell))
+    print(shtab.complete(made, shell=arguments.shell))
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from netspec.cli.run import Commands
+from netspec.cli.run import READ, Commands
 from netspec.terminal.commands import DONE, SOMETHING, UNREADABLE
 
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add("diff", _diff, "tell what differs in meaning: nets, solvers or weights", quiet=True)
+    p = commands.add("diff", _diff, "tell what differs in meaning: nets, solvers or weights", quiet=True, net=READ)
     p.add_argument("first", metavar="A", help="a prototxt, a .caffemodel or a .caffemodel.h5")
     p.add_argument("second", metavar="B", help="another of the same kind")
     p.add_argument(

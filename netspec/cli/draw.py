@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
-from netspec.cli.run import Commands
+from netspec.cli.run import READ, Commands
 from netspec.proto.schema import PHASES, TEST, TRAIN
 from netspec.terminal.commands import WrongUsage, refuse
 
@@ -16,7 +16,9 @@ FORMATS = (".svg", ".png", ".html")
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add("draw", _draw, "draw a net: layers, shapes, shared parameters, multiply-adds", quiet=True)
+    p = commands.add(
+        "draw", _draw, "draw a net: layers, shapes, shared parameters, multiply-adds", quiet=True, net=READ
+    )
     p.add_argument("file", metavar="FILE", help="a net's prototxt, or a solver's, whose training net is drawn")
     p.add_argument("--out", required=True, type=Path, metavar="F.svg|F.png|F.html", help="the file to write")
     p.add_argument("--phase", choices=tuple(PHASES), type=str.upper, help="only this phase (default: both in one)")

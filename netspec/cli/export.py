@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
-from netspec.cli.run import Commands
+from netspec.cli.run import BUILT, Commands
 from netspec.proto.binary import split_paths
 from netspec.terminal import log
 from netspec.terminal.commands import refuse
@@ -27,7 +27,7 @@ Layers that read data become inputs; --shape says what they read, where the prot
 def add_to(commands: Commands) -> None:
     """Add the commands."""
     summary = "write a net as ONNX, PyTorch source, a torch.export archive or safetensors"
-    p = commands.add("export", _export, summary, quiet=True)
+    p = commands.add("export", _export, summary, quiet=True, net=BUILT)
     p.description, p.formatter_class = EXPORT, argparse.RawDescriptionHelpFormatter
     p.add_argument("file", metavar="FILE", help="the net's prototxt")
     p.add_argument("--to", required=True, choices=("onnx", "torch", "pt2", "safetensors"), help="the form")
@@ -47,7 +47,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--scale", type=float, default=1.0, metavar="S", help="ONNX: then multiply by this")
     p.add_argument("--uint8", action="store_true", help="ONNX: images are bytes")
     summary = "write the deploy net with BatchNorm and Scale folded in: OUT.prototxt, OUT.caffemodel"
-    p = commands.add("fold", _fold, summary, quiet=True)
+    p = commands.add("fold", _fold, summary, quiet=True, net=BUILT)
     p.add_argument("file", metavar="MODEL", help="the net's prototxt; of a training net, labels and losses are removed")
     p.add_argument("--weights", required=True, help="the trained weights")
     p.add_argument("--out", required=True, type=Path, metavar="PREFIX", help="write PREFIX.prototxt and .caffemodel")

@@ -11,6 +11,7 @@ from netspec.cli.arguments import (
     add_device,
     add_engine,
     add_exact,
+    add_model,
     add_passes,
     add_python,
     add_state,
@@ -20,12 +21,13 @@ from netspec.cli.arguments import (
     choice,
     device,
     load_weights,
+    model,
     positive,
     run_by,
     shape,
     stages,
 )
-from netspec.cli.run import Commands
+from netspec.cli.run import BUILT, Commands
 from netspec.errors import SpecError
 from netspec.features.views import read_zooms
 from netspec.files.whole_file import whole_file, why_unwritable
@@ -38,8 +40,8 @@ from netspec.terminal.commands import WrongUsage, refuse
 def add_to(commands: Commands) -> None:
     """Add the command."""
     summary = "write blobs to an .npz file, for the records of a data layer or for images"
-    p = commands.add("extract", _extract, summary, quiet=True)
-    p.add_argument("--model", required=True, help="the net's prototxt")
+    p = commands.add("extract", _extract, summary, quiet=True, net=BUILT)
+    add_model(p)
     p.add_argument("--weights", help="the trained weights (default: random weights)")
     p.add_argument("--blob", required=True, nargs="+", action="extend", help="the blobs to write")
     p.add_argument("--out", required=True, help="the .npz to write")
@@ -73,6 +75,7 @@ def _extract(arguments: argparse.Namespace) -> None:
 
     from netspec.features.finite import rows_not_finite
 
+    model(arguments)
     out = Path(arguments.out)
     if reason := why_unwritable(out):
         raise SpecError(f"--out {out}: cannot be written: {reason}")
@@ -106,7 +109,7 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     (blob,) = arguments.blob
     chosen = device(arguments.gpu) if arguments.gpu else "cpu"  # without torch, where the engine needs none
     net = ImageNet(
-        arguments.model,
+        model(arguments),
         weights,
         blob,
         arguments.input,
@@ -120,7 +123,7 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
         arguments.passes,
     )
     size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "RGB" if net.scaling.swap else "BGR"
-    print(f"{arguments.model}: {blob} of {len(images.paths)} images from {arguments.images}")
+    print(f"{model(arguments)}: {blob} of {len(images.paths)} images from {arguments.images}")
     print(f"{arguments.input} ({size}): {kind}, {net.scaling}")
     return extract_images(net, images, bar("extract", "batch"))
 
@@ -134,7 +137,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
 
     images = ("input", "shape", "zooms", "swap", "raw_scale", "mean", "scale")
     refuse(arguments, images, "is for --images; a data layer's records have its shape and its transform_param")
-    message, source = parse_net(arguments.model)
+    message, source = parse_net(model(arguments))
     stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
     stated = with_sources(stated, source, dict(arguments.source))
     python, exact = arguments.allow_python_layers, arguments.exact
@@ -144,7 +147,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     net = run_by(net, arguments, arguments.weights)
     arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))
     net.close()
-    print(f"{arguments.model}: {', '.join(arguments.blob)} of {len(arrays['keys'])} records")
+    print(f"{model(arguments)}: {', '.join(arguments.blob)} of {len(arrays['keys'])} records")
     return arrays
 
 

@@ -7,13 +7,15 @@ import json
 import sys
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
-from netspec.cli.run import Commands
+from netspec.cli.run import READ, Commands
 from netspec.terminal.commands import DONE, SOMETHING, UNREADABLE, WrongUsage, refuse
 
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add("lint", _lint, "find what is legal but likely a mistake, in nets and solvers", quiet=True)
+    p = commands.add(
+        "lint", _lint, "find what is legal but likely a mistake, in nets and solvers", quiet=True, net=READ
+    )
     p.add_argument("files", nargs="*", metavar="FILE", help="a net's or a solver's prototxt")
     p.add_argument("--rules", action="store_true", help="print the rules, with their reasons")
     p.add_argument("--json", action="store_true", help="print faults and findings as JSON, one object for each file")

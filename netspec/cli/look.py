@@ -1,4 +1,4 @@
-"""``netspec filters``, ``maps``, ``saliency`` and ``embedding``: pictures of what a net has learned."""
+"""``netspec look``: pictures of what a net has learned."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from netspec.cli.arguments import add_steps, positive, shape
-from netspec.cli.run import Commands
+from netspec.cli.run import BUILT, Commands
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto.binary import split_paths
 from netspec.terminal.commands import WrongUsage, refuse
@@ -20,19 +20,20 @@ PICTURES = ("png", "svg")
 
 def add_to(commands: Commands) -> None:
     """Add the commands."""
+    commands = Commands(commands.group("look", "draw what a net has learned: filters, maps, saliency, embedding"))
     p = commands.add("filters", _filters, "draw the filters of a layer, by default the first", quiet=True)
     p.add_argument("weights", metavar="WEIGHTS", help="a .caffemodel or .caffemodel.h5")
     p.add_argument("--layer", help="the layer (default: the first with filters)")
     p.add_argument("--rgb", action="store_true", help="the net was trained with red, green, blue (Caffe's order: BGR)")
     _add_out(p)
 
-    p = commands.add("maps", _maps, "draw the maps of a blob for an image", quiet=True)
+    p = commands.add("maps", _maps, "draw the maps of a blob for an image", quiet=True, net=BUILT)
     _add_net(p)
     p.add_argument("--image", required=True, help="the image file")
     _add_out(p)
 
     p = commands.add(
-        "saliency", _saliency, "draw which pixels matter for a number of a blob, or a distance", quiet=True
+        "saliency", _saliency, "draw which pixels matter for a number of a blob, or a distance", quiet=True, net=BUILT
     )
     _add_net(p)
     p.add_argument("--image", required=True, help="the image file")
@@ -56,7 +57,7 @@ def _add_out(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_net(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--model", required=True, help="the net's prototxt")
+    parser.add_argument("net", metavar="NET", help="the net's prototxt")
     parser.add_argument("--weights", required=True, help="the trained weights, several separated by commas")
     parser.add_argument("--blob", required=True, help="the blob")
     parser.add_argument("--input", default="data", help="the blob that the image goes into (default: data)")
@@ -145,7 +146,7 @@ def _net(arguments: argparse.Namespace) -> ImageNet:
     steps = Steps.of(arguments.mean, arguments.scale, arguments.raw_scale, arguments.swap)
     given = arguments.shape[1] if arguments.shape else None
     return ImageNet(
-        arguments.model,
+        arguments.net,
         split_paths(arguments.weights),
         arguments.blob,
         arguments.input,

@@ -8,6 +8,7 @@ from netspec.cli.arguments import (
     add_device,
     add_engine,
     add_exact,
+    add_model,
     add_passes,
     add_python,
     add_state,
@@ -17,14 +18,14 @@ from netspec.cli.arguments import (
     positive,
     run_by,
 )
-from netspec.cli.run import Commands
+from netspec.cli.run import BUILT, Commands
 from netspec.runs.scores import Score, Scores
 
 
 def add_to(commands: Commands) -> None:
     """Add the commands."""
-    p = commands.add("test", _test, "score a model on its TEST-phase data (caffe test)")
-    p.add_argument("--model", required=True, help="the net's prototxt")
+    p = commands.add("test", _test, "score a model on its TEST-phase data (caffe test)", net=BUILT)
+    add_model(p)
     p.add_argument("--weights", required=True, help="the trained weights")
     p.add_argument("--iterations", type=positive, default=50, help="batches to run (default: 50)")
     p.add_argument("--scores", metavar="F.json", help="also write the mean scores to this file")
@@ -36,8 +37,8 @@ def add_to(commands: Commands) -> None:
     add_strict(p)
     add_engine(p)
 
-    p = commands.add("time", _time, "measure the forward and backward time of each layer (caffe time)")
-    p.add_argument("--model", required=True, help="the net's prototxt")
+    p = commands.add("time", _time, "measure the forward and backward time of each layer (caffe time)", net=BUILT)
+    add_model(p)
     p.add_argument("--iterations", type=positive, default=50, help="passes to time (default: 50)")
     add_device(p)
     add_state(p, phase="TRAIN")

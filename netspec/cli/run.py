@@ -15,16 +15,24 @@ from netspec.dialects import use_dialect
 from netspec.files.limits import limited, read_amount
 from netspec.terminal import commands, log
 
+READ, BUILT = 1, 2  # what a command does with nets: it reads their files, or makes them, which takes memory
+
 
 class Commands(commands.Commands):
     """Commands that run with the dialects of ``--plugin``."""
 
     def add(
-        self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str, quiet: bool = False
+        self,
+        name: str,
+        function: Callable[[argparse.Namespace], int | None],
+        summary: str,
+        quiet: bool = False,
+        net: int = 0,
     ) -> argparse.ArgumentParser:
         """Return the parser of a new command that runs ``function``, to add its own arguments to.
 
-        A command of Caffe shows Caffe's log. A ``quiet`` command shows only warnings, and the log with ``-v``.
+        A command of Caffe shows Caffe's log. A ``quiet`` command shows only warnings, and if it makes nets the log with
+        ``-v``. ``net`` is READ, BUILT or 0.
         """
 
         def with_dialects(arguments: argparse.Namespace) -> int | None:
@@ -34,17 +42,21 @@ class Commands(commands.Commands):
                 return function(arguments)
 
         added = super().add(name, with_dialects, summary)
+        added.set_defaults(plugin=[], limit=None)
         if quiet:
             added.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
+        if quiet and net == BUILT:
             added.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
-        plugin = "a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated"
-        added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=plugin)
-        added.add_argument(
-            "--limit",
-            type=_amount,
-            metavar="SIZE",
-            help="memory that a net may need, e.g. 64GiB; more is refused (default: this machine's)",
-        )
+        if net:
+            plugin = "a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated"
+            added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=plugin)
+        if net == BUILT:
+            added.add_argument(
+                "--limit",
+                type=_amount,
+                metavar="SIZE",
+                help="memory that a net may need, e.g. 64GiB; more is refused (default: this machine's)",
+            )
         return added
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from netspec.cli.run import Commands
+from netspec.cli.run import BUILT, Commands
 from netspec.terminal.commands import VARIABLE, WrongUsage, refuse
 
 NAME = "run"
@@ -16,7 +16,7 @@ _WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel", "--limit")
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add(NAME, _run, "run a Python script; in it `import caffe` finds netspec")
+    p = commands.add(NAME, _run, "run a Python script; in it `import caffe` finds netspec", net=BUILT)
     p.set_defaults(log_form=None)  # pycaffe shows its log, and the script has its own
     p.usage = "netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]"
     p.add_argument("--shadow-caffe", action="store_true", help="use netspec also where a real Caffe is installed")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, devices
-from netspec.cli.run import Commands, signals
+from netspec.cli.run import BUILT, Commands, signals
 from netspec.runs.scores import Score, Scores, Snapshot, read_scores
 from netspec.terminal import log
 from netspec.terminal.commands import DONE, FAULT, WrongUsage
@@ -27,7 +27,7 @@ EFFECTS = ("stop", "snapshot", "none")
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add("train", _train, "train or fine-tune a model (caffe train)")
+    p = commands.add("train", _train, "train or fine-tune a model (caffe train)", net=BUILT)
     p.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
     p.add_argument("--solver", help="the solver's prototxt")
     p.add_argument("--snapshot", help="a .solverstate to resume from")

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from netspec.cli.run import Commands
+from netspec.cli.run import READ, Commands
 from netspec.terminal.commands import DONE, WrongUsage, refuse
 
 if TYPE_CHECKING:
@@ -25,7 +25,9 @@ _NEW_SCREEN, _OLD_SCREEN = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
-    p = commands.add("watch", _watch, "show a training in the terminal: curve, speed, time left, memory", quiet=True)
+    p = commands.add(
+        "watch", _watch, "show a training in the terminal: curve, speed, time left, memory", quiet=True, net=READ
+    )
     p.add_argument("log", nargs="?", metavar="LOG", help="the log of a training, which may still grow")
     p.add_argument("--solver", help="train this solver, with a log beside its snapshots, and watch it")
     p.add_argument("--every", type=float, default=1.0, metavar="SECONDS", help="how often to look (default: 1)")

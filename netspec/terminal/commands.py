@@ -52,13 +52,30 @@ def program(name: str, description: str) -> argparse.ArgumentParser:
 
 
 class Commands:
-    """The commands of a parser, each with the options that all of them share; ``quiet`` ones show only warnings."""
+    """The commands of a parser, each with the options that all of them share; ``quiet`` ones show only warnings.
+
+    ``heading`` is that of the commands to come in the program's help.
+    """
 
     def __init__(self, parser: argparse.ArgumentParser, quiet: bool = False) -> None:
+        self.heading = "commands"
         self._log = (logging.WARNING, logging.Formatter("warning: %(message)s")) if quiet else CAFFES_LOG
+        self._groups: dict[str, list[str]] = {}
+        self._parser = parser
+        self._parser.formatter_class = _Overview
         self._parsers = parser.add_subparsers(
             dest="command", required=True, metavar="COMMAND", parser_class=_GflagsParser
         )
+
+    def group(self, name: str, summary: str) -> argparse.ArgumentParser:
+        """Return the parser of a command that has commands of its own."""
+        self._list(name, summary)
+        return self._parsers.add_parser(name, help=summary, description=summary)
+
+    def _list(self, name: str, summary: str) -> None:
+        self._groups.setdefault(self.heading, []).append(f"  {name:25} {summary}")
+        groups = ("\n".join((f"{heading}:", *lines)) for heading, lines in self._groups.items())
+        self._parser.epilog = "\n\n".join(groups)
 
     def add(
         self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str
@@ -68,9 +85,10 @@ class Commands:
         An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. A command that shows no
         log itself sets the default ``log_form`` to None, one whose faults are no FAULT sets ``fault_status``.
         """
+        self._list(name, summary)
         added = self._parsers.add_parser(name, help=summary, description=summary)
         level, form = self._log
-        added.set_defaults(run=function, log_level=level, log_form=form, fault_status=FAULT)
+        added.set_defaults(prog=added.prog, run=function, log_level=level, log_form=form, fault_status=FAULT)
         added.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
         for name in ("--logtostderr", "--alsologtostderr"):  # it always does
             added.add_argument(name, action="store_true", help=argparse.SUPPRESS)
@@ -96,7 +114,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
         print(fault, file=sys.stderr)
         return arguments.fault_status
     except WrongUsage as fault:
-        print(f"{parser.prog} {arguments.command}: error: {fault}", file=sys.stderr)
+        print(f"{arguments.prog}: error: {fault}", file=sys.stderr)
         return WRONG_USAGE
     except BrokenPipeError:
         return FAULT  # quietly
@@ -175,6 +193,8 @@ class _GflagsParser(_Parser):
         found, unknown = super().parse_known_args(words, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}{self._meant(unknown)}")
+        if hasattr(found, "given"):  # it was the parser of a group: that of the command has noted them
+            return found, unknown
         found.given = {
             action.dest: word.partition("=")[0].lstrip("-")
             for word in takewhile(lambda word: word != "--", words)
@@ -204,6 +224,13 @@ class _GflagsParser(_Parser):
         if name.startswith("no-") and name[3:] in switches and not equals:
             return switches[name[3:]].off
         return "--" + word
+
+
+class _Overview(argparse.RawDescriptionHelpFormatter):
+    """The help of a program: its commands stand in groups, at the end."""
+
+    def _iter_indented_subactions(self, action: argparse.Action) -> Iterator[argparse.Action]:
+        return iter(())
 
 
 class _Version(argparse.Action):

@@ -3,6 +3,7 @@
 import argparse
 import shlex
 import shutil
+from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -12,12 +13,11 @@ import cv2
 import numpy as np
 import pytest
 
-from paths import GOLDEN
-
-pytestmark = pytest.mark.slow
+from paths import GOLDEN, ROOT
 
 NET, SOLVER, WEIGHTS = "train_val.prototxt", "solver.prototxt", "init.caffemodel"
 FEATURES = f"--model {NET} --weights {WEIGHTS} --blob feat"
+SHOWN = f"{NET} --weights {WEIGHTS} --blob feat"
 # A command line of each way in which a command works; those of one command have the same options.
 WAYS = {
     "netspec": (
@@ -46,11 +46,11 @@ WAYS = {
         "watch train.log --once",
         "data stat pairs/test_lmdb",
         "data show pairs/test_lmdb --out s.png",
-        f"filters {WEIGHTS} --out f.png",
-        f"maps {FEATURES} --image images/0.png --out m.png",
-        f"saliency {FEATURES} --image images/0.png --out s.png",
-        f"saliency {FEATURES} --image images/0.png --to images/1.png --out s.png",
-        "embedding features.npz --out e.png",
+        f"look filters {WEIGHTS} --out f.png",
+        f"look maps {SHOWN} --image images/0.png --out m.png",
+        f"look saliency {SHOWN} --image images/0.png --out s.png",
+        f"look saliency {SHOWN} --image images/0.png --to images/1.png --out s.png",
+        "look embedding features.npz --out e.png",
         f"bug-report {NET}",
         f"extract_features {WEIGHTS} {NET} feat features_lmdb 1 lmdb",
         "device_query",
@@ -86,7 +86,11 @@ NOT_STARTED = {
         "cifar": "needs CIFAR-10",
     },
 }
-SHARED = {"help", "minloglevel", "logtostderr", "alsologtostderr", "verbose", "plugin", "limit"}  # read by run()
+SHARED = {"verbose", "plugin", "limit"}  # read before the command itself
+HIDDEN = argparse.SUPPRESS
+FROZEN = ROOT / "tests" / "laws" / "options.txt"
+PROGRAMS = ("netspec", "lmdb_build", "loopclosure")
+MOST = 395
 VALUES = {"shape": "data=1,1,28,28", "source": "pair_data=pairs/test_lmdb", "size": "8x8", "view_size": "8x8"}
 
 
@@ -123,28 +127,42 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def options(module: str, command: str) -> list[argparse.Action]:
-    """The options of a command that have a name."""
-    (commands,) = (a for a in import_module(module).parser()._actions if isinstance(a, argparse._SubParsersAction))
-    found = commands.choices[command]._actions
-    return [a for a in found if a.option_strings and a.dest not in SHARED]
+def commands(parser: argparse.ArgumentParser, words: str = "") -> Iterator[tuple[str, list[argparse.Action]]]:
+    """Each command of a parser, as it is typed, and its arguments."""
+    groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if not groups:
+        yield words.strip(), parser._actions
+    for group in groups:
+        for name, below in group.choices.items():
+            yield from commands(below, f"{words} {name}")
+
+
+def options(program: str) -> dict[str, list[argparse.Action]]:
+    """The options of each command of a program that its help shows, but for ``--help`` itself."""
+    found = commands(import_module(f"{program}.cli").parser())
+    return {
+        name: [a for a in actions if a.option_strings and a.dest != "help" and a.help != HIDDEN]
+        for name, actions in found
+    }
 
 
 def ways() -> list[tuple[str, str]]:
     return [(program, line) for program, lines in WAYS.items() for line in lines]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("program", "line"), ways(), ids=lambda value: value.replace(" ", "_"))
 def test_every_option_is_read_or_refused(
     folder: Path, program: str, line: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    module = f"{program}.cli"
     words = shlex.split(line)
+    main = import_module(f"{program}.cli").main
+    own = next(found for name, found in options(program).items() if f"{line} ".startswith(f"{name} "))
 
     def run(*more: str) -> int:
         Watched.read = set()
         with suppress(SystemExit):
-            return import_module(module).main([*words, *more])
+            return main([*words, *more])
         return 0
 
     status = run()
@@ -152,8 +170,8 @@ def test_every_option_is_read_or_refused(
     assert status != 2, said
     usual = set(Watched.read)
     typed = {word.partition("=")[0] for word in words}
-    for option in options(module, words[0]):
-        if option.dest in usual or typed & set(option.option_strings):
+    for option in own:
+        if option.dest in SHARED | usual or typed & set(option.option_strings):
             continue
         value = VALUES.get(option.dest, str(next(iter(option.choices))) if option.choices else "1")
         name = option.option_strings[0]
@@ -165,7 +183,27 @@ def test_every_option_is_read_or_refused(
 
 @pytest.mark.parametrize("program", WAYS)
 def test_every_command_is_among_them(program: str) -> None:
-    (commands,) = (
-        a for a in import_module(f"{program}.cli").parser()._actions if isinstance(a, argparse._SubParsersAction)
-    )
-    assert {line.split()[0] for line in WAYS[program]} | set(NOT_STARTED[program]) == set(commands.choices)
+    names = set(options(program)) - set(NOT_STARTED[program])
+    assert {name for name in names if not any(f"{line} ".startswith(f"{name} ") for line in WAYS[program])} == set()
+
+
+def test_the_list_of_options_is_frozen() -> None:
+    """A new option changes the list, for all to see: PYTHONPATH=.:tests python tests/laws/test_options.py writes it."""
+    listed = FROZEN.read_text()
+    assert listed == frozen()
+    assert sum(len(line.split(": ")[1].split()) for line in listed.splitlines() if ": " in line) <= MOST
+
+
+def frozen() -> str:
+    lines = []
+    for program in PROGRAMS:
+        for name, found in options(program).items():
+            names = " ".join(
+                next(s for s in option.option_strings if s.startswith("--") or len(s) == 2) for option in found
+            )
+            lines.append(f"{program} {name}: {names}".strip(": "))
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    FROZEN.write_text(frozen())

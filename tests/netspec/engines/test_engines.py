@@ -277,7 +277,7 @@ def test_a_net_that_reads_records_scores_and_extracts_the_same(
     numbers = [[float(line.split("loss = ")[1].split()[0]) for line in lines] for lines in told]
     np.testing.assert_allclose(numbers[1], numbers[0], rtol=1e-4)
     plain = extract_records(netspec.load_net(words[1], weights=words[3]), ["feat"])
-    assert main(["extract", *words, "--blob", "feat", "--out", "f.npz", "--engine", engine, "--no-cache"]) == 0
+    assert main(["extract", *words, "--blob", "feat", "--out", "f.npz", "--engine", engine, "--cache", "none"]) == 0
     with np.load("f.npz") as found:
         np.testing.assert_allclose(found["feat"], plain["feat"], rtol=1e-4, atol=1e-5)
         assert list(found["keys"]) == list(plain["keys"])

@@ -161,19 +161,25 @@ def test_thumbnails_by_name_and_by_key(tmp_path: Path) -> None:
         thumbnails(tmp_path, None, 2)
 
 
-NET = ("--model", "sgd_step/train_val.prototxt", "--weights", "sgd_step/init.caffemodel")
+NET = ("sgd_step/train_val.prototxt", "--weights", "sgd_step/init.caffemodel")
 
 
 def test_the_commands(run: Run) -> None:
     cv2.imwrite("a.png", image(0, (30, 40, 3)))
     cv2.imwrite("b.png", image(1, (30, 40, 3)))
     for words, said in (
-        (("filters", WEIGHTS), "x.png: conv1 (6, 1, 5, 5)"),
-        (("filters", WEIGHTS, "--layer", "conv2"), "x.png: conv2 (8, 6, 5, 5)"),
-        (("maps", *NET, "--blob", "conv1", "--image", "a.png"), "x.png: conv1 (6, 24, 24)"),
-        (("maps", *NET, "--blob", "feat", "--image", "a.png"), "x.png: feat (8,)"),
-        (("saliency", *NET, "--blob", "feat", "--image", "a.png", "--unit", 3), "x.png: number 3 of feat of a.png: "),
-        (("saliency", *NET, "--blob", "feat", "--image", "a.png", "--to", "b.png"), "x.png: distance of feat between "),
+        (("look", "filters", WEIGHTS), "x.png: conv1 (6, 1, 5, 5)"),
+        (("look", "filters", WEIGHTS, "--layer", "conv2"), "x.png: conv2 (8, 6, 5, 5)"),
+        (("look", "maps", *NET, "--blob", "conv1", "--image", "a.png"), "x.png: conv1 (6, 24, 24)"),
+        (("look", "maps", *NET, "--blob", "feat", "--image", "a.png"), "x.png: feat (8,)"),
+        (
+            ("look", "saliency", *NET, "--blob", "feat", "--image", "a.png", "--unit", 3),
+            "x.png: number 3 of feat of a.png: ",
+        ),
+        (
+            ("look", "saliency", *NET, "--blob", "feat", "--image", "a.png", "--to", "b.png"),
+            "x.png: distance of feat between ",
+        ),
     ):
         result = run(*words, "--out", "x.png")
         assert (result.status, result.err) == (0, "")
@@ -184,30 +190,30 @@ def test_the_commands(run: Run) -> None:
 
 def test_the_embedding_of_a_siamese_net(run: Run) -> None:
     assert run("extract", *NET, "--blob", "feat", "--out", "f.npz").status == 0
-    result = run("embedding", "f.npz", "--images", "pairs/test_lmdb", "--out", "x.svg")
+    result = run("look", "embedding", "f.npz", "--images", "pairs/test_lmdb", "--out", "x.svg")
     assert (result.status, result.err) == (0, "")
     assert result.out.startswith("x.svg: feat of 200 images: two principal components, ")
     text = Path("x.svg").read_text()
     assert text.count("<image") > 5
     assert "label 1" in text
-    assert run("embedding", "f.npz", "--out", "y.png").status == 0
+    assert run("look", "embedding", "f.npz", "--out", "y.png").status == 0
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("filters", WEIGHTS, "--layer", "conv3"), 'no layer "conv3" with filters; did you mean "conv'),
-        (("filters", "none.caffemodel"), "none.caffemodel: cannot be read: No such file"),
-        (("maps", *NET, "--blob", "no", "--image", "a.png"), 'no blob "no"'),
-        (("maps", *NET, "--blob", "conv1", "--image", "no.png"), "no.png: cannot be read"),
-        (("embedding", "a.png"), "a.png: is not a features.npz of netspec extract, or is damaged"),
-        (("embedding", "cut.npz"), "cut.npz: is not a features.npz of netspec extract, or is damaged"),
-        (("embedding", "no.npz"), "no.npz: cannot be read: No such file or directory"),
+        (("look", "filters", WEIGHTS, "--layer", "conv3"), 'no layer "conv3" with filters; did you mean "conv'),
+        (("look", "filters", "none.caffemodel"), "none.caffemodel: cannot be read: No such file"),
+        (("look", "maps", *NET, "--blob", "no", "--image", "a.png"), 'no blob "no"'),
+        (("look", "maps", *NET, "--blob", "conv1", "--image", "no.png"), "no.png: cannot be read"),
+        (("look", "embedding", "a.png"), "a.png: is not a features.npz of netspec extract, or is damaged"),
+        (("look", "embedding", "cut.npz"), "cut.npz: is not a features.npz of netspec extract, or is damaged"),
+        (("look", "embedding", "no.npz"), "no.npz: cannot be read: No such file or directory"),
         (
-            ("embedding", "f.npz", "--array", "fea"),
+            ("look", "embedding", "f.npz", "--array", "fea"),
             'f.npz: has no descriptors "fea"; did you mean "feat"? it has: feat',
         ),
-        (("embedding", "f.npz", "--images", "pairs"), "pairs: contains no images"),
+        (("look", "embedding", "f.npz", "--images", "pairs"), "pairs: contains no images"),
     ],
 )
 def test_faults(run: Run, words: tuple[object, ...], said: str) -> None:
