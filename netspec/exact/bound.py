@@ -104,7 +104,8 @@ class BoundVectors:
 class BoundColumns:
     """:class:`netspec.exact.products.ColumnProducts` of maps (N, C, H, W) of one shape.
 
-    The columns of a batch that fits into :data:`netspec.exact.products.COLUMNS` are kept for the backward pass.
+    The columns of a batch that fits into :data:`netspec.exact.products.COLUMNS` are kept for the backward pass, if maps
+    are ``steady``: if they do not change before it.
     """
 
     def __init__(
@@ -117,10 +118,12 @@ class BoundColumns:
         weight_sums: torch.Tensor | None,
         bias_sums: torch.Tensor | None,
         wanted: bool,
+        steady: bool,
     ) -> None:
         count, channels, *size = shape
         self._size, self._sliding = tuple(size), sliding
         fits = sliding.fits(self._size)
+        self._steady = steady
         self._top = torch.empty((count, len(weight), *fits), dtype=weight.dtype)
         self._bias = None if bias is None else bias.view(-1, 1, 1)
         self._at_once = min(count, sliding.images_at_once(channels, self._size))
@@ -172,13 +175,12 @@ class BoundColumns:
             for each in diffs:
                 self._gemv(1.0, each.T, self._ones, 1.0, self._bias_sums, 0, 1, 0, 1, 1, 1)
         found: list[torch.Tensor] = []
+        whole = self._steady and len(self._columns) == 1
         for k, lay_out in enumerate(self._columns):
             start = k * self._at_once
             some = diffs[start : start + self._at_once]
             if self._weight_sums is not None:
-                laid_out = (
-                    lay_out(self._maps[start : start + self._at_once]) if len(self._columns) > 1 else self._laid_out
-                )
+                laid_out = self._laid_out if whole else lay_out(self._maps[start : start + self._at_once])
                 for columns, each in zip(laid_out, some, strict=True):
                     for rows, inputs in self._groups:
                         self._gemm(1.0, columns[inputs].T, each[rows].T, 1.0, self._weight_sums[rows].T, 1, 0, 1)

@@ -27,11 +27,13 @@ class Learning:
     ``wanted[i]`` says whether bottom i's gradient is asked for; ``sums[j]`` is where that of learnable blob j is added
     up, in the blob's shape, None where it is not learned. Both kernels run without autograd, in turns, and BLAS uses
     one thread. The backward kernel gets None for a top without a gradient, though never for all tops. Tensors that a
-    kernel returns are good until its next call; those that it gets do not change before the backward kernel has run.
+    kernel returns are good until its next call. Where the net is ``steady``, bottoms do not change before the backward
+    kernel has run; otherwise it reads them again, as Caffe's does.
     """
 
     wanted: tuple[bool, ...]
     sums: tuple[Diff, ...] = ()
+    steady: bool = True
 
 
 def recorded(run: Callable[..., Sequence[torch.Tensor]], learning: Learning) -> Kernels:

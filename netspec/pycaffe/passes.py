@@ -12,12 +12,16 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 
+from netspec.exact.blas import one_thread
 from netspec.layers.base import Layer
+from netspec.layers.training import Kernels, Learning
 from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
@@ -30,11 +34,24 @@ Hook = Callable[[int], object]
 
 @dataclass(frozen=True)
 class _Tape:
-    """One run of a layer watched by autograd: copies of what it read, the tensors that held it, what it returned."""
+    """One run of a layer: what it read, the tensors that held it, what it returned, and its gradients from the tops'.
+
+    Autograd has watched it, and read copies; or it was run by kernels, which read the tensors themselves.
+    """
 
     leaves: list[torch.Tensor]
     holders: list[torch.Tensor]
-    made: tuple[torch.Tensor, ...]
+    made: Sequence[torch.Tensor]
+    backward: Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """The kernels of a layer for bottoms of these shapes, and where its learnable blobs were when they were made."""
+
+    shapes: list[tuple[int, ...]]
+    places: list[Any]
+    kernels: Kernels
 
 
 class Passes:
@@ -59,6 +76,7 @@ class Passes:
         self._layers: list[Layer] = list(net.layers)
         self.params = [_parameters(layer) for layer in self._layers]
         self._tapes: list[_Tape | None] = [None] * len(self._layers)
+        self._bound: list[_Bound | None] = [None] * len(self._layers)
         for i in range(len(self._layers)):
             self._wire(i)
         self.bottoms = [[self.blobs[b] for b in ids] for ids in self.bottom_ids]
@@ -69,6 +87,7 @@ class Passes:
         ]
         self._kept = [layer.filled_once() for layer in self._layers]
         self._records = [self._is_recorded(i) for i in range(len(self._layers))]
+        self._has_kernels = [self._can_bind(i) for i in range(len(self._layers))]
         for i in range(len(self._layers)):
             self._set_up(i)
         self._prepares = self._can_prepare()
@@ -134,6 +153,17 @@ class Passes:
         wanted = any(plan.bottoms[i]) or any(blob.requires_grad for blob in layer.blobs)
         return plan.layers[i] and wanted and not from_memory
 
+    def _can_bind(self, i: int) -> bool:
+        """Return whether layer ``i`` has kernels of its own for what autograd would watch."""
+        layer = self._layers[i]
+        return (
+            type(layer).prepare_training is not Layer.prepare_training
+            and self.net.device.type == "cpu"
+            and not any(self._is_in_place(i, blob) for blob in self.bottoms[i])
+            and all(blob.dtype == torch.float32 and blob.is_contiguous() for blob in layer.blobs)
+            and all(layer.blob(j) is blob for j, blob in enumerate(layer.blobs))
+        )
+
     # Running
 
     @contextmanager
@@ -165,6 +195,7 @@ class Passes:
         fresh = {key: memory for key, memory in memories.items() if key not in written}
         for memory in fresh.values():
             memory.leave_views()
+        self._bound = [None] * len(self._layers)  # kernels keep the memory that they compute into
 
     @torch.no_grad()
     def forward(self, start: int, end: int) -> torch.Tensor:
@@ -172,6 +203,10 @@ class Passes:
         self.upload()
         if self._prepares and (start, end) == (0, len(self._layers) - 1) and not self._has_hooks():
             return self._forward_prepared()
+        with one_thread() if any(self._has_kernels) else nullcontext():
+            return self._forward_by_layers(start, end)
+
+    def _forward_by_layers(self, start: int, end: int) -> torch.Tensor:
         loss: torch.Tensor | None = None
         before, after = self.hooks["before_forward"], self.hooks["after_forward"]
         for i in range(start, end + 1):
@@ -234,6 +269,10 @@ class Passes:
         Bottoms' diffs are overwritten, those of learnable blobs added to. Layers that need none are passed over.
         """
         self.upload()
+        with one_thread() if any(self._has_kernels) else nullcontext():
+            self._backward_by_layers(start, end)
+
+    def _backward_by_layers(self, start: int, end: int) -> None:
         for i in range(start, end - 1, -1):
             for hook in self.hooks["before_backward"]:
                 hook(i)
@@ -317,7 +356,13 @@ class Passes:
                 top.put_data(_apart(tensor.detach(), taken))
 
     def _record(self, i: int) -> _Tape:
-        """Run layer ``i`` watched by autograd."""
+        """Run layer ``i`` by its kernels, or watched by autograd."""
+        if bound := self._kernels(i):
+            forward, backward = bound.kernels
+            values = [blob.data_memory.tensor(blob.shape) for blob in self.bottoms[i]]
+            holders = [blob.data_memory.holder(blob.count) for blob in self.bottoms[i]]
+            made = forward(*values)
+            return _Tape(values, holders, (made,) if isinstance(made, torch.Tensor) else made, backward)
         leaves, holders = [], []
         for blob, wanted in zip(self.bottoms[i], self.net.backward_plan.bottoms[i], strict=True):
             memory = blob.data_memory
@@ -326,7 +371,21 @@ class Passes:
             leaves.append((value.clone() if overwritten else value.detach()).requires_grad_(wanted))
             holders.append(memory.holder(blob.count))
         with torch.enable_grad():
-            return _Tape(leaves, holders, self._layers[i].run(*leaves))
+            made = self._layers[i].run(*leaves)
+        return _Tape(leaves, holders, made, partial(_by_autograd, leaves, made))
+
+    def _kernels(self, i: int) -> _Bound | None:
+        """Return the kernels of layer ``i`` at its present shapes, None where autograd is to watch it."""
+        layer, bound = self._layers[i], self._bound[i]
+        if not self._has_kernels[i]:
+            return None
+        shapes = [blob.shape for blob in self.bottoms[i]]
+        if bound is None or bound.shapes != shapes or bound.places != _places(layer):
+            layer.fit(shapes)
+            sums = tuple(_gradient(blob) if blob.requires_grad else None for blob in layer.blobs)
+            learning = Learning(tuple(self.net.backward_plan.bottoms[i]), sums, steady=False)
+            bound = self._bound[i] = _Bound(shapes, _places(layer), layer.prepare_training(learning))
+        return bound
 
     def _tape(self, i: int) -> _Tape:
         """Return the record of the last forward pass of layer ``i``, its bottoms' values as they are now in memory.
@@ -362,17 +421,32 @@ class Passes:
                 bottoms[0].diff_memory.put(layer.caffes_gradient(bottom, top, diffs[0]))
             return
         tape = self._tape(i)
-        ends = [(top, diff) for top, diff in zip(tape.made, diffs, strict=True) if top.requires_grad]
-        for leaf in tape.leaves:
-            leaf.grad = None
-        if ends:
-            torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends], retain_graph=True)
+        found = tape.backward(*diffs)
+        if not any(wanted):
+            return
         taken = _storages(diffs)
-        for blob, leaf, asked in zip(bottoms, tape.leaves, wanted, strict=True):
+        found = (found,) if isinstance(found, torch.Tensor) else found
+        for blob, leaf, diff, asked in zip(bottoms, tape.leaves, found, wanted, strict=True):
             if asked:
-                diff = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
-                blob.diff_memory.put(_apart(diff, taken))
-                leaf.grad = None
+                blob.diff_memory.put(_apart(torch.zeros_like(leaf) if diff is None else diff, taken))
+
+
+def _by_autograd(
+    leaves: Sequence[torch.Tensor], made: Sequence[torch.Tensor], *diffs: torch.Tensor
+) -> list[torch.Tensor | None]:
+    """Return the gradients of what autograd saw a layer read, from those of what it returned."""
+    ends = [(top, diff) for top, diff in zip(made, diffs, strict=True) if top.requires_grad]
+    if ends:
+        torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends], retain_graph=True)
+    found = [leaf.grad for leaf in leaves]
+    for leaf in leaves:
+        leaf.grad = None
+    return found
+
+
+def _places(layer: Layer) -> list[Any]:
+    """Return where a layer's learnable blobs and their gradients are."""
+    return [place for blob in layer.blobs for place in (blob.data_ptr(), id(blob.grad), blob.requires_grad)]
 
 
 def _storages(tensors: Sequence[torch.Tensor]) -> set[int]:

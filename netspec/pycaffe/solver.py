@@ -49,7 +49,8 @@ class _Training(core_solver.Solver):
     @override
     def clear_gradients(self) -> None:
         """Zero the gradients where they are: views of them stay valid."""
-        self.shown[self.net].clear_param_diffs()
+        self.shown[self.net].passes.upload()
+        super().clear_gradients()
 
     @override
     def train_pass(self) -> tuple[torch.Tensor, Outputs]:

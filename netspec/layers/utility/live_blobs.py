@@ -63,7 +63,8 @@ class Memory:
     def tensor(self, shape: Shape) -> torch.Tensor:
         """Return the first numbers, on the device; who reads the tensor must not write to it."""
         count = math.prod(shape)
-        return self.holder(count).view(-1)[:count].view(shape)
+        holder = self.holder(count)
+        return holder if holder.shape == shape else holder.view(-1)[:count].view(shape)
 
     def holder(self, count: int) -> torch.Tensor:
         """Return the tensor that holds the first ``count`` numbers; while it is the same one, so are they."""

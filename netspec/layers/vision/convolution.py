@@ -287,7 +287,8 @@ class Convolution(_SlidingFilter):
         weight, bias = (*self.values(), None)[:2]
         sums = (*learning.sums, None)[:2]
         if self.is_exact(weight, self.small):
-            bound = BoundColumns(shape, sliding, self.group, weight, bias, *sums, learning.wanted[0])
+            asked = (learning.wanted[0], learning.steady)
+            bound = BoundColumns(shape, sliding, self.group, weight, bias, *sums, *asked)
             return bound.forward, bound.backward
         lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else torch.Tensor.contiguous
         return self.convolutions(sliding, weight, bias, sums, learning.wanted[0], lay_out)
