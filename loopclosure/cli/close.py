@@ -9,8 +9,10 @@ import numpy as np
 
 from loopclosure.cli.data_set import add_poses, add_topics, sequence
 from loopclosure.cli.run import show_progress, warn
-from loopclosure.closing.close import close, summary, write_closed
+from loopclosure.closing.close import Closed, close, summary, write_closed
 from loopclosure.closing.drift import drifted
+from loopclosure.closing.g2o import read_pose_graph, solve_pose_graph, write_solution
+from loopclosure.closing.g2o import summary as graph_summary
 from loopclosure.closing.measure import measure, read_loops
 from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
@@ -19,15 +21,32 @@ from loopclosure.places.sequences import ImageSequence
 from netspec.terminal.commands import Commands, WrongUsage
 from netspec.terminal.options import seed
 
+# What belongs to frames, and means nothing to --graph.
+OF_FRAMES = (
+    "loops",
+    "odometry",
+    "drift",
+    "odometry_form",
+    "seed",
+    "poses",
+    "pose_form",
+    "topic",
+    "pose_topic",
+    "camera",
+)
+
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
     p = commands.add("close", _close, "correct a path by the loops that detect found")
     p.add_argument(
-        "source", help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag"
+        "source",
+        nargs="?",
+        help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag",
     )
-    p.add_argument("--loops", required=True, type=Path, metavar="CSV", help="the loops.csv that detect wrote")
-    path = p.add_mutually_exclusive_group(required=True)
+    p.add_argument("--graph", type=Path, metavar="IN.g2o", help="a pose graph to solve as it is, instead of frames")
+    p.add_argument("--loops", type=Path, metavar="CSV", help="the loops.csv that detect wrote")
+    path = p.add_mutually_exclusive_group()
     path.add_argument("--odometry", type=Path, metavar="FILE", help="the path to correct: poses of TUM, KITTI or EuRoC")
     path.add_argument(
         "--drift", type=float, metavar="PERCENT", help="simulate odometry that drifts, from the true poses"
@@ -41,6 +60,14 @@ def add_to(commands: Commands) -> None:
 
 
 def _close(a: argparse.Namespace) -> None:
+    out = Path(a.out)
+    if a.graph:
+        _close_graph(a, out)
+        return
+    if not a.source or not a.loops:
+        raise WrongUsage("expected the frames and --loops, or --graph")
+    if a.odometry is None and a.drift is None:
+        raise WrongUsage("one of the arguments --odometry --drift is required")
     if a.odometry_form and not a.odometry:
         raise WrongUsage("--odometry-form means nothing without --odometry")
     if a.seed is not None and a.drift is None:
@@ -52,7 +79,6 @@ def _close(a: argparse.Namespace) -> None:
     odometry = _odometry(a, frames)
     loops = measure(frames, read_loops(a.loops, frames.names), camera, show_progress)
     closed = close(odometry, loops, frames.poses)
-    out = Path(a.out)
     write_closed(out, closed, frames.stamps, frames.names)
     # Drawing takes seconds to import, which the other commands need not wait for.
     from loopclosure.report.paths import draw_paths
@@ -60,6 +86,22 @@ def _close(a: argparse.Namespace) -> None:
     draw_paths(out / "paths.png", closed)
     print("\n".join(summary(closed)))
     print(f"{out / 'closed.g2o'}, {out / 'closed.txt'}, {out / 'paths.png'}")
+
+
+def _close_graph(a: argparse.Namespace, out: Path) -> None:
+    for option in ("source", *OF_FRAMES):
+        if getattr(a, option) is not None:
+            name = "the frames" if option == "source" else f"--{option.replace('_', '-')}"
+            raise WrongUsage(f"{name} and --graph do not go together: a graph has its poses and loops")
+    graph = read_pose_graph(a.graph)
+    solution = solve_pose_graph(graph)
+    write_solution(out, graph, solution)
+    from loopclosure.report.paths import draw_paths
+
+    ends = graph.poses, solution.poses, graph.steps, graph.loops
+    draw_paths(out / "paths.png", Closed(graph.ids, *ends, [], solution.accepted, 0), ("before", "after"))
+    print("\n".join(graph_summary(graph, solution)))
+    print(f"{out / 'closed.g2o'}, {out / 'loops.csv'}, {out / 'paths.png'}")
 
 
 def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:

@@ -1,7 +1,10 @@
-"""A pose graph, and its solution by SciPy's least_squares with a loss that gives up on false loops.
+"""A pose graph, and its solution by least squares with a loss that gives up on false loops.
 
 An edge i -> j measures the pose Z of j in the frame of i. Its error is that of g2o: the translation of Z^-1 T_i^-1 T_j,
 and its rotation as a vector in radians, weighted by an information matrix (6, 6).
+
+Steps are those of Gauss and Newton, halved until the loss is less. Damping them, as Levenberg and Marquardt do, costs
+more steps: it holds back the long, weak bends of a path most, which are what loops correct.
 
 False loops: the loss of an edge with squared error s is that of Geman and McClure, s / (1 + s / c), which is nearly s
 for a small error and never more than c. To start far from the solution, c is large at first, at least as large as the
@@ -11,21 +14,26 @@ edges keep the square.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, sparse
+from scipy import sparse
+from scipy.sparse import csgraph
 from scipy.spatial.transform import Rotation
+
+from loopclosure.closing.normal import least_squares_step, order
 
 Array = NDArray[np.float64]
 
 # A true edge of six numbers is below this in 99 of 100 cases (chi-squared).
 ACCEPTED_SQUARE = 16.8
 WIDEST, NARROWER = 1000.0, 10.0  # the loss at first, in units of that square; and from one stage to the next
-STEPS_PER_STAGE = 20
+EARLY_STEPS, LAST_STEPS = 2, 50
+EARLY_GAIN, LAST_GAIN = 1e-2, 1e-7  # a stage ends when a step makes the loss smaller by less than this share
+HALVES = 10  # of a step that makes the loss greater
 
 
 @dataclass(frozen=True)
@@ -40,9 +48,10 @@ class Edge:
 
 @dataclass(frozen=True)
 class Solution:
-    """Poses (N, 7) of all nodes, and the squared error (L,) of each loop edge there."""
+    """Poses (N, 7) of all nodes, and the squared error of each edge there: (S,) odometry, (L,) loops."""
 
     poses: Array
+    odometry_squares: Array
     squares: Array
 
     @property
@@ -51,105 +60,153 @@ class Solution:
         return self.squares <= ACCEPTED_SQUARE
 
 
-def solve(poses: Array, odometry: Sequence[Edge], loops: Sequence[Edge]) -> Solution:
-    """Find the poses (N, 7) that agree best with all edges; the first stays where it is.
+def solve(poses: Array, odometry: Sequence[Edge], loops: Sequence[Edge], held: Collection[int] = ()) -> Solution:
+    """Find the poses (N, 7) that agree best with all edges.
 
-    ``poses`` are those to start from. Some of the loops may be false.
+    ``poses`` are those to start from. Some of the loops may be false. The ``held`` nodes stay where they are, and the
+    first node of each part of the graph that has none of them.
     """
-    graph = _Graph(poses, [*odometry, *loops])
-    x = np.zeros(6 * (len(poses) - 1))
-    solver: Any = optimize.least_squares  # its stubs know no function for jac and loss
-    worst = np.square(graph.errors(x).reshape(-1, 6)).sum(axis=1)[len(odometry) :].max(initial=0)
-    factor = max(WIDEST, float(worst) / ACCEPTED_SQUARE) if loops else 0.0
-    while factor:
-        loss = _loss(6 * len(odometry), factor * ACCEPTED_SQUARE)
-        x = solver(
-            graph.errors,
-            x,
-            graph.derivatives,
-            loss=loss,
-            x_scale="jac",
-            tr_solver="lsmr",
-            tr_options={"maxiter": 3000, "atol": 1e-8, "btol": 1e-8},
-            max_nfev=STEPS_PER_STAGE,
-        ).x
-        factor = max(1.0, factor / NARROWER) if factor > 1 else 0.0
-    squares = np.square(graph.errors(x).reshape(-1, 6)).sum(axis=1)[len(odometry) :]
-    positions, turns, _ = graph.state(x)
-    return Solution(np.hstack([positions, turns.as_quat(canonical=True)]), squares)
+    graph = _Graph(len(poses), [*odometry, *loops], held)
+    state = State(poses[:, :3], Rotation.from_quat(poses[:, 3:]))
+
+    def worst() -> float:
+        return float(graph.squares(state)[len(odometry) :].max(initial=0)) / ACCEPTED_SQUARE
+
+    factor = max(WIDEST, worst()) if loops else 1.0
+    while factor > 1:
+        state = _descend(graph, state, _Loss(len(odometry), factor * ACCEPTED_SQUARE), EARLY_STEPS, EARLY_GAIN)
+        factor = min(factor / NARROWER, worst())  # at once to the last where no loop is false
+    state = _descend(graph, state, _Loss(len(odometry), ACCEPTED_SQUARE), LAST_STEPS, LAST_GAIN)
+    squares = graph.squares(state)
+    solved = np.hstack([state.positions, state.turns.as_quat(canonical=True)])
+    return Solution(solved, squares[: len(odometry)], squares[len(odometry) :])
 
 
-def _loss(odometry: int, most: float) -> Callable[[Array], Array]:
-    """Return the loss for ``least_squares``: squares of the first numbers, Geman and McClure's of each six others."""
+def squares_of(poses: Array, edges: Sequence[Edge]) -> Array:
+    """Return the squared error (E,) of each edge for poses (N, 7)."""
+    return _Graph(len(poses), edges).squares(State(poses[:, :3], Rotation.from_quat(poses[:, 3:])))
 
-    def loss(z: Array) -> Array:
-        squares = z[odometry:].reshape(-1, 6).sum(axis=1)
-        share = 1 / (1 + squares / most)
-        rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
-        rho[0, odometry:] = np.repeat(squares * share / 6, 6)
-        rho[1, odometry:] = np.repeat(share**2, 6)
-        return rho
 
-    return loss
+class State(NamedTuple):
+    """Positions (N, 3) and rotations (N) of all nodes."""
+
+    positions: Array
+    turns: Rotation
+
+
+@dataclass(frozen=True)
+class _Loss:
+    """The squares of the first edges, and Geman and McClure's loss, of at ``most`` that much, of the others."""
+
+    odometry: int
+    most: float
+
+    def __call__(self, squares: Array) -> float:
+        loops = squares[self.odometry :]
+        return float(squares[: self.odometry].sum() + (loops / (1 + loops / self.most)).sum())
+
+    def weights(self, squares: Array) -> Array:
+        """Return the derivative (E,) of the loss by the square of each edge."""
+        weights = np.ones(len(squares))
+        weights[self.odometry :] = (1 + squares[self.odometry :] / self.most) ** -2
+        return weights
+
+
+def _descend(graph: _Graph, state: State, loss: _Loss, most_steps: int, least_gain: float) -> State:
+    """Return a state of less loss near this one, by the steps of Gauss and Newton, halved until the loss is less."""
+    squares = graph.squares(state)
+    for _ in range(most_steps):
+        before = loss(squares)
+        roots = np.repeat(np.sqrt(loss.weights(squares)), 6)
+        step = least_squares_step(sparse.diags(roots) @ graph.derivatives(state), roots * graph.errors(state))
+        for share in 0.5 ** np.arange(HALVES):
+            moved = graph.moved(state, share * step)
+            squares = graph.squares(moved)
+            gain = before - loss(squares)
+            if gain >= 0:
+                break
+        else:
+            return state
+        state = moved
+        if gain <= least_gain * before:
+            break
+    return state
 
 
 class _Graph:
-    """Errors of all edges and their derivatives; unknown: a step and a turn in the world of all nodes but the first."""
+    """Errors of all edges and their derivatives; unknown: a step and a turn in the world of each node not held."""
 
-    def __init__(self, poses: Array, edges: Sequence[Edge]) -> None:
-        self._positions, self._turns = poses[:, :3], Rotation.from_quat(poses[:, 3:])
+    def __init__(self, nodes: int, edges: Sequence[Edge], held: Collection[int] = ()) -> None:
         self._first = np.array([edge.first for edge in edges], int)
         self._second = np.array([edge.second for edge in edges], int)
         measured = np.array([edge.pose for edge in edges]).reshape(-1, 7)
         self._steps, self._rotations = measured[:, :3], Rotation.from_quat(measured[:, 3:])
-        self._roots = np.stack([_root(edge.information) for edge in edges])
-        rows, columns = 6 * np.arange(len(edges)), 6 * (np.stack([self._first, self._second]) - 1)
+        self._roots = _roots(np.array([edge.information for edge in edges]).reshape(-1, 6, 6))
+        self._place = _places(nodes, self._first, self._second, held)
+        rows, columns = 6 * np.arange(len(edges)), 6 * self._place[np.stack([self._first, self._second])]
         self._kept = columns >= 0
         six = np.arange(6)
         block_rows = np.broadcast_to(rows[:, None, None] + six[:, None], (2, len(edges), 6, 6))
         block_columns = np.broadcast_to(columns[..., None, None] + six, (2, len(edges), 6, 6))
-        self._places = block_rows[self._kept].ravel(), block_columns[self._kept].ravel()
-        self._shape = 6 * len(edges), 6 * (len(poses) - 1)
+        self._at = block_rows[self._kept].ravel(), block_columns[self._kept].ravel()
+        self._shape = 6 * len(edges), 6 * int(np.count_nonzero(self._place >= 0))
 
-    def state(self, x: Array) -> tuple[Array, Rotation, Array]:
-        """Return positions (N, 3), rotations (N) and the turns (N, 3) that made them."""
-        change = np.vstack([np.zeros((1, 6)), x.reshape(-1, 6)])
-        return self._positions + change[:, :3], Rotation.from_rotvec(change[:, 3:]) * self._turns, change[:, 3:]
+    def moved(self, state: State, x: Array) -> State:
+        """Return the state after a step and a turn in the world, x (6 U,), of the unknown nodes."""
+        change = np.vstack([x.reshape(-1, 6), np.zeros((1, 6))])[self._place]  # place -1, of those held, is the last
+        steps = np.linalg.solve(_inverse_left(change[:, 3:]), change[:, :3, None])[..., 0]
+        return State(state.positions + steps, Rotation.from_rotvec(change[:, 3:]) * state.turns)
 
-    def errors(self, x: Array) -> Array:
+    def errors(self, state: State) -> Array:
         """Return the weighted errors (6 E,)."""
-        positions, turns, _ = self.state(x)
-        step, turned = self._unweighted(positions, turns)
+        step, turned = self._unweighted(state)
         return np.einsum("eij,ej->ei", self._roots, np.hstack([step, turned.as_rotvec()])).ravel()
 
-    def derivatives(self, x: Array) -> sparse.csr_matrix:
-        """Return their derivatives (6 E, 6 (N - 1))."""
-        positions, turns, change = self.state(x)
-        i, j = self._first, self._second
-        to_world = turns.as_matrix()
-        world_to_edge = (to_world[i] @ self._rotations.as_matrix()).transpose(0, 2, 1)
-        left = np.linalg.inv(_inverse_left(change))  # a change of the turn's vector -> a turn in the world
-        turned = self._unweighted(positions, turns)[1].as_rotvec()
-        turning = _inverse_left(-turned) @ to_world[j].transpose(0, 2, 1)
-        lever = world_to_edge @ _cross(positions[j] - positions[i])
-        zero = np.zeros_like(lever)
-        of_first = np.block([[-world_to_edge, lever @ left[i]], [zero, -turning @ left[i]]])
-        of_second = np.block([[world_to_edge, zero], [zero, turning @ left[j]]])
-        blocks = self._roots @ np.stack([of_first, of_second])
-        return sparse.csr_matrix((blocks[self._kept].ravel(), self._places), self._shape)
+    def squares(self, state: State) -> Array:
+        """Return the squared error (E,) of each edge."""
+        return np.square(self.errors(state)).reshape(-1, 6).sum(axis=1)
 
-    def _unweighted(self, positions: Array, turns: Rotation) -> tuple[Array, Rotation]:
+    def derivatives(self, state: State) -> sparse.csr_matrix:
+        """Return their derivatives (6 E, 6 U) by x of :meth:`moved` at x = 0."""
         i, j = self._first, self._second
-        quaternions = turns.as_quat()
+        to_world = state.turns.as_matrix()
+        world_to_edge = (to_world[i] @ self._rotations.as_matrix()).transpose(0, 2, 1)
+        turned = self._unweighted(state)[1].as_rotvec()
+        turning = _inverse_left(-turned) @ to_world[j].transpose(0, 2, 1)
+        lever = world_to_edge @ _cross(state.positions[j] - state.positions[i])
+        zero = np.zeros_like(lever)
+        of_first = np.block([[-world_to_edge, lever], [zero, -turning]])
+        of_second = np.block([[world_to_edge, zero], [zero, turning]])
+        blocks = self._roots @ np.stack([of_first, of_second])
+        return sparse.csr_matrix((blocks[self._kept].ravel(), self._at), self._shape)
+
+    def _unweighted(self, state: State) -> tuple[Array, Rotation]:
+        i, j = self._first, self._second
+        quaternions = state.turns.as_quat()
         back, there = Rotation.from_quat(quaternions[i]).inv(), Rotation.from_quat(quaternions[j])
-        step = self._rotations.inv().apply(back.apply(positions[j] - positions[i]) - self._steps)
+        step = self._rotations.inv().apply(back.apply(state.positions[j] - state.positions[i]) - self._steps)
         return step, self._rotations.inv() * back * there
 
 
-def _root(information: Array) -> Array:
-    """Return W with W^T W = information; a direction without information has weight 0."""
+def _places(nodes: int, first: NDArray[np.int_], second: NDArray[np.int_], held: Collection[int]) -> NDArray[np.int_]:
+    """Return the place (N,) of each node among the unknowns, -1 for those that stay."""
+    ends = sparse.coo_matrix((np.ones(len(first)), (first, second)), (nodes, nodes))
+    _, part = csgraph.connected_components(ends, directed=False)
+    stays = np.zeros(nodes, bool)
+    stays[list(held)] = True
+    parts, starts = np.unique(part, return_index=True)
+    stays[starts[~np.isin(parts, part[stays])]] = True
+    place = np.full(nodes, -1)
+    place[~stays] = np.arange(np.count_nonzero(~stays))
+    free = (place[first] >= 0) & (place[second] >= 0)
+    place[~stays] = order(np.count_nonzero(~stays), place[first[free]], place[second[free]])
+    return place
+
+
+def _roots(information: Array) -> Array:
+    """Return W with W^T W = information (E, 6, 6); a direction without information has weight 0."""
     values, vectors = np.linalg.eigh(information)
-    return np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+    return np.sqrt(np.maximum(values, 0))[..., None] * vectors.transpose(0, 2, 1)
 
 
 def _cross(vectors: Array) -> Array:

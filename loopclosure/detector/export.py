@@ -19,6 +19,9 @@ from loopclosure.detector.detector import LoopResult
 from loopclosure.errors import InputError
 from netspec.files.whole_file import whole_file
 
+VERTEX, EDGE, VERTEX_2D, EDGE_2D = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"
+PLANE = np.array([0, 1, 5])  # x, y and the turn about z, of the six numbers of a pose's error
+
 RelativePose = Callable[[int, int], np.ndarray | None]
 
 
@@ -107,17 +110,32 @@ def write_g2o(
 
 
 def write_pose_graph(
-    path: str | Path, vertices: Mapping[int, np.ndarray], edges: Iterable[tuple[int, int, np.ndarray, np.ndarray]]
+    path: str | Path,
+    vertices: Mapping[int, np.ndarray],
+    edges: Iterable[tuple[int, int, np.ndarray, np.ndarray]],
+    fixed: Iterable[int] = (),
+    flat: bool = False,
 ) -> None:
-    """Write vertices, number -> pose (7,), and edges: i, j, pose (7,) of j in the frame of i, information (6, 6)."""
-    lines = [f"VERTEX_SE3:QUAT {i} {_numbers(pose)}" for i, pose in vertices.items()]
-    upper = np.triu_indices(6)
+    """Write vertices, number -> pose (7,), and edges: i, j, pose (7,) of j in the frame of i, information (6, 6).
+
+    ``fixed`` vertices are to stay where they are. ``flat``: in two dimensions, for poses in the plane z = 0.
+    """
+    vertex, edge = (VERTEX_2D, EDGE_2D) if flat else (VERTEX, EDGE)
+    upper = np.triu_indices(3 if flat else 6)
+    said = _flat_pose if flat else np.asarray
+    lines = [f"{vertex} {i} {_numbers(said(pose))}" for i, pose in vertices.items()]
+    lines += [f"FIX {i}" for i in fixed]
     for i, j, pose, information in edges:
-        lines.append(f"EDGE_SE3:QUAT {i} {j} {_numbers(pose)} {_numbers(information[upper])}")
+        entries = (information[np.ix_(PLANE, PLANE)] if flat else information)[upper]
+        lines.append(f"{edge} {i} {j} {_numbers(said(pose))} {_numbers(entries)}")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as unfinished:
         unfinished.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _flat_pose(pose: np.ndarray) -> np.ndarray:
+    return np.array([*pose[:2], Rotation.from_quat(pose[3:]).as_rotvec()[2]])
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -17,13 +17,13 @@ from netspec.files.whole_file import whole_file
 AXES = ("x [m]", "y [m]", "z [m]")
 
 
-def draw_paths(path: Path, closed: Closed) -> None:
+def draw_paths(path: Path, closed: Closed, names: tuple[str, str] = ("odometry", "loops closed")) -> None:
     """Draw both paths from the side from which they look largest, and the true one where it is known, as PNG.
 
     Paths are moved and turned as a whole to be nearest to the true one. Lines across are loops: green if used, red if
     they contradict the others.
     """
-    paths = {"odometry": closed.odometry, "loops closed": closed.poses}
+    paths = dict(zip(names, (closed.odometry, closed.poses), strict=True))
     if closed.truth is not None:
         known = np.all(np.isfinite(closed.truth), axis=1)
         if np.count_nonzero(known) >= 3:

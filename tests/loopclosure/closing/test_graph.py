@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.drift import aligned, ate_rmse_m, drifted, path_of, steps_between, turn_rmse_deg
-from loopclosure.closing.graph import Edge, _Graph, solve
+from loopclosure.closing.graph import Edge, State, _Graph, solve
 from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
 from loopclosure.errors import InputError
 
@@ -37,11 +37,14 @@ def test_derivatives_are_those_of_the_errors() -> None:
     measured = np.hstack([rng.normal(size=(3, 3)), Rotation.random(3, rng).as_quat()])
     information = [np.eye(6), np.diag([1, 2, 0, 3, 4, 5.0]), np.diag(rng.uniform(1, 9, 6))]
     edges = [Edge(*ends, measured[k], information[k]) for k, ends in enumerate([(0, 1), (3, 2), (4, 0)])]
-    graph = _Graph(poses, edges)
-    x = rng.normal(0, 0.3, 24)
-    steps = 1e-6 * np.eye(24)
-    numeric = np.stack([(graph.errors(x + step) - graph.errors(x - step)) / 2e-6 for step in steps], axis=1)
-    np.testing.assert_allclose(graph.derivatives(x).toarray(), numeric, atol=1e-7)
+    graph = _Graph(len(poses), edges)
+    start = State(poses[:, :3], Rotation.from_quat(poses[:, 3:]))
+    # The graph has two parts, 0 1 4 and 2 3; the first node of each stays.
+    steps = 1e-6 * np.eye(18)
+    state = graph.moved(start, rng.normal(0, 0.3, 18))
+    there, back = ([graph.errors(graph.moved(state, way * step)) for step in steps] for way in (1, -1))
+    numeric = (np.stack(there, axis=1) - np.stack(back, axis=1)) / 2e-6
+    np.testing.assert_allclose(graph.derivatives(state).toarray(), numeric, atol=1e-7)
 
 
 def test_loops_mend_the_drift() -> None:

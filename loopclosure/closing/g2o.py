@@ -1,0 +1,169 @@
+"""Pose graphs in g2o files, of three and of two dimensions: read, solved, written.
+
+Lines: ``VERTEX_SE3:QUAT id x y z qx qy qz qw``, ``EDGE_SE3:QUAT i j`` with the pose of j in the frame of i and the 21
+upper entries of its information matrix; ``VERTEX_SE2 id x y theta``, ``EDGE_SE2 i j x y theta`` with 6 entries;
+``FIX id``. Ids may have gaps and any order; ``#`` begins a comment.
+
+A graph of two dimensions is one of three whose poses lie in a plane: errors and solution are the same.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopclosure.closing.graph import Edge, Solution, solve, squares_of
+from loopclosure.detector.export import EDGE, EDGE_2D, PLANE, VERTEX, VERTEX_2D, write_pose_graph
+from loopclosure.errors import InputError
+from netspec.files.whole_file import whole_file
+
+Array = NDArray[np.float64]
+
+# How many numbers follow, and how many of them are ids.
+NUMBERS = {VERTEX: (8, 1), EDGE: (30, 2), VERTEX_2D: (4, 1), EDGE_2D: (11, 2), "FIX": (1, 1)}
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """A pose graph as its file gives it.
+
+    ids    (N,) of the vertices, ascending;  poses  (N, 7);  held  the vertices that stay, as rows of ids
+    steps  edges between vertices whose ids follow each other: odometry, which is trusted;  loops  all others
+    flat   whether the file has two dimensions
+    """
+
+    ids: NDArray[np.int_]
+    poses: Array
+    steps: list[Edge]
+    loops: list[Edge]
+    held: list[int]
+    flat: bool
+
+
+def read_pose_graph(path: Path) -> PoseGraph:
+    """Read a g2o file. Raises InputError (file:line) for what is no pose graph."""
+    vertices: dict[int, Array] = {}
+    edges: list[tuple[int, int, int, Array, Array]] = []  # line, ids, pose, information
+    fixed: list[tuple[int, int]] = []  # line, id
+    tags = set()
+    try:
+        with path.open(encoding="utf-8", errors="replace") as stream:
+            for line, text in enumerate(stream, 1):
+                words = text.partition("#")[0].split()
+                if not words:
+                    continue
+                tag, ids, values = _entry(words, path, line)
+                if tag == "FIX":
+                    fixed.append((line, ids[0]))
+                    continue
+                tags.add(tag.endswith("SE2"))
+                pose = _lifted(values[:3]) if tag.endswith("SE2") else _checked(values[:7], path, line)
+                if tag in (EDGE, EDGE_2D):
+                    edges.append((line, *ids, pose, _information(values, path, line)))
+                elif ids[0] in vertices:
+                    raise InputError(f"there is a vertex {ids[0]} already", path, line, 1)
+                else:
+                    vertices[ids[0]] = pose
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror}); expected a pose graph (g2o)", path) from error
+    if len(tags) > 1:
+        raise InputError("has vertices or edges of two and of three dimensions; expected one kind", path)
+    if not vertices or not edges:
+        raise InputError(f"has {len(vertices)} vertices and {len(edges)} edges; expected a pose graph (g2o)", path)
+    rows = {number: row for row, number in enumerate(sorted(vertices))}
+    steps, loops = [], []
+    for line, *ends, pose, information in edges:
+        missing = [end for end in ends if end not in rows]
+        if missing or ends[0] == ends[1]:
+            what = f"ends at vertex {missing[0]}, which the file does not have" if missing else "joins it with itself"
+            raise InputError(f"the edge {ends[0]} {ends[1]} {what}", path, line, 1)
+        edge = Edge(rows[ends[0]], rows[ends[1]], pose, information)
+        (steps if abs(edge.first - edge.second) == 1 else loops).append(edge)
+    for line, number in fixed:
+        if number not in rows:
+            raise InputError(f"fixes vertex {number}, which the file does not have", path, line, 1)
+    poses = np.array([vertices[number] for number in rows])
+    return PoseGraph(np.array(list(rows)), poses, steps, loops, [rows[number] for _, number in fixed], True in tags)
+
+
+def solve_pose_graph(graph: PoseGraph) -> Solution:
+    """Find the poses that agree best with all edges; loops that contradict the rest do no harm."""
+    return solve(graph.poses, graph.steps, graph.loops, graph.held)
+
+
+def write_solution(out: Path, graph: PoseGraph, solution: Solution) -> None:
+    """Write closed.g2o, without the loops that were rejected, and loops.csv, which says what became of each."""
+    out.mkdir(parents=True, exist_ok=True)
+    ids, accepted = graph.ids.tolist(), solution.accepted.tolist()
+    kept = [edge for edge, used in zip(graph.loops, accepted, strict=True) if used]
+    edges = [(ids[edge.first], ids[edge.second], edge.pose, edge.information) for edge in [*graph.steps, *kept]]
+    vertices = dict(zip(ids, solution.poses, strict=True))
+    write_pose_graph(out / "closed.g2o", vertices, edges, [ids[row] for row in graph.held], graph.flat)
+    with whole_file(out / "loops.csv") as unfinished, unfinished.open("w", newline="", encoding="ascii") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["first", "second", "chi2", "used"])
+        for edge, square, used in zip(graph.loops, solution.squares, accepted, strict=True):
+            writer.writerow([ids[edge.first], ids[edge.second], f"{square:.6g}", "yes" if used else "no"])
+
+
+def summary(graph: PoseGraph, solution: Solution) -> list[str]:
+    """Return what there is to say about a solved graph, a sentence each."""
+    used = int(np.count_nonzero(solution.accepted))
+    kept = [edge for edge, accepted in zip(graph.loops, solution.accepted, strict=True) if accepted]
+    before = squares_of(graph.poses, [*graph.steps, *kept]).sum()
+    after = solution.odometry_squares.sum() + solution.squares[solution.accepted].sum()
+    return [
+        f"{len(graph.ids)} poses, {len(graph.steps)} edges of odometry: between vertices whose ids follow each other",
+        f"{used} of {len(graph.loops)} loops used, {len(graph.loops) - used} contradict the others",
+        f"chi-squared {before:.6g} before, {after:.6g} after, of the edges that are used",
+    ]
+
+
+def _entry(words: list[str], path: Path, line: int) -> tuple[str, list[int], Array]:
+    """Return the tag of a line, its ids and its other numbers."""
+    tag = words[0]
+    if tag not in NUMBERS:
+        known = ", ".join(NUMBERS)
+        raise InputError(f"found {tag:.40}; expected {known}: the vertices and edges of a pose graph", path, line, 1)
+    count, ids = NUMBERS[tag]
+    try:
+        if len(words) - 1 != count:
+            raise ValueError
+        values = np.array(words[1 + ids :], float)
+        if not np.all(np.isfinite(values)):
+            raise ValueError
+        return tag, [int(word) for word in words[1 : 1 + ids]], values
+    except ValueError:
+        text = f"found {len(words) - 1} words after {tag}; expected {count} numbers, the first {ids} whole"
+        raise InputError(text, path, line, 1) from None
+
+
+def _checked(pose: Array, path: Path, line: int) -> Array:
+    if not np.any(pose[3:]):
+        raise InputError("the quaternion is 0; expected x y z qx qy qz qw", path, line, 1)
+    return pose
+
+
+def _lifted(flat: Array) -> Array:
+    return np.array([flat[0], flat[1], 0, 0, 0, np.sin(flat[2] / 2), np.cos(flat[2] / 2)])
+
+
+def _information(values: Array, path: Path, line: int) -> Array:
+    """Return the information (6, 6) of an edge; in a plane, that of what it does not say is 1, and its error 0."""
+    flat = len(values) == 9
+    size, pose = (3, 3) if flat else (6, 7)
+    matrix = np.zeros((size, size))
+    matrix[np.triu_indices(size)] = values[pose:]
+    matrix += np.triu(matrix, 1).T
+    lowest, *_, highest = np.linalg.eigvalsh(matrix)
+    if lowest < -1e-6 * max(highest, 1e-300):
+        raise InputError(f"the information matrix has a negative eigenvalue, {lowest:.3g}", path, line, 1)
+    if not flat:
+        return matrix
+    lifted = np.eye(6)
+    lifted[np.ix_(PLANE, PLANE)] = matrix
+    return lifted
