@@ -48,6 +48,12 @@ class Judgment:
             judged.all_pairs_curve(), judged.best_match_curve(), judged.best_matches, judged.recall_at(RECALL_AT)
         )
 
+    def answered(self) -> str:
+        """Say how much of all that has a score is right, and how much of what is to be found that is."""
+        if not len(self.best.recall):
+            return "nothing accepted, recall 0"
+        return f"precision {self.best.precision[-1]:.3f}, recall {self.best.recall[-1]:.3f}"
+
     def measures(self, zone: str = "") -> dict[str, dict[str, float]]:
         """Return convention + ``zone`` -> name of the measure -> value in 0..1."""
         table = {
@@ -71,6 +77,7 @@ class Outcome:
     soft     the same in the soft zone; None where it is not known
     seconds  stage -> total seconds
     training_stages  the stages done once, on training images
+    answer   of a method that decides by itself: what became of the queries, and how much of it is right
     """
 
     name: str
@@ -80,6 +87,7 @@ class Outcome:
     seconds: dict[str, float]
     training_stages: tuple[str, ...]
     notes: list[str]
+    answer: str = ""
 
     @property
     def pairs(self) -> PrecisionRecall:
@@ -163,12 +171,19 @@ def judge(
     if silent_pairs:
         judged = int(np.count_nonzero(data.truth.judged))
         notes.append(f"no score for {silent_pairs} of {judged} judged pairs, which counts as no loop")
+    soft = None if soft_truth is None else Judgment.of(result.scores, soft_truth)
+    answer = ""
+    if result.answer:
+        zones = [("", rule)] + ([] if soft is None else [(" in the soft zone", soft)])
+        answer = "; ".join([result.answer, *(f"{judged.answered()}{zone}" for zone, judged in zones)])
+        notes.append(answer)
     return Outcome(
         name=name,
         scores=result.scores,
         rule=rule,
-        soft=None if soft_truth is None else Judgment.of(result.scores, soft_truth),
+        soft=soft,
         seconds=result.seconds,
         training_stages=result.training_stages,
         notes=notes,
+        answer=answer,
     )

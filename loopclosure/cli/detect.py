@@ -16,10 +16,12 @@ from loopclosure.detector import run
 from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetector
 from loopclosure.detector.export import write_g2o, write_loops_csv
 from loopclosure.detector.verification import GeometricCheck
+from loopclosure.methods.auto import PRECISION
+from loopclosure.methods.drive import whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.bags import is_bag
 from loopclosure.places.extraction import extract
-from loopclosure.places.frames import Selection
+from netspec.files.whole_file import whole_file
 from netspec.terminal.commands import Commands, WrongUsage
 
 # The detector's settings that --resume takes from the saved one.
@@ -32,14 +34,8 @@ SETTINGS = (
     "consistency",
     "consistency_window",
 )
-PRECISION = 0.99
-# Options that mean nothing without another one.
-NEEDS = {
-    "calibrate_truth": "calibrate",
-    "calibrate_features": "calibrate",
-    "precision": "calibrate",
-    "min_inliers": "verify",
-}
+# Settings of the search frame by frame.
+ONLINE = ("top_k", "consistency", "consistency_window")
 
 
 def add_to(commands: Commands) -> None:
@@ -61,15 +57,17 @@ def add_to(commands: Commands) -> None:
         "--with", action="append", default=[], dest="options", metavar="KEY=VALUE", help="a keyword for --describe"
     )
     p.add_argument("--whiten", metavar="OTHER.npz", help="whiten the descriptors by these, of images of other places")
-    which = p.add_mutually_exclusive_group(required=True)
-    which.add_argument("--threshold", type=float, help="least score of a loop (euclidean: minus the distance)")
+    which = p.add_mutually_exclusive_group()
     which.add_argument(
-        "--calibrate", metavar="SEQUENCE", help="choose the threshold on this TUM sequence, or folder with a mask"
+        "--precision",
+        type=float,
+        metavar="P",
+        help=f"share of the loops that should be right, for which all else is chosen (default: {PRECISION:g})",
     )
-    which.add_argument("--resume", metavar="F.npz", help="continue with a detector that --save wrote")
-    p.add_argument("--calibrate-truth", metavar="MASK", help="of --calibrate, if it is not a TUM sequence")
-    p.add_argument("--calibrate-features", metavar="F.npz", help="of --calibrate, if --features is given")
-    p.add_argument("--precision", type=float, help=f"least precision for --calibrate (default: {PRECISION:g})")
+    which.add_argument(
+        "--threshold", type=float, help="decide frame by frame, by this least score (euclidean: minus the distance)"
+    )
+    which.add_argument("--resume", metavar="F.npz", help="decide frame by frame, with a detector that --save wrote")
     of = DetectorSettings()
     p.add_argument("--metric", choices=METRICS, help=f"of the descriptors (default: {of.metric})")
     p.add_argument(
@@ -98,26 +96,28 @@ def _detect(a: argparse.Namespace) -> None:
     for doubt in recording.doubts:
         warn(doubt)
     features = read_features(a.features) if a.features else None
-    validation = read_features(a.calibrate_features) if a.calibrate_features else None
     describe = run.load_describe(a.describe, options) if features is None else None
     views = run.views_of(describe, features)
     if a.whiten is not None:
         whitening = WhitenBy(a.whiten).learn()
         describe = None if describe is None else run.whitened(describe, whitening, views)
         features = None if features is None else features.whitened(whitening)
-        validation = None if validation is None else validation.whitened(whitening)
     detector = _detector(a, describe, views)
-    if a.calibrate:
-        stride = Selection(stride=a.stride)  # that of the source
-        data = run.validation_set(a.calibrate, a.calibrate_truth, detector.settings, stride)
-        precision = PRECISION if a.precision is None else a.precision
-        print(run.calibrate_on_data_set(detector, data, precision, validation, show_progress))
     # Frames of the run that is resumed have numbers but no names here.
     names = [""] * len(detector) + recording.names
-    results = run.run_detector(detector, recording, features, show_progress)
     out = Path(a.out)
+    if a.threshold is None and not a.resume:
+        precision = PRECISION if a.precision is None else a.precision
+        results, found = whole_drive(detector, recording, features, precision, show_progress)
+        said = [*found.reasons, found.counts()]
+    else:
+        results = run.run_detector(detector, recording, features, show_progress)
+        said = [run.verdicts_said(results)]
     write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names)
+    with whole_file(out / "chosen.txt") as unfinished:
+        unfinished.write_text("\n".join(said) + "\n", encoding="utf-8")
     loops = sum(result.accepted is not None for result in results)
+    print("\n".join(said))
     print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}")
     if np.isfinite(detector.poses).any():
         left_out = write_g2o(out / "loops.g2o", detector.poses, detector.loops, run.from_poses(detector))
@@ -130,13 +130,14 @@ def _detect(a: argparse.Namespace) -> None:
 
 def _checked_options(a: argparse.Namespace) -> dict[str, str]:
     """Return the keywords of --with; refuse options that do not go together."""
-    for option, other in NEEDS.items():
-        if getattr(a, option) is not None and not getattr(a, other):
-            raise WrongUsage(f"--{option.replace('_', '-')} means nothing without --{other}")
     if a.resume and (_changes(a) or a.verify):
         raise WrongUsage("--resume continues with the settings of the saved detector; leave out others")
-    if a.calibrate and a.features and not a.calibrate_features:
-        raise WrongUsage("--calibrate with --features needs --calibrate-features, the same net's")
+    if a.min_inliers is not None and not a.verify:
+        raise WrongUsage("--min-inliers means nothing without --verify")
+    given = [f"--{name.replace('_', '-')}" for name in ONLINE if getattr(a, name) is not None]
+    given += ["--verify"] if a.verify else []
+    if given and a.threshold is None:
+        raise WrongUsage(f"{given[0]} means nothing without --threshold")
     if a.features and a.options:
         raise WrongUsage("--with belongs to --describe; --features has descriptors already")
     options = {}

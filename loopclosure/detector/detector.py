@@ -1,6 +1,6 @@
 """Loop closure frame by frame, for use inside a running robot.
 
-    detector = LoopDetector(describe, exclude_recent=50, threshold=-0.4, consistency=3)
+    detector = LoopDetector(describe, check=GeometricCheck())
     for image in camera:
         result = detector.add(image)
         if result.accepted is not None:
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,12 @@ from loopclosure.arrays import check_array, from_json, read_npz
 from loopclosure.descriptors.similarity import check_metric, squared_distances
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
-from loopclosure.precision_recall import PrecisionRecall, curve
 from netspec.errors import SpecError
 from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
 FIRST_CAPACITY = 256  # frames; doubled when full
+LEAST_STEPS = 20  # from one frame to the next, before they give a threshold
 FORMAT = 1  # of the file that save writes
 SAVED = "a file that LoopDetector.save wrote"
 
@@ -41,7 +41,8 @@ class LoopResult:
     query_id    the frame's number, from 0
     candidates  (id, score) of the best earlier frames, best first, higher = more similar
     accepted    the earlier frame that this one closes a loop with, or None
-    verdict     why: "accepted", "no candidate", "no threshold", "below threshold", "not consistent", "not verified"
+    verdict     why: "accepted", "no candidate", "too early" (to choose a threshold), "below threshold",
+                "not consistent", "not verified"
     score       of the accepted frame, or of the best candidate; -inf without one
     inliers     inliers of the accepted candidate, or the most of any candidate tried; None if none was tried
     stamp       seconds, as given
@@ -66,7 +67,8 @@ class DetectorSettings:
     exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i
     exclude_seconds     frames less than this many seconds old are not candidates either
     top_k               how many candidates are examined
-    threshold           a candidate needs score >= threshold; None: nothing is accepted (see ``calibrate``)
+    threshold           a candidate needs score >= threshold. None: with a geometric check, that decides alone; without
+                        one a candidate must be as similar as consecutive frames so far are (their median)
     consistency         how many previous frames must have had a candidate that leads to this one, so that places
                         follow each other in time
     consistency_window  a candidate leads to one of the next frame that is at most this many frames away
@@ -142,7 +144,7 @@ class LoopDetector:
 
         describe  image (H, W, 3) uint8 BGR -> descriptor (D,), the same D each time, or (views D,); None: use
                   ``add_descriptor``
-        settings  or its fields by name: ``LoopDetector(describe, exclude_recent=50, top_k=5, threshold=-0.4)``
+        settings  or its fields by name: ``LoopDetector(describe, exclude_recent=50, top_k=5)``
         check     verifies candidates by their geometry, best first; None: no verification
         """
         given = asdict(settings or DetectorSettings())
@@ -154,6 +156,7 @@ class LoopDetector:
         self.check = check
         self.loops: list[LoopResult] = []
         self._frames = _Frames()
+        self._steps: list[float] = []  # the score of each frame with the one before it
         self._runs: list[tuple[int, int]] = []  # of the last frame: candidate, consecutive frames that led to it
 
     def __len__(self) -> int:
@@ -203,6 +206,8 @@ class LoopDetector:
                 raise InputError("a geometric check needs the images")
             local = self.check.describe(image)
         result = self._decide(candidates, stamp, local)
+        if len(self):
+            self._steps.append(float(self._score(self._frames.rows[len(self) - 1 : len(self)], row)[0]))
         self._frames.append(row, stamp, position)
         if local is not None:
             self._frames.local.append(local)
@@ -210,27 +215,15 @@ class LoopDetector:
             self.loops.append(result)
         return result
 
-    def calibrate(self, results: Sequence[LoopResult], same: np.ndarray, precision: float = 0.99) -> PrecisionRecall:
-        """Set the threshold with the greatest recall that has at least ``precision`` on a validation run.
+    @property
+    def descriptors(self) -> np.ndarray:
+        """The descriptors of all frames (N, views D), of unit length for cosine."""
+        return self._frames.rows[: len(self)].reshape(len(self), -1).copy()
 
-        results  of adding the frames of the validation run (its threshold is not used)
-        same     (N, N) bool: frames i and j < i show the same place
-        Returns the curve of the best candidate of each frame, from which the threshold is chosen. Consistency and a
-        geometric check, which come after the threshold, can only increase the precision. Raises InputError if no
-        threshold has this precision.
-        """
-        scores = np.array([result.candidates[0][1] if result.candidates else -np.inf for result in results])
-        right = np.array([bool(r.candidates) and bool(same[r.query_id, r.candidates[0][0]]) for r in results], bool)
-        found = curve(scores, right, convention="best candidate of each frame")
-        threshold = found.threshold_for_precision(precision)
-        if threshold is None:
-            best = float(np.max(found.precision, initial=0.0))
-            raise InputError(
-                f"no threshold reaches a precision of {precision:g} on the validation run; the best is {best:.3g} "
-                f"({int(right.sum())} of {len(results)} best candidates are right)"
-            )
-        self.settings = DetectorSettings(**{**asdict(self.settings), "threshold": threshold})
-        return found
+    def decided(self, loops: Sequence[LoopResult], threshold: float | None) -> None:
+        """Take loops that were found with all frames in view, and a threshold for frames to come."""
+        self.loops = list(loops)
+        self.settings = replace(self.settings, threshold=None if threshold is None else float(threshold))
 
     def save(self, path: str | Path) -> None:
         """Write everything except ``describe`` to an .npz file, from which ``load`` continues."""
@@ -271,6 +264,8 @@ class LoopDetector:
                 check = from_json(GeometricCheck, {**asdict(GeometricCheck()), **about["check"]})
             detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check)
             detector._frames = _frames(arrays, detector.settings.views, check is not None)
+            rows = detector._frames.rows
+            detector._steps = [float(detector._score(rows[i : i + 1], rows[i + 1])[0]) for i in range(len(rows) - 1)]
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
             detector.loops = [_loop(found, len(detector)) for found in about["loops"]]
         except SpecError as fault:
@@ -304,6 +299,20 @@ class LoopDetector:
             row = row / np.where(lengths > 0, lengths, 1)
         return row
 
+    def _score(self, rows: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Return the scores (k,) of frames (k, views, D) with one (views, D), computed directly."""
+        if self.settings.metric == "cosine":
+            return (rows @ row.T).reshape(len(rows), -1).max(axis=1)
+        return -np.linalg.norm(rows[:, :, None] - row, axis=-1).reshape(len(rows), -1).min(axis=1)
+
+    def _threshold(self) -> float | None:
+        """Return the least score of a loop now; None if there are too few frames to tell."""
+        if self.settings.threshold is not None:
+            return self.settings.threshold
+        if self.check is not None:
+            return -np.inf
+        return float(np.median(self._steps)) if len(self._steps) >= LEAST_STEPS else None
+
     def _search(self, row: np.ndarray, stamp: float | None) -> list[tuple[int, float]]:
         frames, settings = self._frames, self.settings
         end = max(0, frames.count - settings.exclude_recent)
@@ -320,11 +329,7 @@ class LoopDetector:
         k = min(settings.top_k, end)
         best = np.argpartition(scores, end - k)[end - k :]
         # The product is fast but rounds small distances badly: the few that are reported are computed directly.
-        if settings.metric == "euclidean":
-            apart = np.linalg.norm(frames.rows[best][:, :, None] - row, axis=-1)
-            values = -apart.reshape(k, -1).min(axis=1)
-        else:
-            values = scores[best]
+        values = self._score(frames.rows[best], row) if settings.metric == "euclidean" else scores[best]
         order = np.lexsort((best, -values))
         return [(int(best[i]), float(values[i])) for i in order]
 
@@ -345,9 +350,10 @@ class LoopDetector:
 
         if not candidates:
             return result("no candidate")
-        if settings.threshold is None:
-            return result("no threshold")
-        likely = [(number, value) for number, value in candidates if value >= settings.threshold]
+        threshold = self._threshold()
+        if threshold is None:
+            return result("too early")
+        likely = [(number, value) for number, value in candidates if value >= threshold]
         if not likely:
             return result("below threshold")
         for number, _ in likely:

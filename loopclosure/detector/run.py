@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,10 +14,9 @@ import numpy as np
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.whitening import Whitening
-from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetector, LoopResult
+from loopclosure.detector.detector import Describe, LoopDetector, LoopResult
 from loopclosure.detector.export import RelativePose, relative_pose
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import DataSet, load_folder, load_tum
 from loopclosure.places.frames import (
     ALL_FRAMES,
     VIDEO_SUFFIXES,
@@ -29,7 +28,6 @@ from loopclosure.places.frames import (
 from loopclosure.places.same_place import same_place
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses
-from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
@@ -121,41 +119,12 @@ def run_detector(
     return results
 
 
-def validation_set(
-    source: str | Path, truth: str | Path | None, settings: DetectorSettings, selection: Selection = ALL_FRAMES
-) -> DataSet:
-    """Load the frames that a threshold is chosen on: a TUM sequence, or a folder with the mask ``truth``.
-
-    Candidates near in time are excluded as by the detector's ``settings``.
-    """
-    if truth:
-        return load_folder(source, truth, None, selection, Exclusion(settings.exclude_recent))
-    return load_tum(source, selection, Exclusion(settings.exclude_recent, settings.exclude_seconds))
-
-
-def calibrate_on_data_set(
-    detector: LoopDetector,
-    data: DataSet,
-    precision: float,
-    features: Features | None = None,
-    progress: Progress = silent,
-) -> str:
-    """Set the threshold of ``detector`` on a validation sequence with its truth; return a sentence about the result.
-
-    The validation run uses another detector with the same settings: ``detector`` stays empty. Candidates near in time
-    are excluded by the detector's settings, not by those of the data set.
-    """
-    if data.reference_images is not None:
-        raise InputError(f"{data.name} is two traverses; a detector is calibrated on one sequence")
-    trial = LoopDetector(detector.describe, detector.settings)
-    images = data.query_images
-    recording = Recording(Path(data.name), [p.name for p in images], images, np.arange(len(images)), data.stamps)
-    results = run_detector(trial, recording, features, progress)
-    found = detector.calibrate(results, data.truth.soft, precision)
-    return (
-        f"threshold {detector.settings.threshold:.6g}: on {data.name} precision at least {precision:g} at recall "
-        f"{found.recall_at_precision(precision):.3f} of the {found.positives} frames whose best candidate is right"
-    )
+def verdicts_said(results: Sequence[LoopResult]) -> str:
+    """Say in one sentence what became of all frames, and the best score."""
+    verdicts = [result.verdict for result in results]
+    words = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
+    scores = [result.score for result in results if result.candidates]
+    return f"frames: {words}" + (f"; best score {max(scores):.4g}" if scores else "")
 
 
 def from_poses(detector: LoopDetector) -> RelativePose:

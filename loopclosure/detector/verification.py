@@ -190,6 +190,13 @@ class Pairs:
             self._local[of] = check.describe(self.image(key))
         return self._local[of]
 
+    def __bool__(self) -> bool:
+        return bool(self._local)
+
+    def put(self, check: GeometricCheck, key: Any, image: np.ndarray) -> None:
+        """Find the points of an image that cannot be read later, a video's."""
+        self._local[_by_points(check), key] = check.describe(image)
+
     def agreement(self, check: GeometricCheck, a: Any, b: Any) -> Agreement:
         """Return how many points of two images agree."""
         of = (replace(check, min_inliers=0), a, b)

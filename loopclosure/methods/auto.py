@@ -221,8 +221,8 @@ class Auto:
         scores = np.full(found.scores.shape, np.nan)
         loops = np.flatnonzero(decided.accepted)
         scores[loops, decided.match[loops]] = decided.score[loops]
-        notes = [*found.notes, *decided.reasons, decided.counts()]
-        return MethodResult(scores, seconds, notes, found.training_stages)
+        notes = [*found.notes, *decided.reasons]
+        return MethodResult(scores, seconds, notes, found.training_stages, decided.counts())
 
 
 def auto(argument: str, context: MethodContext, inner: Method | None) -> Auto:

@@ -50,12 +50,14 @@ class MethodResult:
     seconds          stage -> total seconds spent on it, in the order of the work
     notes            sentences for the report: settings, sizes of vocabularies, what was left out
     training_stages  the stages done once, on training images, rather than for each frame
+    answer           of a method that decides by itself what is a loop: what became of the queries
     """
 
     scores: np.ndarray
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     training_stages: tuple[str, ...] = ()
+    answer: str = ""
 
 
 class Method(Protocol):

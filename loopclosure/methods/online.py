@@ -14,7 +14,7 @@ import numpy as np
 
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.detector.detector import DetectorSettings, LoopDetector
-from loopclosure.detector.run import Recording, calibrate_on_data_set, run_detector, validation_set
+from loopclosure.detector.run import Recording, run_detector, verdicts_said
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_inner
@@ -30,8 +30,7 @@ class OnlineMethod:
     """A :class:`LoopDetector` on descriptors from a file.
 
     features            the file, of ``netspec extract --images``
-    threshold           least score of a loop; or it is chosen on the sequence ``calibrate`` with ``calibrate_truth``, a
-                        mask, if it is not a TUM sequence, and ``calibrate_features``, for at least ``precision``
+    threshold           least score of a loop; NaN: from the frames so far (:class:`DetectorSettings`)
     verify              verify candidates by ``check``
     """
 
@@ -39,10 +38,6 @@ class OnlineMethod:
     settings: DetectorSettings = field(default_factory=DetectorSettings)
     check: GeometricCheck = field(default_factory=GeometricCheck)
     threshold: float = float("nan")
-    calibrate: str = ""
-    calibrate_truth: str = ""
-    calibrate_features: str = ""
-    precision: float = 0.99
     verify: bool = False
 
     @property
@@ -55,16 +50,10 @@ class OnlineMethod:
         if images.references is not None:
             raise InputError("the detector finds loops in one sequence, and these are queries and references")
         described = read_features(self.features)
-        threshold = None if self.calibrate else self.threshold
+        threshold = None if np.isnan(self.threshold) else self.threshold
         settings = replace(self.settings, threshold=threshold, views=described.views)
         detector = LoopDetector(settings=settings, check=self.check if self.verify else None)
         seconds: dict[str, float] = {}
-        notes = []
-        if self.calibrate:
-            with timed(seconds, "calibration"):
-                data = validation_set(self.calibrate, self.calibrate_truth, detector.settings)
-                validation = read_features(self.calibrate_features)
-                notes.append(calibrate_on_data_set(detector, data, self.precision, validation, progress))
         if np.isfinite(described.seconds_per_image):
             seconds["features"] = described.seconds_per_image * len(images.queries)
         recording = Recording(
@@ -76,18 +65,18 @@ class OnlineMethod:
         for result in results:
             if result.accepted is not None:
                 scores[result.query_id, result.accepted] = result.score
-        verdicts = [result.verdict for result in results]
-        counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
-        notes += [f"frames: {counts}", f"{detector.settings}", f"{detector.check or 'no geometric verification'}"]
-        return MethodResult(scores, seconds, notes, ("calibration",))
+        notes = [f"{detector.settings}", f"{detector.check or 'no geometric verification'}"]
+        return MethodResult(scores, seconds, notes, answer=verdicts_said(results))
 
 
 def online(argument: str, context: MethodContext, inner: Method | None) -> OnlineMethod:
-    """Build ``detector:FILE.npz:threshold=T[,setting=value,...]``; or with ``calibrate=SEQUENCE`` for the threshold."""
+    """Build ``detector:FILE.npz[:threshold=T,setting=value,...]``."""
     refuse_inner("detector", inner)
     path, *settings = SETTINGS_BEGIN.split(argument, maxsplit=1)
     if not path.endswith(".npz"):
-        raise InputError(f'"detector:{argument}": expected detector:FILE.npz:threshold=T, or calibrate=SEQUENCE')
+        raise InputError(
+            f'"detector:{argument}": expected detector:FILE.npz, or with settings detector:FILE.npz:verify=yes'
+        )
     method, detector, check = configure(
         "detector",
         "".join(settings),
@@ -95,9 +84,5 @@ def online(argument: str, context: MethodContext, inner: Method | None) -> Onlin
         DetectorSettings(exclude_recent=context.exclude_frames),
         GeometricCheck(),
     )
-    if np.isnan(method.threshold) == (not method.calibrate):
-        raise InputError("the detector needs either threshold=T or calibrate=SEQUENCE")
-    if bool(method.calibrate) != bool(method.calibrate_features):
-        raise InputError("calibrate=SEQUENCE needs calibrate_features=FILE.npz, the same net's")
     method.settings, method.check = detector, check
     return method

@@ -114,7 +114,8 @@ def measures_text(evaluation: Evaluation) -> str:
     if soft:
         over += f"  {' soft zone ':-^{sum(widths[10:12]) + 2}}"
         said.append(f"soft zone, best match of each query: a match is no mistake if {data.overlap_rule}")
-    return "\n".join([*said, over, *lines])
+    answers = [f"{outcome.name}: {outcome.answer}" for outcome in evaluation.outcomes if outcome.answer]
+    return "\n".join([*said, over, *lines, *answers])
 
 
 def _write_measures_csv(evaluation: Evaluation, path: Path) -> None:

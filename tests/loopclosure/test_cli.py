@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -141,34 +142,41 @@ def test_detect_writes_loops_and_a_pose_graph(two_laps, tmp_path, capsys):
     assert "18 loops in 40 frames" in capsys.readouterr().out
 
 
-def test_detect_calibrates_saves_and_resumes(two_laps, two_laps_features, tmp_path, capsys):
+def test_detect_saves_and_resumes(two_laps, two_laps_features, tmp_path, capsys):
     features = ["--features", str(two_laps_features)]
-    code = main(
-        [
-            "detect",
-            str(two_laps),
-            "--stop",
-            "30",
-            "--calibrate",
-            str(two_laps),
-            "--exclude-recent",
-            "10",
-            *features,
-            "--calibrate-features",
-            str(two_laps_features),
-            "--save",
-            str(tmp_path / "d.npz"),
-            "--out",
-            str(tmp_path),
-        ]
-    )
-    assert code == 0
+    first = ["detect", str(two_laps), "--stop", "30", "--threshold", "-0.2", "--exclude-recent", "10", *features]
+    assert main([*first, "--save", str(tmp_path / "d.npz"), "--out", str(tmp_path)]) == 0
     assert "10 loops in 30 frames" in capsys.readouterr().out
     again = ["detect", str(two_laps), "--start", "30", "--resume", str(tmp_path / "d.npz"), *features]
     assert main([*again, "--out", str(tmp_path)]) == 0
     assert "10 loops in 10 frames" in capsys.readouterr().out
     with (tmp_path / "loops.csv").open() as stream:
         assert [int(row["query_id"]) for row in csv.DictReader(stream)] == list(range(20, 40))
+
+
+def test_detect_chooses_by_itself(tmp_path, capsys):
+    """A drive that comes back: pictures that change slowly, the second time darker."""
+    rng = np.random.default_rng(0)
+    steps = rng.integers(0, 256, (126, 24, 32)).astype(np.float64)
+    road = [sum(steps[i + k] for k in range(6)) / 6 for i in range(120)]
+    frames = [*road, *(0.8 * image for image in road[20:100])]
+    (tmp_path / "drive").mkdir()
+    for i, image in enumerate(frames):
+        cv2.imwrite(str(tmp_path / "drive" / f"{i:03d}.png"), cv2.resize(image, (64, 48)))
+    line = ["detect", str(tmp_path / "drive"), "--exclude-recent", "20", "--out", str(tmp_path / "found")]
+    assert main([*line, "--save", str(tmp_path / "d.npz")]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == 5
+    assert (tmp_path / "found" / "chosen.txt").read_text().splitlines() == printed[:4]
+    assert printed[0].startswith("sequences")
+    assert printed[1].startswith("verification: ")
+    assert "best score" in printed[3]
+    with (tmp_path / "found" / "loops.csv").open() as stream:
+        loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
+    assert len(loops) > 60
+    assert all(abs(query - 100 - match) <= 5 for query, match in loops)
+    resumed = ["detect", str(tmp_path / "drive"), "--resume", str(tmp_path / "d.npz"), "--out", str(tmp_path / "again")]
+    assert main(resumed) == 0
 
 
 def test_similarity(two_laps_features, tmp_path, capsys):
@@ -230,9 +238,9 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
         ("detect LAPS --threshold 1 --with width --out OUT", "expected KEY=VALUE"),
         ("detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT", "--with belongs to --describe"),
         ("detect LAPS --resume OUT --metric cosine --out OUT", "leave out others"),
-        ("detect LAPS --threshold 1 --precision 0.9 --out OUT", "--precision means nothing without --calibrate"),
+        ("detect LAPS --top-k 3 --out OUT", "--top-k means nothing without --threshold"),
+        ("detect LAPS --verify --out OUT", "--verify means nothing without --threshold"),
         ("detect LAPS --threshold 1 --min-inliers 9 --out OUT", "--min-inliers means nothing without --verify"),
-        ("detect LAPS --calibrate LAPS --features FEATURES --out OUT", "needs --calibrate-features"),
         ("similarity FEATURES --exclude-frames 3 --out OUT", "belongs to --top-k"),
         ("similarity FEATURES --references FEATURES --top-k 1 --exclude-frames 3 --out OUT", "one sequence"),
     ],
@@ -261,7 +269,9 @@ def test_names_that_are_not_utf8_are_escaped(two_laps, tmp_path):
     assert main(["compare", *reports, "--out", str(out / "page\udce9.html")]) == 0
 
 
-@pytest.mark.parametrize("line", ["", "evaluate", "detect x --out y", "evaluate --camera front"])
+@pytest.mark.parametrize(
+    "line", ["", "evaluate", "detect x --threshold 1 --precision 0.9 --out y", "evaluate --camera front"]
+)
 def test_wrong_usage_is_status_2(line, capsys):
     assert main(line.split()) == 2
     assert "usage: loopclosure" in capsys.readouterr().err

@@ -127,6 +127,7 @@ def test_every_name_of_the_registry_is_there(name):
         "features": ":a.npz",
         "describe": ":a.py:function",
         "verified": "+thumbnails",
+        "auto": "+thumbnails",
         "detector": ":a.npz:threshold=-1",
     }
     assert make_method(name + needed.get(name, "")).name

@@ -275,15 +275,19 @@ def test_evaluate_says_what_is_wrong_in_one_line(two_laps, files, capsys):
     assert "laps.npz: 40 of 40 test images are training images too" in line
 
 
-def test_detect(two_laps, files, tmp_path, capsys):
-    features = ["--features", str(files / "laps.npz"), "--calibrate-features", str(files / "laps.npz")]
-    words = ["detect", str(two_laps), *features, "--exclude-recent", "10", "--calibrate", str(two_laps)]
-    assert main([*words, "--out", str(tmp_path)]) == 1
-    assert "no threshold reaches a precision" in capsys.readouterr().err
-    assert main([*words, "--whiten", str(files / "other.npz"), "--out", str(tmp_path)]) == 0
-    with (tmp_path / "loops.csv").open() as stream:
-        loops = {int(row["query_id"]): int(row["match_id"]) for row in csv.DictReader(stream)}
-    assert loops == {i: i - PLACES for i in range(PLACES, 2 * PLACES)}
+def test_detect(two_laps, files, tmp_path):
+    words = ["detect", str(two_laps), "--features", str(files / "laps.npz"), "--exclude-recent", "10"]
+    words += ["--threshold", "-0.9", "--out", str(tmp_path)]
+
+    def right():
+        with (tmp_path / "loops.csv").open() as stream:
+            loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
+        return len(loops) >= PLACES - 2 and all(query - match == PLACES for query, match in loops)
+
+    assert main(words) == 0
+    assert not right()
+    assert main([*words, "--whiten", str(files / "other.npz")]) == 0
+    assert right()
 
 
 def test_detect_whitens_what_describe_returns(two_laps, tmp_path, capsys):

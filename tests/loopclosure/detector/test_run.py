@@ -10,7 +10,6 @@ from loopclosure.descriptors.feature_file import Features, read_features
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import (
     Recording,
-    calibrate_on_data_set,
     from_poses,
     judged_by_poses,
     load_describe,
@@ -19,7 +18,6 @@ from loopclosure.detector.run import (
 )
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import load_tum
 from loopclosure.places.frames import Selection
 
 
@@ -78,16 +76,6 @@ def test_video(tmp_path):
         run_detector(detector, recording, Features(tmp_path / "f.npz", np.zeros((1, 2))))
     with pytest.raises(InputError, match="no such video"):
         open_recording(tmp_path / "gone.mp4")
-
-
-def test_calibration_on_a_sequence(two_laps, two_laps_features):
-    detector = LoopDetector(small, exclude_recent=10, metric="cosine")
-    sentence = calibrate_on_data_set(detector, load_tum(two_laps), precision=1.0)
-    assert "two_laps precision at least 1 at recall 1.000 of the 20 frames" in sentence
-    assert len(detector) == 0
-    assert detector.settings.threshold is not None
-    results = run_detector(detector, open_recording(two_laps))
-    assert [r.accepted for r in results] == [None] * 20 + list(range(20))
 
 
 def test_describe_by_name(tmp_path, monkeypatch):

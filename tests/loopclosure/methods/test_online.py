@@ -18,27 +18,23 @@ def test_it_scores_only_what_it_accepts(two_laps, two_laps_features):
     assert np.argwhere(np.isfinite(outcome.scores)).tolist() == [[i, i - 20] for i in range(22, 40)]
     assert outcome.best.precision.tolist() == [1.0] * len(outcome.best.precision)
     assert outcome.measures["best match of each query"]["recall at 100 % precision"] == pytest.approx(18 / 20)
-    assert any(note.startswith("frames: 10 no candidate") for note in outcome.notes)
+    assert outcome.answer.startswith("frames: 10 no candidate")
+    assert "best score" in outcome.answer
+    assert "precision 1.000, recall 0.900" in outcome.answer
 
 
-def test_its_threshold_is_calibrated_and_candidates_verified(two_laps, two_laps_features):
-    settings = f"calibrate={two_laps},calibrate_features={two_laps_features},verify=yes,inliers=500,max_features=500"
-    method = make_method(f"detector:{two_laps_features}:{settings}", MethodContext(9))
-    images = load_tum(two_laps).query_images
-    result = method.score(Images(images), silent)
+def test_without_a_threshold_its_candidates_are_verified(two_laps, two_laps_features):
+    method = make_method(f"detector:{two_laps_features}:verify=yes,inliers=500", MethodContext(9))
+    result = method.score(Images(load_tum(two_laps).query_images), silent)
     assert not np.isfinite(result.scores).any()
-    assert result.notes[0].startswith("threshold -")
-    assert "20 not verified" in result.notes[1]
-    assert result.training_stages == ("calibration",)
+    assert "30 not verified" in result.answer
 
 
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("detector", "expected detector:FILE.npz:threshold=T"),
-        ("detector:a.npz", "either threshold=T or calibrate=SEQUENCE"),
-        ("detector:a.npz:threshold=1,calibrate=b", "either threshold=T or calibrate=SEQUENCE"),
-        ("detector:a.npz:calibrate=b", "needs calibrate_features"),
+        ("detector", "expected detector:FILE.npz, or"),
+        ("detector:a.npz:calibrate=b", 'has no setting "calibrate=b"'),
         ("detector:a.npz:threshold=-1,top_k=0", "top_k is 0"),
         ("detector+thumbnails", "works on images, not on the scores"),
     ],

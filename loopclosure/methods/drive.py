@@ -1,0 +1,63 @@
+"""The loops of a whole drive, chosen without settings: what ``loopclosure detect`` does."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loopclosure.descriptors.feature_file import Features
+from loopclosure.descriptors.similarity import similarity_matrix
+from loopclosure.detector.detector import LoopDetector, LoopResult
+from loopclosure.detector.run import Recording, run_detector
+from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
+from loopclosure.methods.auto import PRECISION, Answer, answer
+from loopclosure.places.frames import gray, read_gray
+from loopclosure.places.truth import Exclusion
+from loopclosure.progress import Progress, silent
+
+
+def whole_drive(
+    detector: LoopDetector,
+    recording: Recording,
+    features: Features | None = None,
+    precision: float = PRECISION,
+    progress: Progress = silent,
+) -> tuple[list[LoopResult], Answer]:
+    """Add every frame of a recording to a new detector, then decide with all of them in view which close loops.
+
+    The detector gets these loops, and for frames to come the least threshold that accepts none of this drive's others.
+    """
+    run_detector(detector, recording, features, progress)
+    settings, rows = detector.settings, detector.descriptors
+    scores = similarity_matrix(rows, None, settings.metric, settings.views)
+    numbers = np.arange(len(rows))
+    exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
+    allowed = np.tri(len(rows), k=-1, dtype=bool)
+    allowed &= ~exclusion.excludes(numbers, numbers, detector.stamps, detector.stamps)
+    check, pairs = GeometricCheck(), Pairs(lambda number: read_gray((recording.images or [])[number]))
+
+    def agree(query: int, reference: int) -> Agreement:
+        if recording.images is None and not pairs:
+            for number, (image, _) in enumerate(progress(recording.frames(), "local features", len(recording))):
+                pairs.put(check, number, gray(image))
+        return pairs.agreement(check, query, reference)
+
+    found = answer(scores, allowed, False, precision, check, agree, progress)
+    single = np.where(allowed, scores, -np.inf).max(axis=1)
+    others = float(np.max(single[~found.accepted], initial=-np.inf))
+    above = single[found.accepted & (single > others)]
+    results = [_result(found, i, float(stamp)) for i, stamp in enumerate(detector.stamps)]
+    detector.decided([result for result in results if result.accepted is not None], above.min() if len(above) else None)
+    return results, found
+
+
+def _result(found: Answer, query: int, stamp: float) -> LoopResult:
+    match, score, inliers = int(found.match[query]), float(found.score[query]), int(found.inliers[query])
+    return LoopResult(
+        query,
+        [(match, score)] if match >= 0 else [],
+        match if found.accepted[query] else None,
+        found.verdicts[query],
+        score,
+        inliers if inliers >= 0 else None,
+        None if np.isnan(stamp) else stamp,
+    )
