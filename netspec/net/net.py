@@ -105,11 +105,18 @@ class Net(torch.nn.Module):
             v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
         ]
         self.programs = Programs(self, options.passes) if self.phase == TEST and options.passes else None
+        self._training: TrainingStep | str | None = None  # made at the first pass
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what was prepared from it."""
         prepared = self.programs and Programs(self, self.programs.passes)
-        return {**super().__getstate__(), "programs": prepared, "_segments": {}, "_passing": _Passing()}
+        return {
+            **super().__getstate__(),
+            "programs": prepared,
+            "_segments": {},
+            "_training": None,
+            "_passing": _Passing(),
+        }
 
     # Building
 
@@ -340,6 +347,21 @@ class Net(torch.nn.Module):
         self._keep_blobs({self.plan.blobs[v]: values[v] for v in sorted(kept)})
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
+
+    def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]] | None:
+        """Run forward and backward by kernels prepared once; return the loss and the outputs, as forward_loss does.
+
+        Gradients are added to ``grad``. None where autograd must do it: see :meth:`training_step`, or where hooks or
+        ``keep`` look at the pass. The loss is good until the next call.
+        """
+        if self._training is None:
+            self._training = self.training_step()
+        if isinstance(self._training, str) or self.keep or self._training.is_watched():
+            return None
+        with self._passing.lock:
+            loss, outputs = self._training.run()
+            self._keep_blobs(outputs)
+        return loss, outputs
 
     def training_step(self) -> TrainingStep | str:
         """Return what trains the net by kernels prepared once, or in words why there is none."""

@@ -19,7 +19,6 @@ from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
 from netspec.process.heap import keep_freed_memory
 from netspec.proto.text import parse_solver
-from netspec.run.training import TrainingStep
 from netspec.solver import update
 from netspec.solver.checks import check_prefix
 from netspec.solver.extra import read_extra
@@ -100,7 +99,6 @@ class Solver(Tested):
     _displayed = (0.0, 0)
     _waited = 0.0
     _overflowed = False
-    _prepared: TrainingStep | str | None = None  # what trains, or why there is none
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
@@ -202,12 +200,8 @@ class Solver(Tested):
 
     def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the training net forward and backward; return its loss and outputs."""
-        if self._prepared is None:
-            self._prepared = self.net.training_step() if self.options.precision == FP32 else "its precision is not fp32"
-        if isinstance(self._prepared, TrainingStep) and not self.net.keep and not self._prepared.is_watched():
-            loss, outputs = self._prepared.run()
-            self.net.__dict__["blobs"] = outputs  # a module's own way of setting is slow
-            return loss, outputs
+        if self.options.precision == FP32 and (passed := self.net.train_pass()):
+            return passed
         with computing(self.options.precision, self.device):
             loss, outputs = self.net.forward_loss()
         if loss.requires_grad:

@@ -67,7 +67,7 @@ def made(folder: Path, net: str, exact: str = "small", more: str = "") -> Solver
 
 
 def is_prepared(solver: Solver) -> bool:
-    return isinstance(solver._prepared, TrainingStep)
+    return isinstance(solver.net._training, TrainingStep)
 
 
 @pytest.mark.parametrize("more", ["momentum: 0.9", 'type: "Adam" iter_size: 2', 'type: "AdaGrad" clip_gradients: 0.1'])
@@ -78,7 +78,7 @@ def test_trains_as_autograd_does(tmp_path: Path, net: str, exact: str, more: str
     for prepares in (False, True):
         solver = made(tmp_path, NETS[net], exact, more)
         if not prepares:
-            solver._prepared = "as by autograd"
+            solver.net._training = "as by autograd"
         losses = []
         solver.on_iteration = lambda losses=losses, solver=solver: losses.append(solver.loss)
         solver.step(4)
@@ -125,7 +125,7 @@ def test_follows_what_is_done_to_the_weights(tmp_path: Path) -> None:
     for prepares in (False, True):
         solver = made(tmp_path, TYPICAL, more="momentum: 0.9")
         if not prepares:
-            solver._prepared = "as by autograd"
+            solver.net._training = "as by autograd"
         convolution, inner, *_ = (layer for layer in solver.net.layers if len(layer.blobs))
         solver.step(2)
         with torch.no_grad():
@@ -145,4 +145,4 @@ def test_says_why_it_is_not_prepared(tmp_path: Path) -> None:
     rows = "".join(f'layer {{ name: "{t}" type: "{t}" bottom: "x" top: "x" }}\n' for t in ("BatchNorm", "Scale"))
     solver = made(tmp_path, TYPICAL.replace('layer { name: "c"', f'{rows}layer {{ name: "c"'))
     solver.step(1)
-    assert solver._prepared == '"BatchNorm" runs together with the layers after it'
+    assert solver.net._training == '"BatchNorm" runs together with the layers after it'
