@@ -23,7 +23,6 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-import cv2
 import numpy as np
 
 from lmdb_build.pairs.list_file import read_pair_list
@@ -33,6 +32,7 @@ from netspec.data.datum import array_to_datum, decode_image, encoded_datum, time
 from netspec.data.images import read_image, read_image_list
 from netspec.data.random_words import permutation
 from netspec.errors import SpecError, Where
+from netspec.files.opencv import cv2
 from netspec.terminal import log
 
 S = TypeVar("S")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from loopclosure.places.frames import write_picture
+from netspec.files.opencv import cv2
 
 JPEG_QUALITY = 95
 DEPTH_PER_M = 5000

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +22,7 @@ from lmdb_build.picture import CORNERS, seen_through, write_jpeg
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
 from loopclosure.progress import Progress, silent
+from netspec.files.opencv import cv2
 
 # What changes between two views, drawn for each view.
 ZOOM = 2.0  # the part that is seen has 1 to 1/2 of the image's height

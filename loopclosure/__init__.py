@@ -3,24 +3,18 @@
 ``LoopDetector`` is loaded when it is first used, so that reading a trajectory loads nothing else.
 """
 
-from __future__ import annotations
-
-import os
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from loopclosure.detector.detector import LoopDetector, LoopResult
 
 __all__ = ["LoopDetector", "LoopResult"]
 
-# The most pixels of an image, which is read when OpenCV is loaded: a small file may unpack to gigabytes.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
-
-
 __path__.append(f"{__path__[0]}/moved")  # loopclosure.baselines, a former name
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name in __all__:
         from loopclosure.detector import detector
 

@@ -1,15 +1,9 @@
 """netspec, the living Caffe: runs Caffe's prototxt in PyTorch, unmodified, with Caffe's numbers.
 
 The public names are loaded when they are first used, so that ``import netspec.proto.text`` needs no torch. Nothing is
-imported here that takes time: until this is done a program cannot answer signals (netspec/terminal/main.py).
+imported here: until this is done a program cannot answer signals (netspec/terminal/main.py), and ``python -m netspec``
+still looks for modules in the working directory first (netspec/__main__.py).
 """
-
-from __future__ import annotations
-
-import os
-
-from netspec.process import waiting
-from netspec.proto.dialect.folders import FOLDERS
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -22,11 +16,6 @@ if TYPE_CHECKING:
     from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights
     from netspec.solver.solver import Solver, load_solver
-
-waiting.sleep_soon()  # before torch is loaded
-
-# The most pixels of an image, which is read when OpenCV is loaded: a small file may unpack to gigabytes.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
 
 _HOMES = {
     "SpecError": "netspec.errors",
@@ -67,11 +56,10 @@ def unload_ipython_extension(ipython: object) -> None:
     finder.uninstall()
 
 
-FOLDERS.append((f"{__path__[0]}/dialects", "netspec.dialects"))  # here, so that errors can name them
 __path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the names they had before
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     import importlib.util
 
     if name == "__version__":

@@ -1,8 +1,14 @@
 """The program ``netspec``, and ``python -m netspec``."""
 
+import os
 import sys
 
-from netspec.terminal.main import program
+# python -m puts the working directory first, where a file may be called torch.py; the package itself may lie there.
+HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+if __name__ == "__main__" and sys.path[:1] == [os.getcwd()] != [HERE] and not getattr(sys.flags, "safe_path", False):
+    del sys.path[0]
+
+from netspec.terminal.main import program  # noqa: E402
 
 
 def main() -> int:

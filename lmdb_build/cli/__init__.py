@@ -6,9 +6,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-import cv2
-
 from lmdb_build.cli import compare, convert, lists, pairs, views, walk
+from netspec.files.opencv import cv2
 from netspec.terminal.commands import Commands, program, run
 
 _FAMILIES = (walk, pairs, views, lists, convert, compare)

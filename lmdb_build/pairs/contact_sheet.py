@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +12,7 @@ from lmdb_build.pairs.list_file import ListedPair, read_pair_list
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
 from netspec.errors import SpecError
+from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_file
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 240, 180

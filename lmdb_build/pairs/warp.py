@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.picture import CORNERS, seen_through, write_jpeg
 from loopclosure.places.frames import read_bgr
+from netspec.files.opencv import cv2
 
 # Each corner of the crop is moved inward by up to this share of the picture's width and height. That crops, scales (to
 # at least 0.6), shifts, rotates and changes the perspective, without a black border.

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.walk import textures as paint
 from lmdb_build.walk.furniture import THEMES, Box, Piece, Theme
 from lmdb_build.walk.textures import PIXELS_PER_METRE, Image, Texture
+from netspec.files.opencv import cv2
 
 Vector = NDArray[np.float64]
 Glow = Literal["daylight", "lamp"] | None

@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.walk.house import HEIGHT_M, House, Quad, Room
 from lmdb_build.walk.textures import Image
+from netspec.files.opencv import cv2
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from lmdb_build.walk.house import House, Quad
 from lmdb_build.walk.textures import Image
+from netspec.files.opencv import cv2
 
 REPAINTED = 0.5  # share of the rooms whose walls, floor and ceiling get another hue
 REPAINT_TURNS = 0.5  # by at most this share of the color circle; everything else by at most FADE_TURNS

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +33,7 @@ from loopclosure.places.trajectory import (
     write_groundtruth,
     write_rgb_list,
 )
+from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_file
 
 Array = NDArray[np.float64]

@@ -10,9 +10,10 @@ import colorsys
 from collections.abc import Callable
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from netspec.files.opencv import cv2
 
 Image = NDArray[Any]  # (H, W, 3) uint8, BGR; OpenCV does not declare its type
 Colour = tuple[float, float, float]

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from loopclosure.closing.relative import LEAST_INLIERS, Relative, View, relative_view
@@ -19,6 +18,7 @@ from loopclosure.places.frames import read_bgr, read_pixels
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.sequences import ImageSequence
 from loopclosure.progress import Progress, silent
+from netspec.files.opencv import cv2
 
 CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS)
 DEPTH_PER_M = 5000  # TUM RGB-D: 16-bit values per meter, 0 = not known

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.detector.verification import LocalFeatures
 from loopclosure.places.intrinsics import Intrinsics
+from netspec.files.opencv import cv2
 
 METRIC, UP_TO_SCALE, ROTATION_ONLY = "metric", "up to scale", "rotation only"
 LEAST_INLIERS = 20

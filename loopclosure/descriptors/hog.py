@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from loopclosure.errors import InputError
 from loopclosure.places.frames import gray
+from netspec.files.opencv import cv2
 
 # Levels of gray whose histogram gives the entropy of a region; its greatest value is their logarithm.
 ENTROPY_LEVELS = 32

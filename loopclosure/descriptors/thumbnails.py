@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import InitVar, dataclass
 
-import cv2
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from loopclosure.errors import InputError
 from loopclosure.places.frames import gray
+from netspec.files.opencv import cv2
 
 # Standard deviation in gray values below which a patch counts as uniform; rounding can make it slightly positive.
 UNIFORM = 1e-6

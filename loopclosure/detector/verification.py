@@ -19,10 +19,10 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
+from netspec.files.opencv import cv2
 
 # Fewer matches prove nothing: any seven have a fundamental matrix.
 LEAST_MATCHES = 8

@@ -7,13 +7,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
 from netspec.errors import SpecError
+from netspec.files.opencv import cv2
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 POSES = (

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
@@ -19,6 +18,7 @@ from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_pl
 from loopclosure.places.sequences import ImageSequence, posed, read_sequence
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
+from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_file
 
 # Ten seconds are common for TUM's 30 Hz sequences; the other sets have no time.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
@@ -15,6 +14,7 @@ from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.pose_files import DIRECTIONS, FORMS, ORDERS
 from loopclosure.places.trajectory import Frame, Trajectory, write_groundtruth, write_rgb_list
 from loopclosure.progress import Progress, silent
+from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_folder
 
 MADE_FROM = "source.txt"

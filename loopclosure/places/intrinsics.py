@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from loopclosure.errors import InputError
+from netspec.files.opencv import cv2
 
 FORM = "FX,FY,CX,CY or FX,FY,CX,CY,K1,K2,P1,P2 or FX,FY,CX,CY,K1,K2,P1,P2,K3"
 

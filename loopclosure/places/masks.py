@@ -6,7 +6,6 @@ import csv
 import os
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from loopclosure.arrays import read_lists, read_npy
@@ -14,6 +13,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import read_pixels
 from loopclosure.places.mat_file import read_mat
 from netspec.errors import SpecError
+from netspec.files.opencv import cv2
 
 # The FAB-MAP sets call it truth; several papers' derived files GT.
 TRUTH_KEYS = ("truth", "gt", "groundtruth", "ground_truth")

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,7 @@ from loopclosure.places.frames import read_pixels
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.same_place import distances_m, view_angles_deg
 from loopclosure.places.trajectory import Poses, rotation_matrices
+from netspec.files.opencv import cv2
 
 ASSUMED_M = (2.0, 4.0, 8.0)
 FOV_DEG = 60.0  # of a camera that is not known

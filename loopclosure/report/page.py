@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
@@ -24,6 +23,7 @@ from loopclosure.places.trajectory import Poses
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import plots
 from loopclosure.report.files import EXPLANATION, SOFT_MEASURES, share, write_files
+from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_file
 
 PAIRS_SHOWN = 4

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 
 from loopclosure.descriptors.similarity import squared_distances
 from loopclosure.errors import InputError
 from loopclosure.places.frames import gray
+from netspec.files.opencv import cv2
 
 # Rows at a time where a matrix of distances to all centers is needed: 4096 x 5000 words are 80 MB.
 BLOCK_ROWS = 4096

@@ -46,8 +46,11 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from netspec.process.heap import keep_freed_memory
     from netspec.scripts.program import Options, run_module, run_script
     from netspec.scripts.sources import write_translation
+
+    keep_freed_memory()  # most scripts train
 
     if not arguments.program:
         raise WrongUsage("the following arguments are required: SCRIPT, or -m MODULE")

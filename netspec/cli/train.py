@@ -133,8 +133,10 @@ def _as_caffe() -> bool:
 
 def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | None], processes: Processes) -> Solver:
     """Return the solver, resumed where that is asked for."""
+    from netspec.process.heap import keep_freed_memory
     from netspec.solver.solver import load_solver
 
+    keep_freed_memory()
     if arguments.resume and (found := _newest(path)):
         arguments.snapshot, arguments.weights = str(found), None
     solver = load_solver(

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 from google.protobuf.message import DecodeError
 
 from netspec.files.lfs import pointer_fault
+from netspec.files.opencv import cv2
 from netspec.files.png import is_cut_png
 from netspec.proto.schema import Datum
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from netspec.data.datum import decode_pixels, planar
 from netspec.errors import SpecError, Where
 from netspec.files.limits import read_bytes
+from netspec.files.opencv import cv2
 
 
 @dataclass(frozen=True)

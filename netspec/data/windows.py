@@ -12,7 +12,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from netspec.data.datum import decode_pixels, planar
@@ -22,6 +21,7 @@ from netspec.data.sources import Arrays, Cursor, Shape
 from netspec.data.transformer import mean_contradictions
 from netspec.errors import SpecError, Where
 from netspec.files.limits import read_bytes
+from netspec.files.opencv import cv2
 from netspec.terminal import log
 
 CHANNELS = 3  # images are always read in color

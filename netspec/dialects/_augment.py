@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from random import Random
 from typing import Any
 
-import cv2
 import numpy as np
 
 from netspec.data.datum import planar, times
@@ -20,6 +19,7 @@ from netspec.data.mean import read_mean
 from netspec.data.transformer import contradictions
 from netspec.dialects._boxes import Array, coverage, overlaps, sizes
 from netspec.errors import SpecError, Where
+from netspec.files.opencv import cv2
 from netspec.layers.base import Shape
 from netspec.proto.schema import TRAIN, has, value
 

@@ -12,7 +12,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from typing_extensions import override
@@ -20,6 +19,7 @@ from typing_extensions import override
 from netspec.data.images import read_image
 from netspec.dialects._boxes import Array, as_array
 from netspec.dialects._proposals import all_anchors, base_anchors
+from netspec.files.opencv import cv2
 from netspec.layers.base import Layer, Shape
 
 RATIOS, SCALES = (0.5, 1, 2), (8, 16, 32)

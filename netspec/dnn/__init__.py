@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
-from cv2 import dnn as _opencv  # held here, so that a program may say ``cv2.dnn = dnn``
-
 from netspec.dnn.errors import DnnError
 from netspec.dnn.models import ClassificationModel, DetectionModel, Model, SegmentationModel
 from netspec.dnn.net import Layer, Net
 from netspec.dnn.read import readNet, readNetFromCaffe
 from netspec.dnn.shrink import shrinkCaffeModel
+from netspec.files.opencv import cv2
+from netspec.files.opencv import dnn as _opencv  # held here, so that a program may say ``cv2.dnn = dnn``
 
 __all__ = [
     "ClassificationModel",

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import cv2
-
 from netspec.errors import SpecError, Where
+from netspec.files.opencv import cv2
 
 # Codes of cv::Error (opencv2/core/base.hpp)
 UNSPECIFIED, BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED = -2, -5, -204, -213

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from cv2 import dnn as opencv
 
 from netspec.dnn.errors import BAD_ARGUMENT, DnnError
 from netspec.dnn.read import readNet
+from netspec.files.opencv import dnn as opencv
 
 Array = np.ndarray
 

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
@@ -20,6 +19,7 @@ from netspec.dnn.costs import operations
 from netspec.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, DnnError, as_dnn_error
 from netspec.dnn.table import INPUT, Entry, graph_of, make_table, nodes_of, unconnected
 from netspec.errors import Where, did_you_mean
+from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_file
 from netspec.layers.base import Layer as CaffeLayer
 from netspec.layers.base import Shape

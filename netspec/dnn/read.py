@@ -6,11 +6,10 @@ import os
 from pathlib import PurePath
 from typing import Any
 
-from cv2 import dnn as opencv
-
 from netspec.dnn.caffe_files import FileOrBytes, read_files
 from netspec.dnn.errors import as_dnn_error
 from netspec.dnn.net import Net
+from netspec.files.opencv import dnn as opencv
 
 _CAFFE = (".prototxt", ".caffemodel", ".caffemodel.h5")
 

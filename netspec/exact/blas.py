@@ -6,7 +6,6 @@ Caffe: src/caffe/util/math_functions.cpp
 from __future__ import annotations
 
 import ctypes
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -16,6 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 from threadpoolctl import ThreadpoolController
+
+from netspec.process.environment import environment
 
 CAFFES = "SkylakeX"  # OpenBLAS' name of its kernels for AVX-512, with which the golden files were computed
 CORE_TYPE = "OPENBLAS_CORETYPE"  # the environment variable by which OpenBLAS chooses its kernels, when it is loaded
@@ -28,14 +29,8 @@ def _library(name: str) -> Any:
     OpenBLAS chooses others on some newer CPUs. What the environment says stays; if SciPy's BLAS was loaded before, so
     do its kernels. Loading takes half a second, for which nets without exact sums need not wait.
     """
-    chosen = CORE_TYPE not in os.environ and torch.backends.cpu.get_cpu_capability() == "AVX512"
-    if chosen:
-        os.environ[CORE_TYPE] = CAFFES
-    try:
+    with environment({CORE_TYPE: CAFFES} if torch.backends.cpu.get_cpu_capability() == "AVX512" else {}):
         return import_module(f"scipy.linalg.{name}")
-    finally:
-        if chosen:
-            del os.environ[CORE_TYPE]
 
 
 _IN_DOUBLE = 32  # OpenBLAS' dot sums up fewer products than this in double, one by one

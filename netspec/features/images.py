@@ -7,7 +7,6 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 from netspec.data.blobs import Shape
@@ -20,6 +19,7 @@ from netspec.exact import SMALL
 from netspec.features.scaling import Steps, scaling_of
 from netspec.features.views import middle
 from netspec.files.image_list import ImageList
+from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.prune import prune
 from netspec.graph.steps import PASSES

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from netspec.data.records import open_records
 from netspec.errors import SpecError, Where
 from netspec.features.images import read_pixels
 from netspec.files.image_list import list_images
+from netspec.files.opencv import cv2
 
 SIDE = 112  # pixels on the longer side
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 
-import cv2
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
 from netspec.data.datum import times
+from netspec.files.opencv import cv2
 from netspec.pictures.style import COLORS, PALE, STYLE
 from netspec.pictures.tiles import split
 from netspec.terminal.log import number

@@ -17,7 +17,6 @@ import torch
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
-from netspec.process.heap import keep_freed_memory
 from netspec.proto.text import parse_solver
 from netspec.solver import update
 from netspec.solver.checks import check_prefix
@@ -135,7 +134,6 @@ class Solver(Tested):
         Raises SpecError if a net has inputs: a solver cannot fill them.
         """
         self.check_inputs()
-        keep_freed_memory()
         self.stopped = False
         self.replicas.begin()
         self.losses.clear()

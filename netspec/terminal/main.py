@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 
+from netspec.process.programs import set_up
+
 
 def program(module: str, words: Sequence[str] | None = None) -> int:
     """Run the command line of a module, and return its exit status.
@@ -28,6 +30,7 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
             sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")
+        set_up()
         return _written(import_module(module).main(words))
     finally:
         for number in ours:

@@ -1,6 +1,5 @@
-"""Folders whose .py files are dialects, as (folder, package); packages add their own.
+"""Folders whose .py files are dialects, as (folder, package)."""
 
-This module imports nothing, so that adding a folder is fast.
-"""
+import os.path
 
-FOLDERS: list[tuple[str, str]] = []
+FOLDERS = [(os.path.abspath(f"{__file__}/../../../dialects"), "netspec.dialects")]
