@@ -194,7 +194,7 @@ def _net(folder: Path) -> None:
         "--blob feat --images OTHER_IMAGES --out others.npz",
     )
     for name, method in (("A", "thumbnails"), ("B", "hog")):
-        _run(folder, f"loopclosure evaluate --tum SEQUENCE --method {method} --out {name}")
+        _run(folder, f"loopclosure evaluate SEQUENCE --method {method} --out {name}")
 
 
 def _layouts(folder: Path) -> None:

@@ -27,7 +27,7 @@ def test_the_words_net_is_ahead_of_thumbnails_on_an_unseen_walk(tmp_path: Path, 
     net = ["--model", str(NETS / name / "deploy.prototxt"), "--weights", files, "--strict"]
     assert netspec(["extract", *net, "--blob", "feat", "--images", str(walk), "--out", str(features)]) == 0
     methods = ["--method", "thumbnails", "--method", f"words=features:{features}"]
-    assert loopclosure(["evaluate", "--tum", str(walk), "--exclude-seconds", "5", *methods, "--out", str(out)]) == 0
+    assert loopclosure(["evaluate", str(walk), "--exclude-seconds", "5", *methods, "--out", str(out)]) == 0
     found = json.loads((out / "report.json").read_text())
     precision = {method["name"]: method["figures"]["all pairs"]["average precision"] for method in found["methods"]}
     assert precision["words"] > precision["thumbnails"] + 0.2

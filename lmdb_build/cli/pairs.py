@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from lmdb_build.cli.bar import bar
@@ -21,69 +22,68 @@ from lmdb_build.pairs.by_list import (
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
 from loopclosure.descriptors.feature_file import read_features
+from loopclosure.errors import InputError
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
-from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_posed
+from loopclosure.places.source import POSES, TOPICS, Source, read_source
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
-from netspec.terminal.commands import Commands, WrongUsage
+from netspec.terminal.commands import Commands, WrongUsage, refuse
 from netspec.terminal.options import above_zero, seed
+
+SEQUENCES = ("", *LAYOUTS)
+KINDS = {
+    "": (*POSES, *TOPICS, "truth", "camera"),
+    **dict.fromkeys(LAYOUTS, (*POSES, *TOPICS)),
+    "images": (*POSES, "truth", "camera"),
+    "traverses": ("references", "truth"),
+    "nordland": (),
+    "folders": ("references",),
+    "table": ("group", "index"),
+    "index": ("group", "track", "time", "max-gap"),
+    "singles": (),
+}
+NEEDED = {
+    "images": ("truth",),
+    "traverses": ("references", "truth"),
+    "folders": ("references",),
+    "index": ("group", "track", "time"),
+}
+HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]...
+
+Sequences with poses, several of them (KIND is seen from the files, or named):
+{chr(10).join(f"  {kind + ':':11} {what.replace('--', '')}" for kind, what in LAYOUTS.items())}
+  with poses=FILE, {POSES_HELP},
+  and pose-form: {POSE_FORM_HELP.replace("--", "")}; topic, pose-topic: of a bag that has several
+Or one of these:
+  images:     images in natural order, truth=MASK of loops (.mat .npy .txt or image), camera={"|".join(CAMERAS)}
+  traverses:  queries, references=FOLDER, truth=MASK or ground_truth*.npy
+  nordland:   query/, ref/, ground_truth*.npy: VPR benchmarks
+  folders:    a folder, references=FOLDER: equal names are the same place
+  table:      a CSV of positives, two columns of image names; group=COLUMN names the place; index=CSV of groups
+  index:      a CSV of frames; group=COLUMN names the place, track=COLUMN the clip, time=COLUMN the position in it:
+              neighbors, at most max-gap (1) apart, are positives
+  singles:    a folder, each image a different place; positives are warped copies"""
+# Options that mean something only for sequences with poses.
+POSED = (
+    *("max_distance", "max_angle", "negatives", "clear_distance", "clear_view_angle", "same_scene", "same_frame"),
+    *("different_scenes", "max_difference"),
+)
 
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add("pairs", _pairs, "choose labeled pairs and write their lists")
     add = parser.add_argument
-    add("sequences", type=Path, nargs="*", metavar="SEQUENCE", help=f"pairs by pose: {', '.join(LAYOUTS.values())}")
+    parser.epilog, parser.formatter_class = HELP, argparse.RawDescriptionHelpFormatter
+    add("sources", type=_source_text, nargs="+", metavar="SOURCE", help="sequences with poses, or one other, see below")
     add("--out", type=Path, required=True, help="folder for train.txt, val.txt and test.txt")
     add("--root", type=Path, help="folder that the lists' names are relative to (the sources' common parent)")
-
-    posed = parser.add_argument_group("sequences with poses")
-    for layout, what in LAYOUTS.items():
-        about = f"a SEQUENCE that must be {what}; may be repeated"
-        posed.add_argument(f"--{layout}", type=Path, action="append", default=[], metavar="PATH", help=about)
-    posed.add_argument("--topic", default="", help="of the images of bags that have several")
-    posed.add_argument("--pose-topic", default="", metavar="TOPIC", help="of the poses of bags that have several")
-    posed.add_argument("--poses", type=Path, metavar="FILE", help=POSES_HELP)
-    posed.add_argument("--pose-form", default="", metavar="WORDS", help=POSE_FORM_HELP)
-
-    source = parser.add_argument_group("other sources, instead of sequences")
-    source.add_argument(
-        "--mask",
-        type=Path,
-        metavar="FILE",
-        help="a mask of loops (.mat, .npy, .txt, image) of --images or --traverses; of these also ground_truth*.npy",
-    )
-    source.add_argument("--traverses", type=Path, nargs=2, metavar=("QUERIES", "REFERENCES"), help="with --mask")
-    source.add_argument(
-        "--nordland", type=Path, metavar="FOLDER", help="query/, ref/, ground_truth*.npy: VPR benchmarks"
-    )
-    source.add_argument("--images", type=Path, metavar="FOLDER", help="the images of --mask, in natural order")
-    source.add_argument(
-        "--camera",
-        choices=CAMERAS,
-        default="all",
-        help="which images to use: FAB-MAP's data alternates left and right (all)",
-    )
-    source.add_argument("--folders", type=Path, nargs=2, metavar="FOLDER", help="equal names are the same place")
-    source.add_argument("--table", type=Path, metavar="CSV", help="positives: two columns of image names")
-    source.add_argument("--index", type=Path, metavar="CSV", help="a table of frames; with --table, of their groups")
-    source.add_argument(
-        "--group", metavar="COLUMN", help="column that names the place: images of different places are negatives"
-    )
-    source.add_argument("--track", metavar="COLUMN", help="column of --index that names the clip")
-    source.add_argument(
-        "--time", metavar="COLUMN", help="column of --index with the position in the clip: neighbors are positives"
-    )
-    source.add_argument("--max-gap", type=float, default=1.0, help="largest distance of such neighbors (1)")
-    source.add_argument(
-        "--singles", type=Path, metavar="FOLDER", help="each image is a different place; positives are warped copies"
-    )
 
     rule = parser.add_argument_group("what is the same place")
     rule.add_argument("--max-distance", type=above_zero, default=MAX_DISTANCE_M, help="meters; less is a positive (2)")
     rule.add_argument("--max-angle", type=above_zero, default=MAX_ANGLE_DEG, help="degrees; less is a positive (15)")
-    rule.add_argument("--min-gap", type=float, help="leave out pairs nearer in time: seconds (--mask: images) (0)")
+    rule.add_argument("--min-gap", type=float, help="leave out pairs nearer in time: seconds (images: frames) (0)")
     rule.add_argument("--negatives", choices=NEGATIVES, default="both", help="where negatives come from (both)")
     rule.add_argument("--clear-distance", type=float, metavar="M", help="negatives by pose are at least this far apart")
     rule.add_argument("--clear-view-angle", type=float, metavar="DEG", help="or their viewing axes are")
@@ -137,91 +137,90 @@ def _pairs(arguments: argparse.Namespace) -> None:
         at_most=arguments.at_most,
         features=read_features(arguments.hard_negatives) if arguments.hard_negatives else None,
         hard_share=arguments.hard_share,
-        warp_share=1.0 if arguments.singles else arguments.warp_share,
+        warp_share=1.0 if arguments.sources[0].kind == "singles" else arguments.warp_share,
     )
     lists = build_lists(source, plan, root, arguments.out, print, _warn, bar)
     print(f"wrote {', '.join(map(str, lists.values()))}; the names of images in them are relative to {root}/")
 
 
+def _source_text(text: str) -> Source:
+    try:
+        found = read_source(text, KINDS)
+    except InputError as fault:
+        raise argparse.ArgumentTypeError(str(fault)) from None
+    kind = found.kind or ("images" if "truth" in found.settings else "")
+    if kind == "images" and "poses" in found.settings:
+        kind = ""
+    for name in NEEDED.get(kind, ()):
+        if name not in found.settings:
+            raise argparse.ArgumentTypeError(f"{text} needs ,{name}=...")
+    return replace(found, kind=kind)
+
+
 def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
-    """Open the one source that is named; return it and the root folder."""
-    sequences = _sequences(arguments)
-    kinds = ("mask", "traverses", "nordland", "folders", "table", "singles")
-    given = ["sequences"] if sequences else []
-    given += [kind for kind in kinds if getattr(arguments, kind)]
-    if arguments.index and "table" not in given:
-        given.append("index")
-    if "traverses" in given and "mask" in given:
-        given.remove("mask")
-    if len(given) != 1:
-        raise WrongUsage(
-            "name sequences or one of --mask, --traverses, --nordland, --folders, --table, --index, --singles"
-        )
-    kind = given[0]
-    if kind == "mask" and not arguments.images:
-        raise WrongUsage("--mask needs --images or --traverses")
-    if kind == "traverses" and not arguments.mask:
-        raise WrongUsage(
-            "--traverses needs --mask, which says what shows the same place; --folders goes by equal names"
-        )
-    if kind == "index" and not (arguments.group and arguments.track and arguments.time):
-        raise WrongUsage("--index without --table needs --group, --track and --time")
-    places = {
-        "sequences": [folder.resolve().parent for _, folder in sequences],
-        "mask": [arguments.images],
-        "traverses": arguments.traverses,
-        "nordland": [arguments.nordland],
-        "folders": arguments.folders,
-        "table": [arguments.table.parent] if arguments.table else [],
-        "index": [arguments.index.parent] if arguments.index else [],
-        "singles": [arguments.singles],
-    }[kind]
-    warped = [arguments.out] if arguments.warp_share or arguments.singles else []
+    """Open the sources; return them as one, and the root folder."""
+    first, *others = arguments.sources
+    path, kind = first.path, first.kind
+    if (kind not in SEQUENCES and others) or any(each.kind not in SEQUENCES for each in others):
+        raise WrongUsage(f"{kind or 'sequences'}: only sequences may be several; name one source of another kind")
+    if kind not in SEQUENCES:
+        refuse(arguments, POSED, f"is for sequences with poses, not for {kind}")
+    sequences = _sequences(arguments) if kind in SEQUENCES else []
+    places = [folder.resolve().parent for _, folder, _ in sequences]
+    if kind not in SEQUENCES:
+        places = [path.parent if kind in ("table", "index") else path]
+        places += [other for other in (first.get("references", Path),) if other]
+    warped = [arguments.out] if arguments.warp_share or kind == "singles" else []
     root = arguments.root or Path(os.path.relpath(os.path.commonpath([str(p.resolve()) for p in [*places, *warped]])))
-    if kind == "sequences":
+    if sequences:
         return _pose_source(arguments, sequences, root), root
-    if kind == "traverses":
-        return TraverseSource(arguments.mask, arguments.traverses[0], arguments.traverses[1], root), root
-    if kind == "nordland":
-        queries, references, truth = benchmark_parts(arguments.nordland)
-        return TraverseSource(truth, queries, references, root), root
     min_gap = None if arguments.min_gap is None else int(arguments.min_gap)
-    if kind == "mask":
-        return MaskSource(arguments.mask, arguments.images, root, min_gap, arguments.camera), root
+    get = {name: first.get(name, str) for name in KINDS[kind]}
+    if kind in ("images", "traverses"):
+        truth = Path(str(get["truth"]))
+        if kind == "traverses":
+            return TraverseSource(truth, path, Path(str(get["references"])), root), root
+        return MaskSource(truth, path, root, min_gap, _camera(first)), root
+    if kind == "nordland":
+        queries, references, truth = benchmark_parts(path)
+        return TraverseSource(truth, queries, references, root), root
     if kind == "folders":
-        return folders_source(arguments.folders[0], arguments.folders[1], root, min_gap or 0), root
+        return folders_source(path, Path(str(get["references"])), root, min_gap or 0), root
     if kind == "table":
-        return table_source(arguments.table, root, arguments.group, arguments.index), root
+        return table_source(path, root, get["group"], first.get("index", Path)), root
     if kind == "index":
-        return index_source(
-            arguments.index, root, arguments.group, arguments.track, arguments.time, arguments.max_gap
-        ), root
-    return singles_source(arguments.singles, root), root
+        max_gap = first.get("max-gap", float)
+        columns = (str(get[name]) for name in ("group", "track", "time"))
+        return index_source(path, root, *columns, 1.0 if max_gap is None else max_gap), root
+    return singles_source(path, root), root
 
 
-def _sequences(arguments: argparse.Namespace) -> list[tuple[str, Path]]:
-    """Return layout and folder of every sequence that is named; bags and videos are extracted below --out."""
-    named = [("", path) for path in arguments.sequences]
-    named += [(layout, path) for layout in LAYOUTS for path in getattr(arguments, layout)]
-    if arguments.poses and len(named) != 1:
-        raise WrongUsage("--poses are those of one sequence; name one")
-    if arguments.pose_form and not arguments.poses:
-        raise WrongUsage("--pose-form means nothing without --poses")
+def _camera(source: Source) -> str:
+    camera = source.get("camera", str) or "all"
+    if camera not in CAMERAS:
+        raise WrongUsage(f'{source}: camera is "{camera}", expected {", ".join(CAMERAS)}')
+    return camera
+
+
+def _sequences(arguments: argparse.Namespace) -> list[tuple[str, Path, PoseChoice | None]]:
+    """Return layout, folder and poses of every sequence; bags and videos are extracted below --out."""
     found = []
-    for layout, path in named:
+    for source in arguments.sources:
+        path, layout, poses = source.path, source.kind, source.pose_choice()
         if layout in RECORDED or (not layout and is_recording(path)):
-            folder, said = extract(path, arguments.out / path.stem, arguments.topic, arguments.pose_topic, bar)
+            topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
+            path, said = extract(path, arguments.out / path.stem, *topics, bar)
             print(said)
-            found.append(("images" if arguments.poses else "tum", folder))
-        else:
-            found.append((layout or layout_of(path, "images" if arguments.poses else "tum"), path))
+            layout = "images" if poses else "tum"
+        found.append((layout or layout_of(path, "images" if poses else "tum"), path, poses))
     return found
 
 
-def _pose_source(arguments: argparse.Namespace, named: list[tuple[str, Path]], root: Path) -> PoseSource:
-    poses = PoseChoice(arguments.poses, pose_form(arguments.pose_form)) if arguments.poses else None
-    sequences = [read_posed(folder, layout, arguments.max_difference, poses) for layout, folder in named]
-    for (_, folder), sequence in zip(named, sequences, strict=True):
+def _pose_source(
+    arguments: argparse.Namespace, named: list[tuple[str, Path, PoseChoice | None]], root: Path
+) -> PoseSource:
+    sequences = [read_posed(folder, layout, arguments.max_difference, poses) for layout, folder, poses in named]
+    for (_, folder, _), sequence in zip(named, sequences, strict=True):
         print(f"{folder}: {len(sequence)} images with a pose, {sequence.dropped} without one left out")
         for doubt in sequence.doubts:
             _warn(doubt)
@@ -234,7 +233,7 @@ def _pose_source(arguments: argparse.Namespace, named: list[tuple[str, Path]], r
         clear_view_angle_deg=arguments.clear_view_angle,
     )
     scenes = Scenes(tuple(arguments.same_scene), tuple(arguments.same_frame), arguments.different_scenes)
-    folders = [Path(os.path.relpath(folder.resolve(), root.resolve())).as_posix() for _, folder in named]
+    folders = [Path(os.path.relpath(folder.resolve(), root.resolve())).as_posix() for _, folder, _ in named]
     return PoseSource(sequences, folders, rule, scenes)
 
 

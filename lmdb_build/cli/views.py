@@ -10,19 +10,19 @@ from lmdb_build.cli.arguments import size
 from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
 from lmdb_build.views import Batches, Changes, write_views
-from netspec.terminal.commands import Commands, WrongUsage, refuse
+from loopclosure.errors import InputError
+from loopclosure.places.source import Source, read_source
+from netspec.terminal.commands import Commands, refuse
 from netspec.terminal.options import above_zero, seed
 
 
 def add_to(commands: Commands) -> None:
     """Add the command."""
     add = commands.add("views", _views, "make two views of each place, in batches of different places").add_argument
-    add("folders", type=Path, nargs="*", metavar="FOLDER", help="runs of images; or --index, or both")
+    source = "a folder of images, a run; or index:CSV,track=COLUMN,time=COLUMN, a table of frames of several runs"
+    add("sources", type=_source, nargs="+", metavar="SOURCE", help=source)
     add("--out", type=Path, required=True, help="folder for the views; the list is OUT.txt")
-    add("--index", type=Path, metavar="CSV", help="a table of frames, with --track and --time")
-    add("--track", metavar="COLUMN", help="column of --index that names the run")
-    add("--time", metavar="COLUMN", help="column of --index with the position in the run")
-    add("--step", type=above_zero, default=1.0, help="seconds between two images of a FOLDER (1)")
+    add("--step", type=above_zero, default=1.0, help="seconds between two images of a folder (1)")
     add("--batches", type=int, default=400, help="how many batches (400)")
     add("--size", type=int, default=48, help="pairs per batch, each of a different place (48)")
     add("--per-track", type=int, default=8, help="at most this many of them from one run (8)")
@@ -37,20 +37,27 @@ def add_to(commands: Commands) -> None:
     add("--seed", type=seed, default=1, help="random seed (1)")
 
 
+def _source(text: str) -> Source:
+    try:
+        found = read_source(text, {"": (), "index": ("track", "time")})
+    except InputError as fault:
+        raise argparse.ArgumentTypeError(str(fault)) from None
+    if found.kind and len(found.settings) < 2:
+        raise argparse.ArgumentTypeError(f"{text} needs ,track=COLUMN,time=COLUMN")
+    return found
+
+
 def _views(arguments: argparse.Namespace) -> None:
-    if not (arguments.folders or arguments.index):
-        raise WrongUsage("name folders, or --index, or both")
-    if not arguments.folders:
-        refuse(arguments, ("step",), "is for folders; --time says when the images of --index were taken")
-    if not arguments.index:
-        refuse(arguments, ("track", "time"), "is a column of --index")
-    elif not (arguments.track and arguments.time):
-        raise WrongUsage("--index needs --track and --time")
-    tables = [arguments.index.parent] if arguments.index else []
-    root = Path(os.path.commonpath([folder.resolve() for folder in arguments.folders + tables]))
-    parts = [folder_runs(arguments.folders, root, arguments.step)] if arguments.folders else []
-    if arguments.index:
-        parts.append(index_runs(arguments.index, root, arguments.track, arguments.time))
+    sources: list[Source] = arguments.sources
+    root = Path(os.path.commonpath([(each.path.parent if each.kind else each.path).resolve() for each in sources]))
+    if all(each.kind for each in sources):
+        refuse(arguments, ("step",), "is for folders; a table has the times of its images")
+    parts = []
+    for each in sources:
+        if each.kind:
+            parts.append(index_runs(each.path, root, each.settings["track"], each.settings["time"]))
+        else:
+            parts.append(folder_runs([each.path], root, arguments.step))
     runs = join_runs(parts)
     batches = Batches(
         arguments.batches,

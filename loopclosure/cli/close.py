@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from loopclosure.cli.data_set import add_poses, add_topics, sequence
+from loopclosure.cli.data_set import add_poses, add_topics, sequence, source_of
 from loopclosure.cli.run import show_progress, warn
 from loopclosure.closing.close import Closed, close, summary, write_closed
 from loopclosure.closing.drift import drifted
@@ -72,7 +72,7 @@ def _close(a: argparse.Namespace) -> None:
         raise WrongUsage("--odometry-form means nothing without --odometry")
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed means nothing without --drift")
-    frames = sequence(a, a.source, "")
+    frames = sequence(source_of(a, a.source), a.out)
     camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
     if camera is None:
         raise InputError(f"does not say what its camera is; give --camera {intrinsics.FORM}", frames.source)

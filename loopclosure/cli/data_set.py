@@ -1,4 +1,4 @@
-"""The options that say which data set, and which of its frames, a command is about."""
+"""The data set that a command is about, and the rule that says which of its frames show the same place."""
 
 from __future__ import annotations
 
@@ -6,61 +6,54 @@ import argparse
 from pathlib import Path
 
 from loopclosure.cli.run import show_progress, warn
+from loopclosure.errors import InputError
 from loopclosure.places import datasets
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
 from loopclosure.places.frames import Selection
 from loopclosure.places.overlap import FOV_DEG, ViewOverlap
-from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import ImageSequence, PoseChoice, benchmark_parts, read_sequence
+from loopclosure.places.sequences import ImageSequence, benchmark_parts, layout_of, read_sequence
+from loopclosure.places.source import FRAMES, POSES, TOPICS, Source, read_source
 from loopclosure.places.truth import Exclusion
-from netspec.terminal.commands import WrongUsage
+from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.options import above_zero
 
-KINDS = (*LAYOUTS, "fabmap", "images", "traverses", "nordland", "pairs")
-POSED = (*LAYOUTS, "images")
-# Which options belong to which data set: given with another one they would be ignored, so they are refused.
-BELONGS = {
-    "truth": ("images", "fabmap", "traverses"),
-    "poses": POSED,
-    "pose_form": POSED,
-    "topic": ("bag",),
-    "pose_topic": ("bag",),
-    "references": ("images", "tum", "euroc", "kitti"),
-    "camera": ("fabmap",),
-    "coordinates": ("fabmap",),
-    "tolerance": ("traverses",),
-    "soft_tolerance": ("traverses",),
-    "max_distance": POSED,
-    "max_angle": POSED,
-    "soft_distance": POSED,
-    "soft_angle": POSED,
-    "fov": POSED,
-    "overlap": POSED,
-    "exclude_frames": (*POSED, "fabmap"),
-    "exclude_seconds": POSED,
+SEQUENCE = (*FRAMES, *POSES, "references")
+KINDS = {
+    "": (*SEQUENCE, *TOPICS, "truth"),
+    **dict.fromkeys(("tum", "euroc", "kitti", "video"), SEQUENCE),
+    "bag": (*SEQUENCE, *TOPICS),
+    "images": (*SEQUENCE, "truth"),
+    "fabmap": (*FRAMES, "truth", "camera", "coordinates"),
+    "traverses": (*FRAMES, "references", "truth"),
+    "nordland": FRAMES,
+    "pairs": FRAMES,
 }
+HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]..., for example tum:desk,stop=50%,stride=2.
+
+Truth from poses (KIND is seen from the files, or named):
+{chr(10).join(f"  {kind + ':':11} {what.replace('--', '')}" for kind, what in LAYOUTS.items())}
+  images:     a folder or list of images, with poses=FILE, or truth=MASK: which frames show the same place
+Truth from elsewhere:
+  fabmap:     FAB-MAP's New College or City Centre; truth=, coordinates=, camera={"|".join(CAMERAS)} (default: both)
+  traverses:  two drives, PATH and references=PATH; equal numbers are equal places, or truth= says it
+  nordland:   query/, ref/, ground_truth*.npy, as VPR benchmarks ship it
+  pairs:      places photographed twice (pairs.csv)
+
+KEYs: start, stop (frame N or share P%), stride, limit: which frames; references=PATH: another sequence to look in;
+truth=FILE (.mat .npy .txt or image); poses=FILE ({POSES_HELP}),
+pose-form ({POSE_FORM_HELP.replace("--", "")});
+topic, pose-topic: of a bag that has several."""
+RULE = ("max_distance", "max_angle", "soft_distance", "soft_angle", "fov", "overlap", "exclude_seconds")
+TRAVERSES = ("tolerance", "soft_tolerance")
 
 
 def add_data_set(p: argparse.ArgumentParser) -> None:
-    """Add the options of :func:`data_set`."""
-    data = p.add_mutually_exclusive_group(required=True)
-    for layout, what in LAYOUTS.items():
-        data.add_argument(f"--{layout}", metavar="PATH", help=f"{what}; truth from its poses")
-    data.add_argument("--fabmap", metavar="FOLDER", help="FAB-MAP's New College or City Centre")
-    data.add_argument("--images", metavar="FOLDER", help="images with a mask (--truth) or poses (--poses)")
-    data.add_argument("--traverses", nargs=2, metavar=("QUERIES", "REFERENCES"), help="equal numbers = equal places")
-    data.add_argument("--nordland", metavar="FOLDER", help="query/, ref/, ground_truth*.npy, as VPR benchmarks ship it")
-    data.add_argument("--pairs", metavar="FOLDER", help="places photographed twice (pairs.csv)")
-    add_selection(p, "--", "")
-    p.add_argument("--truth", metavar="MASK", help=".mat .npy .txt or image: which frames show the same place")
-    add_poses(p)
-    add_topics(p)
-    p.add_argument("--references", metavar="FOLDER", help="of --images, --tum, --euroc or --kitti, if another folder")
-    p.add_argument("--camera", choices=CAMERAS, help="of --fabmap (default: both)")
-    p.add_argument("--coordinates", metavar="FILE", help="of --fabmap, if not in the folder")
-    p.add_argument("--tolerance", type=int, metavar="FRAMES", help="of --traverses (default: 0)")
+    """Add the arguments of :func:`data_set`."""
+    p.epilog, p.formatter_class = HELP, argparse.RawDescriptionHelpFormatter
+    p.add_argument("source", metavar="SOURCE", help="the data set, see below")
+    p.add_argument("--tolerance", type=int, metavar="FRAMES", help="of traverses (default: 0)")
     p.add_argument("--soft-tolerance", type=int, metavar="FRAMES", help="a match up to here is ignored, not wrong")
     p.add_argument("--max-distance", type=above_zero, metavar="M", help=f"of poses (default: {MAX_DISTANCE_M:g})")
     p.add_argument("--max-angle", type=above_zero, metavar="DEG", help=f"of poses (default: {MAX_ANGLE_DEG:g})")
@@ -80,8 +73,8 @@ def add_data_set(p: argparse.ArgumentParser) -> None:
         "--exclude-frames",
         type=int,
         metavar="N",
-        help=f"frames i and j with |i - j| <= N are no pair (default: --fabmap {datasets.FABMAP_EXCLUSION.frames}, "
-        f"--images {datasets.FOLDER_EXCLUSION.frames})",
+        help=f"frames i and j with |i - j| <= N are no pair (default: fabmap {datasets.FABMAP_EXCLUSION.frames}, "
+        f"images {datasets.FOLDER_EXCLUSION.frames})",
     )
     p.add_argument(
         "--exclude-seconds",
@@ -92,30 +85,31 @@ def add_data_set(p: argparse.ArgumentParser) -> None:
 
 
 def add_poses(p: argparse.ArgumentParser) -> None:
-    """Add the options of :func:`pose_choice`."""
+    """Add the options of a file of poses, for :func:`source_of`."""
     p.add_argument("--poses", metavar="FILE", help=POSES_HELP)
     p.add_argument("--pose-form", metavar="WORDS", help=POSE_FORM_HELP)
 
 
 def add_topics(p: argparse.ArgumentParser) -> None:
-    """Add the options of bags."""
+    """Add the options of bags, for :func:`source_of`."""
     p.add_argument("--topic", help="of the images of a bag that has several")
     p.add_argument("--pose-topic", metavar="TOPIC", help="of the poses of a bag that has several")
 
 
-def pose_choice(a: argparse.Namespace) -> PoseChoice | None:
-    """Return the file of poses that is given, if there is one."""
+def source_of(a: argparse.Namespace, path: str) -> Source:
+    """Return the source whose poses and topics are options."""
+    names = {name: getattr(a, name.replace("-", "_")) for name in (*POSES, *TOPICS)}
     if a.pose_form and not a.poses:
         raise WrongUsage("--pose-form means nothing without --poses")
-    return PoseChoice(Path(a.poses), pose_form(a.pose_form or "")) if a.poses else None
+    return Source("", Path(path), {name: value for name, value in names.items() if value})
 
 
-def sequence(a: argparse.Namespace, source: str, layout: str) -> ImageSequence:
-    """Read the sequence with poses that the options describe; frames of bags and videos go to --out/frames."""
-    poses = pose_choice(a)
-    path = Path(source)
+def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence:
+    """Read a sequence; frames of bags and videos go to ``out``/frames. ``layout`` "" is found out."""
+    poses, path = source.pose_choice(), source.path
     if layout in RECORDED or (not layout and is_recording(path)):
-        path, said = extract(path, Path(a.out) / "frames", a.topic or "", a.pose_topic or "", show_progress)
+        topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
+        path, said = extract(path, Path(out) / "frames", *topics, show_progress)
         print(said)
         layout = "images"
     read = read_sequence(path, layout, poses=poses)
@@ -134,50 +128,67 @@ def add_selection(p: argparse.ArgumentParser, prefix: str, of: str) -> None:
 
 def selection(a: argparse.Namespace, prefix: str = "") -> Selection:
     """Return the selection of frames that the options with this prefix describe."""
-    return Selection(*(getattr(a, f"{prefix}{name}") for name in ("start", "stop", "stride", "limit")))
+    return Selection(*(getattr(a, f"{prefix}{name}") for name in FRAMES))
 
 
 def data_set(a: argparse.Namespace) -> datasets.DataSet:
-    """Load the data set that the options describe."""
-    kind = next(name for name in KINDS if getattr(a, name))
-    for option, kinds in BELONGS.items():
-        if getattr(a, option) is not None and kind not in kinds:
-            names = " or ".join(f"--{name}" for name in kinds)
-            raise WrongUsage(f"--{option.replace('_', '-')} means nothing to --{kind}; it belongs to {names}")
-    chosen = selection(a)
+    """Load the data set that the arguments describe."""
+    try:
+        source = read_source(a.source, KINDS)
+    except InputError as fault:
+        raise WrongUsage(str(fault)) from None
+    truth, references = source.get("truth", str), source.get("references", str)
+    kind = source.kind or ("images" if truth else "")
+    posed = not kind or kind in LAYOUTS or (kind == "images" and "poses" in source.settings)
+    if not posed:
+        refuse(a, RULE, f"is for sequences with poses, not for {kind}")
+    if kind != "traverses":
+        refuse(a, TRAVERSES, "is for traverses")
+    if kind in ("traverses", "nordland", "pairs"):
+        refuse(a, ("exclude_frames",), f"is for one sequence, not for {kind}")
+    chosen = source.selection()
     excluded = a.exclude_frames is not None or a.exclude_seconds is not None
     exclusion = Exclusion(a.exclude_frames or 0, a.exclude_seconds or 0.0) if excluded else None
-    if a.references is not None and excluded:
-        raise WrongUsage("--exclude-frames means nothing with --references: nothing is near in time")
-    if kind in LAYOUTS or (kind == "images" and a.poses):
-        if a.truth:
-            raise WrongUsage("--truth and --poses both say which frames show the same place; give one")
-        if a.references and a.poses:
-            raise WrongUsage("--poses are those of one sequence; with --references each must have its own")
+    if references is not None and excluded:
+        raise WrongUsage("--exclude-frames means nothing with references: nothing is near in time")
+    if posed:
+        if truth:
+            raise WrongUsage("truth and poses both say which frames show the same place; give one")
+        if references and "poses" in source.settings:
+            raise WrongUsage("poses are those of one sequence; with references each must have its own")
+        layout = kind or ("" if is_recording(source.path) else _layout(source, source.path))
         return datasets.load_sequence(
-            sequence(a, getattr(a, kind), kind),
+            sequence(source, a.out, layout),
             chosen,
             exclusion,
             max_distance_m=a.max_distance,
             max_angle_deg=a.max_angle,
             soft_distance_m=a.soft_distance,
             soft_angle_deg=a.soft_angle,
-            references=sequence(a, a.references, kind) if a.references else None,
+            references=sequence(Source(kind, Path(references)), a.out, layout) if references else None,
             view_overlap=ViewOverlap(a.fov, ViewOverlap().least if a.overlap is None else a.overlap),
         )
     if kind == "fabmap":
-        camera = a.camera or "both"
+        camera = source.get("camera", str) or "both"
+        if camera not in CAMERAS:
+            raise InputError(f'{source}: camera is "{camera}", expected {", ".join(CAMERAS)}')
         exclusion = exclusion or datasets.FABMAP_EXCLUSION
-        joined = Path(a.out) / "joined"
-        return datasets.load_fabmap(a.fabmap, a.truth, a.coordinates, camera, chosen, exclusion, joined)
+        joined, coordinates = Path(a.out) / "joined", source.get("coordinates", str)
+        return datasets.load_fabmap(source.path, truth, coordinates, camera, chosen, exclusion, joined)
     if kind == "images":
-        if a.truth is None:
-            raise WrongUsage("--images needs --truth, the mask that says which frames show the same place, or --poses")
-        return datasets.load_folder(a.images, a.truth, a.references, chosen, exclusion or datasets.FOLDER_EXCLUSION)
+        if truth is None:
+            raise WrongUsage(f"images:{source} needs ,truth=MASK, which says what shows the same place, or ,poses=FILE")
+        exclusion = exclusion or datasets.FOLDER_EXCLUSION
+        return datasets.load_folder(source.path, truth, references, chosen, exclusion)
     if kind == "traverses":
-        queries, references = a.traverses
-        return datasets.load_traverses(queries, references, a.tolerance or 0, a.soft_tolerance, chosen, a.truth)
+        if references is None:
+            raise WrongUsage(f"traverses:{source} needs ,references=FOLDER, the other drive")
+        return datasets.load_traverses(source.path, references, a.tolerance or 0, a.soft_tolerance, chosen, truth)
     if kind == "nordland":
-        queries, references, truth = benchmark_parts(Path(a.nordland))
-        return datasets.load_traverses(queries, references, selection=chosen, truth_file=truth)
-    return datasets.load_place_pairs(a.pairs, chosen)
+        queries, found, truth_file = benchmark_parts(source.path)
+        return datasets.load_traverses(queries, found, selection=chosen, truth_file=truth_file)
+    return datasets.load_place_pairs(source.path, chosen)
+
+
+def _layout(source: Source, path: Path) -> str:
+    return layout_of(path, "images" if "poses" in source.settings else "tum")

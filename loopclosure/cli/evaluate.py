@@ -6,10 +6,12 @@ import argparse
 from pathlib import Path
 
 from loopclosure import evaluate
-from loopclosure.cli.data_set import add_data_set, add_selection, data_set, selection
+from loopclosure.cli.data_set import add_data_set, data_set
 from loopclosure.cli.run import show_progress
+from loopclosure.errors import InputError
 from loopclosure.methods.base import METHODS, MethodContext
 from loopclosure.places.frames import image_paths
+from loopclosure.places.source import FRAMES, Source, read_source
 from netspec.terminal.commands import Commands
 from netspec.terminal.options import seed
 
@@ -30,13 +32,21 @@ def add_to(commands: Commands) -> None:
         "--train",
         action="append",
         default=[],
-        metavar="PATH",
-        help="images for vocabularies, other than those tested: a folder, list or TUM sequence; may be repeated",
+        type=_training,
+        metavar="PATH[,KEY=VALUE]",
+        help="images for vocabularies, other than those tested: a folder, list or TUM sequence, with start, stop, "
+        "stride, limit; may be repeated",
     )
-    add_selection(p, "--train-", "of each --train: ")
     p.add_argument("--out", required=True, metavar="FOLDER", help="where the report and its parts go")
     p.add_argument("--title", default="", help="heading of the report")
     p.add_argument("--seed", type=seed, default=0, help="of the methods' random numbers (default: 0)")
+
+
+def _training(text: str) -> Source:
+    try:
+        return read_source(text, {"": FRAMES})
+    except InputError as fault:
+        raise argparse.ArgumentTypeError(str(fault)) from None
 
 
 def _evaluate(a: argparse.Namespace) -> None:
@@ -47,12 +57,11 @@ def _evaluate(a: argparse.Namespace) -> None:
     data = data_set(a)
     context = MethodContext(data.exclude_frames, a.seed)
     methods = [evaluate.named_method(text, context) for text in a.method]
-    chosen = selection(a, "train_")
     train: list[Path] = []
     for source in a.train:
-        images = image_paths(source)
-        train += [images[i] for i in chosen.numbers(len(images))]
-    training = f"{len(train)} images of {', '.join(Path(t).name for t in a.train)}" if train else "no training images"
+        images = image_paths(source.path)
+        train += [images[i] for i in source.selection().numbers(len(images))]
+    training = f"{len(train)} images of {', '.join(t.path.name for t in a.train)}" if train else "no training images"
     evaluation = evaluate.evaluate(data, methods, train, training, show_progress)
     page = write_report(evaluation, a.out, a.title, a.command_line)
     print(measures_text(evaluation))

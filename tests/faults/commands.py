@@ -159,7 +159,7 @@ CASES = {
     ),
     "evaluate": Case(
         loopclosure.cli.main,
-        ["evaluate", "--images", "images", "--truth", "truth.npy", "--method", "thumbnails", "--out", "out"],
+        ["evaluate", "images,truth=truth.npy", "--method", "thumbnails", "--out", "out"],
         walk_inputs,
         check_report,
     ),

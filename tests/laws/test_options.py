@@ -90,7 +90,7 @@ SHARED = {"verbose", "plugin", "limit"}  # read before the command itself
 HIDDEN = argparse.SUPPRESS
 FROZEN = ROOT / "tests" / "laws" / "options.txt"
 PROGRAMS = ("netspec", "lmdb_build", "loopclosure")
-MOST = 395
+MOST = 345
 VALUES = {"shape": "data=1,1,28,28", "source": "pair_data=pairs/test_lmdb", "size": "8x8", "view_size": "8x8"}
 
 

@@ -103,8 +103,8 @@ def test_warped_and_joined(walks: Path, tmp_path: Path) -> None:
         (["pairs", "{0}/nowhere", "--out", "{1}"], "no such folder"),
         (["pairs", "{0}/walk_1", "--out", "{1}", "--train", "3"], "even, not 3"),
         (["pairs", "{0}/walk_1", "--out", "{1}", "--train", "100000"], "--at-most"),
-        (["pairs", "--folders", "{0}/walk_1", "{1}", "--out", "{1}"], "contains no images"),
-        (["pairs", "--table", "{1}/none.csv", "--out", "{1}"], "cannot be read"),
+        (["pairs", "folders:{0}/walk_1,references={1}", "--out", "{1}"], "contains no images"),
+        (["pairs", "table:{1}/none.csv", "--out", "{1}"], "cannot be read"),
         (["sheet", "{1}/none.txt", "{1}/x.png"], "cannot be read"),
         (["walk", "{0}"], "holds a sequence already"),
         (["walk", "{1}/w", "--rooms", "3"], "even number of rooms"),
@@ -134,8 +134,8 @@ def test_a_broken_line_of_groundtruth_is_named(walks: Path, tmp_path: Path, caps
     [
         [],
         ["pairs", "--out", "x"],
-        ["pairs", "a", "--folders", "b", "c", "--out", "x"],
-        ["pairs", "--mask", "m.mat", "--out", "x"],
+        ["pairs", "a", "folders:b,references=c", "--out", "x"],
+        ["pairs", "images:m", "--out", "x"],
         ["walk", "x", "--size", "320"],
         ["walk", "x", "--sequences", "0"],
         ["pairs", "a", "--out", "x", "--shares", "1,2"],
@@ -181,10 +181,10 @@ def test_pairs_takes_the_data_sets_that_people_have(tmp_path: Path, capsys: pyte
     video = write_video(tmp_path / "v.avi")
     by_pose = [
         f"{euroc}",
-        f"--euroc {euroc}",
-        f"--kitti {kitti}",
-        f"--video {video} --poses {poses}",
-        f"{kitti / 'image_0'} --poses {poses} --pose-form tum",
+        f"euroc:{euroc}",
+        f"kitti:{kitti}",
+        f"video:{video},poses={poses}",
+        f"images:{kitti / 'image_0'},poses={poses},pose-form=tum",
     ]
     for number, line in enumerate(by_pose):
         chosen = lists(tmp_path / f"out{number}", f"{line} --min-gap 10")
@@ -198,8 +198,8 @@ def test_pairs_takes_the_data_sets_that_people_have(tmp_path: Path, capsys: pyte
 def test_pairs_of_a_benchmark_are_a_query_and_a_reference(tmp_path: Path) -> None:
     folder = write_benchmark(tmp_path / "b")
     for line in (
-        f"--nordland {folder}",
-        f"--traverses {folder}/query {folder}/ref --mask {folder}/ground_truth_new.npy --root {folder}",
+        f"nordland:{folder}",
+        f"traverses:{folder}/query,references={folder}/ref,truth={folder}/ground_truth_new.npy --root {folder}",
     ):
         chosen = lists(tmp_path / "out", line)
         assert {label for _, _, label in chosen} == {0, 1}
@@ -208,8 +208,10 @@ def test_pairs_of_a_benchmark_are_a_query_and_a_reference(tmp_path: Path) -> Non
             assert label == (0 <= ends["ref"] - ends["query"] <= 2)
 
 
-def test_traverses_need_a_mask_and_poses_one_sequence(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["pairs", "--traverses", "a", "b", "--out", "o"]) == 2
-    assert "--traverses needs --mask" in capsys.readouterr().err
-    assert main(["pairs", "a", "b", "--poses", "p.txt", "--out", "o"]) == 2
-    assert "--poses are those of one sequence" in capsys.readouterr().err
+def test_traverses_need_a_mask_and_poses_are_for_sequences(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["pairs", "traverses:a,references=b", "--out", "o"]) == 2
+    assert "traverses:a,references=b needs ,truth=..." in capsys.readouterr().err
+    assert main(["pairs", "nordland:a,poses=p.txt", "--out", "o"]) == 2
+    assert 'nordland has no setting "poses"' in capsys.readouterr().err
+    assert main(["pairs", "images:a,truth=b.npy", "--out", "o", "--max-angle", "9"]) == 2
+    assert "--max-angle is for sequences with poses, not for images" in capsys.readouterr().err

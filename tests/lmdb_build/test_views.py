@@ -131,7 +131,7 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
     index = tmp_path / "src" / "index.csv"
     index.write_text("\n".join(lines) + "\n")
     command = ["views", "--batches", "3", "--size", "4", "--per-track", "2", "--view-size", "32x24"]
-    by_index = [*command, "--index", str(index), "--track", "run", "--time", "second"]
+    by_index = [*command, f"index:{index},track=run,time=second"]
     assert main([*by_index, "--out", str(tmp_path / "one")]) == 0
     said = capsys.readouterr().out
     assert "3 batches of 4 pairs" in said
@@ -174,6 +174,6 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
     assert 'index.csv:5:1: expected a number in column second, found "x"' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("more", [[], ["folder", "--index", "x.csv"], ["--index", "x.csv"], ["folder", "--step", "0"]])
+@pytest.mark.parametrize("more", [[], ["folder", "index:x.csv"], ["index:x.csv,track=a"], ["folder", "--step", "0"]])
 def test_the_source_is_named_whole(more: list[str]) -> None:
     assert main(["views", "--out", "out", *more]) == 2

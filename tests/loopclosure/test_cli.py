@@ -21,8 +21,7 @@ def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
     code = main(
         [
             "evaluate",
-            "--tum",
-            str(two_laps),
+            f"tum:{two_laps}",
             "--method",
             "thumbnails",
             "--method",
@@ -44,13 +43,13 @@ def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
     assert f"report: {tmp_path / 'r' / 'report.html'}" in printed
     summary = json.loads((tmp_path / "r" / "report.json").read_text())
     assert [m["name"] for m in summary["methods"]] == ["thumbnails", "net"]
-    assert summary["command"].startswith("loopclosure evaluate --tum")
+    assert summary["command"].startswith("loopclosure evaluate tum:")
 
 
 @pytest.mark.slow
 def test_evaluate_the_whole_system_on_another_recording(two_laps, two_laps_features, tmp_path, capsys):
     features = f"features:{two_laps_features}"
-    line = f"evaluate --tum {two_laps} --start 20 --references {two_laps} --fov 50 --overlap 0.4 --out {tmp_path}"
+    line = f"evaluate {two_laps},start=20,references={two_laps} --fov 50 --overlap 0.4 --out {tmp_path}"
     line += f" --method verified:k=2,inliers=8+{features} --method verified+seqslam+{features}"
     assert main(line.split()) == 0
     assert "soft zone" in capsys.readouterr().out
@@ -68,20 +67,13 @@ def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
     code = main(
         [
             "evaluate",
-            "--tum",
-            str(two_laps),
-            "--start",
-            "20",
+            f"{two_laps},start=20",
             "--exclude-seconds",
             "0",
             "--max-angle",
             "19",
             "--train",
-            str(two_laps),
-            "--train-stop",
-            "50%",
-            "--train-stride",
-            "2",
+            f"{two_laps},stop=50%,stride=2",
             "--method",
             "bow:words=20",
             "--out",
@@ -100,7 +92,6 @@ def test_the_door(two_laps, two_laps_features, tmp_path):
         [
             sys.executable,
             ROOT / "tools" / "evaluate_loops.py",
-            "--tum",
             two_laps,
             "--out",
             tmp_path,
@@ -196,24 +187,26 @@ def test_similarity(two_laps_features, tmp_path, capsys):
 def expanded(line: str, **names: object) -> list[str]:
     """Split a command line, with the names in capitals replaced at the beginning of its parts."""
     parts = line.split()
-    return [next((p.replace(k, str(v)) for k, v in names.items() if p.startswith(k)), p) for p in parts]
+    for name, value in names.items():
+        parts = [part.replace(name, str(value)) for part in parts]
+    return parts
 
 
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("evaluate --tum NOWHERE --method thumbnails --out OUT", "NOWHERE: no such folder"),
-        ("evaluate --tum LAPS --method magic --out OUT", 'unknown method "magic"'),
-        ("evaluate --tum LAPS --start 50% --method thumbnails --out OUT", "no judged pair shows the same place"),
-        ("evaluate --tum LAPS --method bow --train LAPS --out OUT", "test images are training images"),
-        ("evaluate --tum LAPS --method features:NOWHERE.npz --out OUT", "NOWHERE.npz: no such file"),
+        ("evaluate NOWHERE --method thumbnails --out OUT", "NOWHERE: no such folder"),
+        ("evaluate LAPS --method magic --out OUT", 'unknown method "magic"'),
+        ("evaluate LAPS,start=50% --method thumbnails --out OUT", "no judged pair shows the same place"),
+        ("evaluate LAPS --method bow --train LAPS --out OUT", "test images are training images"),
+        ("evaluate LAPS --method features:NOWHERE.npz --out OUT", "NOWHERE.npz: no such file"),
         ("detect NOWHERE --threshold 1 --out OUT", "cannot be read"),
         ("detect LAPS --threshold 1 --describe nothing --out OUT", "expected module:function"),
         ("similarity NOWHERE.npz --out OUT", "no such file"),
         ("similarity FEATURES --out OUT/no/folder.npy", "cannot be written"),
         ("detect LAPS --threshold 0.5 --out FEATURES", "FEATURES: File exists"),
         (
-            "evaluate --tum LAPS --exclude-seconds nan --method thumbnails --out OUT",
+            "evaluate LAPS --exclude-seconds nan --method thumbnails --out OUT",
             "cannot exclude 0 frames, nan s; expected 0 or more",
         ),
     ],
@@ -228,11 +221,11 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("evaluate --tum LAPS --camera left --method thumbnails --out OUT", "--camera means nothing to --tum"),
-        ("evaluate --images LAPS --method thumbnails --out OUT", "--images needs --truth"),
-        ("evaluate --pairs LAPS --fov 60 --method thumbnails --out OUT", "--fov means nothing to --pairs"),
+        ("evaluate LAPS,camera=left --method thumbnails --out OUT", 'a sequence has no setting "camera"'),
+        ("evaluate images:LAPS --method thumbnails --out OUT", "needs ,truth=MASK"),
+        ("evaluate pairs:LAPS --fov 60 --method thumbnails --out OUT", "--fov is for sequences with poses, not for "),
         (
-            "evaluate --tum LAPS --references LAPS --exclude-seconds 3 --method thumbnails --out OUT",
+            "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT",
             "nothing is near in time",
         ),
         ("detect LAPS --threshold 1 --with width --out OUT", "expected KEY=VALUE"),
@@ -260,7 +253,7 @@ def test_names_that_are_not_utf8_are_escaped(two_laps, tmp_path):
     (source / "rgb.txt").unlink()
     poses = "\n".join(f"{k} {5 * (k % 20)} 0 0 0 0 0 1" for k in range(40))
     (tmp_path / "poses.txt").write_text(poses)
-    words = ["--images", str(source / "rgb"), "--poses", str(tmp_path / "poses.txt"), "--exclude-frames", "5"]
+    words = [f"images:{source / 'rgb'},poses={tmp_path / 'poses.txt'}", "--exclude-frames", "5"]
     words += ["--method", "\udce9=thumbnails", "--title", "\udce9", "--out", str(out)]
     assert main(["evaluate", *words]) == 0
     assert "out\\udce9" in (out / "report.html").read_text()

@@ -253,7 +253,7 @@ def test_evaluate(two_laps, files, tmp_path, capsys):
     plain = f"features:{files}/laps.npz"
     white = f"{plain}:whiten={files}/other.npz,components=100"
     methods = [f"plain={plain}", white, f"with sequences=seqslam+{white}"]
-    words = ["evaluate", "--tum", str(two_laps), "--out", str(tmp_path / "report")]
+    words = ["evaluate", str(two_laps), "--out", str(tmp_path / "report")]
     assert main([*words, *(word for method in methods for word in ("--method", method))]) == 0
     assert "laps (euclidean, whitened)" in capsys.readouterr().out
     report = json.loads((tmp_path / "report" / "report.json").read_text())
@@ -270,7 +270,7 @@ def test_evaluate(two_laps, files, tmp_path, capsys):
 
 def test_evaluate_says_what_is_wrong_in_one_line(two_laps, files, capsys):
     method = f"features:{files}/laps.npz:whiten={files}/laps.npz"
-    assert main(["evaluate", "--tum", str(two_laps), "--out", str(files / "report"), "--method", method]) == 1
+    assert main(["evaluate", str(two_laps), "--out", str(files / "report"), "--method", method]) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "laps.npz: 40 of 40 test images are training images too" in line
 

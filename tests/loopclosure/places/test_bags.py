@@ -99,7 +99,7 @@ def test_what_is_no_bag_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_commands_take_bags(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = Bag(tmp_path / "drive.bag", 1).file
-    line = f"evaluate --bag {bag} --method thumbnails --out {tmp_path / 'report'}"
+    line = f"evaluate {bag} --method thumbnails --out {tmp_path / 'report'}"
     assert main(line.split()) == 0
     line = f"detect {bag} --threshold -0.001 --exclude-recent 10 --out {tmp_path / 'found'}"
     assert main(line.split()) == 0

@@ -212,12 +212,12 @@ def test_evaluate_reads_them_all(tmp_path: Path, capsys: pytest.CaptureFixture[s
     euroc, kitti = write_euroc(tmp_path / "e"), write_kitti(tmp_path / "k")
     video, benchmark = write_video(tmp_path / "v.avi"), write_benchmark(tmp_path / "b")
     lines = [
-        f"--euroc {euroc}",
-        f"--kitti {kitti}",
-        f"--video {video} --poses {poses}",
-        f"--images {kitti / 'image_0'} --poses {poses}",
-        f"--nordland {benchmark}",
-        f"--traverses {benchmark}/query {benchmark}/ref --truth {benchmark}/ground_truth_new.npy",
+        f"{euroc}",
+        f"kitti:{kitti}",
+        f"{video},poses={poses}",
+        f"images:{kitti / 'image_0'},poses={poses}",
+        f"nordland:{benchmark}",
+        f"traverses:{benchmark}/query,references={benchmark}/ref,truth={benchmark}/ground_truth_new.npy",
     ]
     for number, line in enumerate(lines):
         out = tmp_path / f"out{number}"
@@ -227,12 +227,12 @@ def test_evaluate_reads_them_all(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_images_with_both_a_mask_and_poses_are_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = "evaluate --images x --truth t.npy --poses p.txt --method thumbnails --out o"
+    line = "evaluate images:x,truth=t.npy,poses=p.txt --method thumbnails --out o"
     assert main(line.split()) == 2
-    assert "--truth and --poses both say" in capsys.readouterr().err
-    line = "evaluate --tum x --pose-form kitti --method thumbnails --out o"
+    assert "truth and poses both say" in capsys.readouterr().err
+    line = "evaluate tum:x,pose-form=kitti --method thumbnails --out o"
     assert main(line.split()) == 2
-    assert "--pose-form means nothing without --poses" in capsys.readouterr().err
+    assert "pose-form means nothing without poses" in capsys.readouterr().err
 
 
 def test_detect_takes_euroc_with_its_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

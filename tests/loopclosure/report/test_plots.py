@@ -77,7 +77,7 @@ import sys, matplotlib
 matplotlib.use("svg")
 import loopclosure.report.table_one
 from loopclosure.cli import main
-assert main(["evaluate", "--tum", {str(two_laps)!r}, "--method", "thumbnails", "--out", {str(tmp_path)!r}]) == 0
+assert main(["evaluate", {str(two_laps)!r}, "--method", "thumbnails", "--out", {str(tmp_path)!r}]) == 0
 assert matplotlib.get_backend() == "svg", matplotlib.get_backend()
 assert "matplotlib.pyplot" not in sys.modules
 """
