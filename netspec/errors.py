@@ -88,6 +88,11 @@ def did_you_mean(word: str, known: list[str] | tuple[str, ...]) -> str:
     """Return ``; did you mean "x"?`` for the closest known word, or an empty string."""
     import difflib
 
+    for ending in ("_param", "Parameter"):  # what all of them have in common says nothing
+        if word.endswith(ending):
+            stems = {name.removesuffix(ending): name for name in known if name.endswith(ending)}
+            close = difflib.get_close_matches(word.removesuffix(ending), list(stems), n=1, cutoff=0.6)
+            return f'; did you mean "{stems[close[0]]}"?' if close else ""
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
     if not close:
         lowered = {k.lower(): k for k in known}

@@ -1,8 +1,9 @@
 """What a file builds: shapes, parameters, memory, multiply-adds; and all errors in it at once.
 
 Whatever a training would refuse before its first iteration is found here, without writing anything and, unless asked,
-without opening data. Unknown fields of a text file are reported all at once, and the file then is not built; of other
-faults of its text the first is reported, of one layer's own settings too.
+without opening data. Unknown fields of a text file are reported all at once with what is wrong elsewhere in it; of the
+layers that have them nothing more is said. Of other faults of its text the first is reported, of one layer's own
+settings too.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import torch
 
 from netspec.check import net_rules, solver_rules  # noqa: F401, they register their rules
 from netspec.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
-from netspec.check.forks import gathered, unknown_types
+from netspec.check.forks import gathered, others, python_layers, unknown_types
 from netspec.errors import ForkFault, SpecError
 from netspec.files.limits import most
 from netspec.graph.filter import with_state, with_train_state
@@ -92,16 +93,19 @@ def check_file(
         except SpecError as as_solver:
             last = max([*unknown, as_net], [*of_solver, as_solver], key=_reach)
             return [Checked(str(path), None, gathered(last))]
-        if of_solver:
-            return [Checked(str(path), None, gathered(of_solver))]
         solver = with_train_state(solver, level, stages)
-        return _check_solver(solver, node, path, given or solver.weights, manner)
-    if unknown:
-        return [Checked(str(path), None, gathered([*unknown, *unknown_types(net, source)]))]
+        return _check_solver(solver, node, path, given or solver.weights, manner, of_solver)
+    if unknown:  # the build finds unknown types itself, but not behind what it cannot build
+        unknown += _unknown_layers(net, source, manner)
     net = with_state(net, phase, level, stages)
-    checked = _check_net(net, source, str(path), given, manner)
+    checked = _check_net(net, source, str(path), [] if unknown else given, manner)
+    checked.faults = gathered([*unknown, *others(checked.faults, unknown)])
     checked.faults += not_to_be_given(manner.shapes, [net], path)
     return [checked]
+
+
+def _unknown_layers(net: NetParameter, source: SourceMap, manner: _Manner) -> list[SpecError]:
+    return [*unknown_types(net, source), *([] if manner.allow_python else python_layers(net, source))]
 
 
 def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
@@ -147,9 +151,14 @@ def _check_net(
 
 
 def _check_solver(
-    solver: SolverParameter, node: Place, path: str | Path, weights: Iterable[str], manner: _Manner
+    solver: SolverParameter,
+    node: Place,
+    path: str | Path,
+    weights: Iterable[str],
+    manner: _Manner,
+    faults: list[SpecError],
 ) -> list[Checked]:
-    faults: list[SpecError] = []
+    """Check a solver and its nets; ``faults`` are those of its text, to which others are added."""
     check_settings(solver, node, faults.append)
     if (solver.snapshot > 0 and solver.snapshot_prefix) or solver.snapshot_after_train:
         check_prefix(solver, node, faults.append, try_it=False)
@@ -159,9 +168,10 @@ def _check_solver(
     except SpecError as fault:
         faults.append(fault)
     described = solver_nets(solver, node, faults.append)
-    if any(isinstance(fault, ForkFault) for fault in faults):
-        types = [fault for part in described for fault in unknown_types(part.net, part.source)]
-        return [Checked(str(path), None, gathered([*faults, *types]))]
+    unknown: list[SpecError] = [fault for fault in faults if isinstance(fault, ForkFault)]
+    if unknown:
+        unknown += [fault for part in described for fault in _unknown_layers(part.net, part.source, manner)]
+        weights = []
     faults += not_to_be_given(manner.shapes, [part.net for part in described], path)
     parts = [
         _check_net(part.net, part.source, part.label, weights, manner, seed_of(max(solver.random_seed, 0), part.label))
@@ -172,7 +182,8 @@ def _check_solver(
         for net, part in zip(nets[1:], parts[1:], strict=True):
             net.share_weights_with(nets[0], part.faults.append)
     for net, part in zip(nets, parts, strict=True):
-        part.faults += net.missing_inputs()
+        part.faults = [*others(part.faults, unknown), *net.missing_inputs()]
+    faults = gathered([*faults, *unknown])
     advice = [] if faults else findings(SETTINGS, solver, node)
     if not faults and not any(part.faults for part in parts):
         advice += findings(SOLVER, solver, node, nets)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from netspec.errors import ForkFault, SpecError
-from netspec.layers import layer_class, unknown_type
+from netspec.layers import class_of, layer_class, unknown_type
 from netspec.proto.dialect.registry import dialects_with_type
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
@@ -22,6 +22,13 @@ def unknown_types(net: NetParameter, source: SourceMap) -> Iterator[ForkFault]:
             yield ForkFault(message, where, "layer", layer.type, dialects_with_type(layer.type))
 
 
+def python_layers(net: NetParameter, source: SourceMap) -> Iterator[SpecError]:
+    """Yield a fault for each layer whose Python code may not run: where another is unknown, it may not be built."""
+    for i, layer in enumerate(net.layer):
+        if fault := getattr(class_of(layer), "not_allowed", None):
+            yield SpecError(fault, source.at(i, "type", layer=layer.name, type=layer.type))
+
+
 def gathered(faults: Sequence[SpecError]) -> list[SpecError]:
     """Return the faults, with one for each unknown field or layer type, in the place of the first.
 
@@ -33,6 +40,13 @@ def gathered(faults: Sequence[SpecError]) -> list[SpecError]:
         key = (file, fault.message) if isinstance(fault, ForkFault) else fault
         groups.setdefault(key, []).append(fault)
     return [_as_one(group) for group in groups.values()]
+
+
+def others(faults: Sequence[SpecError], unknown: Sequence[SpecError]) -> list[SpecError]:
+    """Return the faults but for those that may only follow from something unknown in their layer."""
+    places = {(fault.where.file, fault.where.layer) for fault in unknown if fault.where and fault.where.layer}
+    own = [fault for fault in faults if fault.where and (fault.where.file, fault.where.layer) in places]
+    return [fault for fault in faults if fault not in own or fault.message.startswith("unknown bottom blob")]
 
 
 def _as_one(faults: list[SpecError]) -> SpecError:

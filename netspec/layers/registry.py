@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.layers.base import Layer
 from netspec.proto.dialect.files import DialectFile, announce_known, find_file, known_files, switch_on, waiting
-from netspec.proto.dialect.registry import advice_for, deactivate, dialects_with_type
+from netspec.proto.dialect.registry import OWN_LAYER, advice_for, deactivate, dialects_with_type
 from netspec.proto.schema import LayerParameter
 
 _LAYERS: dict[str, type[Layer]] = {}
@@ -114,4 +114,4 @@ def unknown_type(type_name: str) -> str:
     announce_known()
     advice = advice_for(type_name, dialects_with_type(type_name))
     hint = f"; {advice}" if advice else did_you_mean(type_name, layer_types())
-    return f'unknown layer type "{type_name}"{hint or "; `netspec layers` lists the known ones"}'
+    return f'unknown layer type "{type_name}"{hint or f"; `netspec layers` lists the known ones, {OWN_LAYER}"}'

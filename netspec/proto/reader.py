@@ -370,7 +370,10 @@ class _Reader:
             return close
         messages = {n: f.descriptor.message_type for n, f in known.items() if f.type == Declared.TYPE_MESSAGE}
         inside = [n for n, message_type in messages.items() if name in fields_of(message_type)]
-        return f"; it belongs in {' or '.join(inside)}" if inside else ""
+        if inside:
+            return f"; it belongs in {' or '.join(inside)}"
+        is_of_a_layer = message.DESCRIPTOR.full_name == "caffe.LayerParameter" and name.endswith("_param")
+        return f"; if it is of a layer of your own, {dialect.OWN_LAYER}" if is_of_a_layer else ""
 
 
 def _frozen(children: Children) -> dict[str, tuple[Place, ...]]:

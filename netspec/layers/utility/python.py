@@ -52,6 +52,7 @@ class Python(Layer):
     Caffe: include/caffe/layers/python_layer.hpp
     """
 
+    not_allowed = "a Python layer runs code named in the prototxt; pass --allow-python-layers if you trust it"
     not_exported = "it runs Python code of its own"
     bottoms = (0, None)
     tops = (0, None)
@@ -64,10 +65,7 @@ class Python(Layer):
         if not self.context.open_data and all(name in given for name in self.param.top):
             return
         if not self.context.allow_python:
-            raise self.error(
-                "a Python layer runs code named in the prototxt; pass --allow-python-layers if you trust it",
-                "type",
-            )
+            raise self.error(self.not_allowed, "type")
         names = list(self.param.bottom)
         self.bottom = [Blob(shape) for shape in self.bottom_shapes]
         self.top = [self.bottom[names.index(n)] if n in names else Blob() for n in self.param.top]  # one blob in place

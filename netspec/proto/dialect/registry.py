@@ -60,6 +60,7 @@ class Dialect:
         return {(f"{PACKAGE}.{f.extendee.removeprefix(f'{PACKAGE}.')}", f.number): f.name for f in added}
 
 
+OWN_LAYER = "docs/layer.md shows how to add one with --plugin FILE.py"
 _known: dict[str, Dialect] = {}
 _active: dict[str, Dialect] = {}
 

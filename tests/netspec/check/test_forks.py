@@ -62,16 +62,50 @@ def test_what_cannot_be_passed_over_comes_after_what_was_found():
 def test_a_solver_and_its_nets_are_read_to_the_end():
     Path("net.prototxt").write_text(INPUT + STRANGE)
     Path("solver.prototxt").write_text('net: "net.prototxt"\nbase_lr: 1\n')
-    assert [line.partition(": ")[2] for line in lines("solver.prototxt")] == [
+    found = [line.partition(": ")[2] for line in lines("solver.prototxt")]
+    assert found == [
         "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid",
-        'layer "s" (Strange): LayerParameter has no field "strange_param"; did you mean "tanh_param"?',
-        'layer "s" (Strange): unknown layer type "Strange"; `netspec layers` lists the known ones',
+        'layer "s" (Strange): LayerParameter has no field "strange_param"; if it is of a layer of your own, '
+        "docs/layer.md shows how to add one with --plugin FILE.py",
+        'layer "s" (Strange): unknown layer type "Strange"; `netspec layers` lists the known ones, '
+        "docs/layer.md shows how to add one with --plugin FILE.py",
+        'layer "in" (Input): nothing fills "a" during training; use a layer that reads data '
+        "(Data, ImageData, HDF5Data, ...)",
     ]
     Path("solver.prototxt").write_text('fast: true\nnet: "net.prototxt"\nbase_lr: 1\nquick_mode { x: 1 }\n')
     assert [line.partition(": ")[2] for line in lines("solver.prototxt")] == [
         'SolverParameter has no field "fast"',
         'SolverParameter has no field "quick_mode"',
+        "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid",
+        *found[1:],
     ]
+
+
+def test_an_unknown_field_hides_nothing_elsewhere():
+    """What may follow from it in its own layer is not said: here, that kernel_size is missing."""
+    conv = (
+        'layer { name: "c" type: "Convolution" bottom: "a" top: "c" convolution_param { num_output: 4 kernal: 3 } }\n'
+    )
+    strange = STRANGE.replace('bottom: "a"', 'bottom: "b"')
+    python = 'layer { name: "p" type: "Python" bottom: "s" top: "p" python_param { module: "m" layer: "L" } }\n'
+    relu = 'layer { name: "r" type: "ReLU" bottom: "cc" top: "r" }\n'
+    pool = 'layer { name: "k" type: "Pooling" bottom: "a" top: "k" }\n'
+    Path("net.prototxt").write_text(INPUT + conv + strange + python + relu + pool)
+    found = lines("net.prototxt")
+    expected = ("2:kernal", "3:strange_param", "3:Strange", "3:unknown bottom", "4:--allow-python", "5:cc", "6:kernel")
+    assert len(found) == len(expected)
+    for line, word in (pair.split(":") for pair in expected):
+        assert any(fault.startswith(f"net.prototxt:{line}:") and word in fault for fault in found), word
+    Path("solver.prototxt").write_text('net: "net.prototxt" base_lr: 1 lr_policy: "fixed" fast: true')
+    told = lines("solver.prototxt")
+    assert any('SolverParameter has no field "fast"' in fault for fault in told)
+    assert set(found) <= set(told)
+
+
+def test_what_is_meant_is_told_by_what_differs():
+    for field, meant in (("spatial_wta_param", ""), ("pooling_parm", "pooling_param"), ("pool_param", "pooling_param")):
+        Path("net.prototxt").write_text(f'{INPUT}layer {{ name: "s" type: "ReLU" {field} {{ }} }}')
+        assert ("did you mean" in lines("net.prototxt")[0], meant in lines("net.prototxt")[0]) == (bool(meant), True)
 
 
 def test_a_solver_read_as_a_net_and_a_file_that_is_not_there():
