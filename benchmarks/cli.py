@@ -6,6 +6,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from benchmarks.growth import KINDS
@@ -14,6 +15,7 @@ from netspec.terminal.commands import Commands, WrongUsage, run
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
+SMALL, WAYS_OF_SMALL = ("tiny", "lenet", "cifar10_quick", "pnet"), ("netspec", "pycaffe", "pytorch")
 TRAINING = ("netspec", "netspec-bf16", "netspec-compile", "pytorch", "pycaffe")
 
 
@@ -35,6 +37,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
     _add_common(p, TRAINING, ("netspec", "pytorch"))
     p.add_argument("--device", default="cpu", help="torch's name of it, for netspec and pytorch (default: cpu)")
+    p = commands.add("small", _small, "time small nets and batches: training iterations, then forward passes")
+    p.add_argument("nets", nargs="*", metavar="NET", default=SMALL, help=f"default: {' '.join(SMALL)}")
+    _add_common(p, WAYS_OF_SMALL, WAYS_OF_SMALL)
+    p.set_defaults(batch=[1, 4, 16, 64])
     p = commands.add("start", _start, "time processes that load a net and describe one image")
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list), or a prototxt")
     p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
@@ -117,6 +123,13 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.device != "cpu" and ("pycaffe" in arguments.ways or arguments.caffe):
         raise WrongUsage("only netspec and pytorch are timed on other devices than the CPU")
     _compare(arguments, training_case, "_training", arguments.device)
+
+
+def _small(arguments: argparse.Namespace) -> None:
+    from benchmarks.case import forward_case, training_case
+
+    _compare(arguments, training_case, "_training")
+    _compare(arguments, partial(forward_case, onnx=False), "")
 
 
 def _waiting(arguments: argparse.Namespace) -> None:

@@ -75,6 +75,34 @@ class Resnet27(nn.Module):
         return unit(self.feat(self.stages(x).flatten(1)))
 
 
+class Tiny(nn.Module):
+    """Three layers of at most 20 numbers, for (N, 10, 1, 1)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ip1, self.ip2, self.ip3 = nn.Linear(10, 20), nn.Linear(20, 20), nn.Linear(20, 10)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the scores (N, 10)."""
+        return self.ip3(torch.tanh(self.ip2(F.relu(self.ip1(x.flatten(1))))))
+
+
+class PNet(nn.Module):
+    """MTCNN's first net, for windows (N, 3, 12, 12)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            *(nn.Conv2d(3, 10, 3), nn.PReLU(10), nn.MaxPool2d(2)),
+            *(nn.Conv2d(10, 16, 3), nn.PReLU(16), nn.Conv2d(16, 32, 3), nn.PReLU(32)),
+            nn.Conv2d(32, 2, 1),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the scores (N, 2, 1, 1)."""
+        return self.layers(x)
+
+
 class LeNet(nn.Module):
     """Caffe's LeNet, for images (N, 1, 28, 28)."""
 
@@ -299,6 +327,8 @@ class SqueezeNet(nn.Module):
 
 
 CLASSIFIERS = {
+    "tiny": Tiny,
+    "pnet": PNet,
     "lenet": LeNet,
     "cifar10_quick": Cifar10Quick,
     "cifar10_full": Cifar10Full,
@@ -334,7 +364,7 @@ class Classified(nn.Module):
 
     def forward(self, images: Tensor, labels: Tensor) -> Tensor:
         """Return the loss, a scalar."""
-        return F.cross_entropy(self.net(images), labels)
+        return F.cross_entropy(self.net(images).flatten(1), labels)
 
 
 def net(name: str) -> nn.Module:
@@ -364,7 +394,7 @@ def load(twin: nn.Module, caffemodel: str | Path) -> None:
                 _copy(module.running_mean, mean * factor)
                 _copy(module.running_var, variance * factor)
             _copy(module.weight, values[0])
-            if module.bias is not None:
+            if len(values) > 1 and module.bias is not None:
                 _copy(module.bias, values[1])
     assert next(layers, None) is None, f"{caffemodel} has more layers than the twin"
 
@@ -375,14 +405,14 @@ def parameter_groups(twin: nn.Module, rate: float, decay: float) -> list[dict]:
     for module in _learning(twin):
         weighs = not isinstance(module, nn.BatchNorm2d)
         groups.append({"params": [module.weight], "lr": rate, "weight_decay": decay if weighs else 0})
-        if module.bias is not None:
+        if getattr(module, "bias", None) is not None:
             groups.append({"params": [module.bias], "lr": 2 * rate if weighs else rate, "weight_decay": 0})
     return groups
 
 
-def _learning(twin: nn.Module) -> Iterator[nn.Conv2d | nn.Linear | nn.BatchNorm2d]:
+def _learning(twin: nn.Module) -> Iterator[nn.Conv2d | nn.Linear | nn.BatchNorm2d | nn.PReLU]:
     for module in twin.modules():
-        if isinstance(module, nn.Conv2d | nn.Linear | nn.BatchNorm2d):
+        if isinstance(module, nn.Conv2d | nn.Linear | nn.BatchNorm2d | nn.PReLU):
             yield module
 
 

@@ -22,6 +22,21 @@ def lenet(n: Any) -> str:
     return _full(n, "ip2", _relu(n, "relu1", _full(n, "ip1", top, 500)), 10)
 
 
+def tiny(n: Any) -> str:
+    """Three layers of at most 20 numbers, as those of reinforcement learning and of tutorials."""
+    top = _relu(n, "relu1", _full(n, "ip1", "data", 20))
+    top = _add(n, "TanH", "tanh2", _full(n, "ip2", top, 20))
+    return _full(n, "ip3", top, 10)
+
+
+def pnet(n: Any) -> str:
+    """Zhang et al. 2016, MTCNN: the first net, on one window; whether it shows a face."""
+    top = _pool(n, "pool1", _prelu(n, "prelu1", _conv(n, "conv1", "data", 10, 3)), 2)
+    top = _prelu(n, "prelu2", _conv(n, "conv2", top, 16, 3))
+    top = _prelu(n, "prelu3", _conv(n, "conv3", top, 32, 3))
+    return _conv(n, "conv4", top, 2, 1)
+
+
 def cifar10_quick(n: Any) -> str:
     """Caffe's quick net for CIFAR-10."""
     top = _relu(n, "relu1", _pool(n, "pool1", _conv(n, "conv1", "data", 32, 5, pad=2), 3))
@@ -148,6 +163,8 @@ def squeezenet(n: Any) -> str:
 SQUEEZENET = ((16, 64), (16, 64), (32, 128), (32, 128), (48, 192), (48, 192), (64, 256), (64, 256))
 
 ZOO: dict[str, tuple[Callable[[Any], str], tuple[int, int, int]]] = {  # the layers, and the image (C, H, W)
+    "tiny": (tiny, (10, 1, 1)),
+    "pnet": (pnet, (3, 12, 12)),
     "lenet": (lenet, (1, 28, 28)),
     "cifar10_quick": (cifar10_quick, (3, 32, 32)),
     "cifar10_full": (cifar10_full, (3, 32, 32)),
@@ -207,6 +224,10 @@ def _full(n: Any, name: str, bottom: str, width: int) -> str:
 
 def _relu(n: Any, name: str, bottom: str) -> str:
     return _add(n, "ReLU", name, bottom, in_place=True)
+
+
+def _prelu(n: Any, name: str, bottom: str) -> str:
+    return _add(n, "PReLU", name, bottom, in_place=True)
 
 
 def _dropout(n: Any, name: str, bottom: str, ratio: float) -> str:

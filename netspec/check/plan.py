@@ -7,6 +7,7 @@ import torch
 from netspec.graph.steps import PASSES, Step
 from netspec.layers.fused import has_bfloat16
 from netspec.net.net import Net
+from netspec.proto.schema import TRAIN
 
 KINDS = {
     "packed": "by oneDNN, weights laid out in advance, channels side by side",
@@ -25,8 +26,12 @@ def plan_text(net: Net) -> str:
     The net must have been built with memory for its weights.
     """
     bfloat16 = f"bfloat16 on this CPU: {_BFLOAT16[has_bfloat16()]}"
+    if net.phase == TRAIN:
+        why = net.training_step()
+        how = f"each pass goes through autograd: {why}" if isinstance(why, str) else "by kernels prepared once"
+        return f"no passes: nets run layer by layer in phase TRAIN. Training in fp32, {how}; {bfloat16}"
     if net.programs is None:
-        return f"no passes: nets run layer by layer in phase TRAIN, and where passes are switched off; {bfloat16}"
+        return f"no passes: nets run layer by layer where passes are switched off; {bfloat16}"
     given = tuple(
         (v, shape, torch.float32)
         for node, layer in zip(net.plan.nodes, net.layers, strict=True)
