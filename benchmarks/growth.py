@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from netspec.errors import SpecError
+
 Found = dict[str, float]  # a column of the table and its value
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -298,7 +300,7 @@ def _in_a_process(python: str, name: str, size: int) -> Found:
     finished = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     if finished.returncode:
         last = (finished.stderr.strip().splitlines() or ["no message"])[-1]
-        raise RuntimeError(f"{name} {size}: {last}")
+        raise SpecError(f"{name} {size}: {last}")
     return json.loads(finished.stdout.splitlines()[-1])
 
 

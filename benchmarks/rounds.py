@@ -17,6 +17,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from netspec.errors import SpecError
+
 ROOT = Path(__file__).resolve().parents[1]
 TURN, MOST = 0.4, 50  # seconds of a turn, and at most so many passes
 FEWEST = 3  # rounds, however long they take
@@ -75,7 +77,7 @@ class Worker:
         """Return their times."""
         said = self._said()
         if isinstance(said, dict):
-            raise RuntimeError(f"{self.name}: {said['fault']}")
+            raise SpecError(f"{self.name}: {said['fault']}")
         return [(clock, computing) for clock, computing in said]
 
     def turn(self, passes: int) -> list[Pass]:
@@ -119,7 +121,7 @@ class Starter:
         self._command = [python, "-m", "benchmarks.start", json.dumps({**task, "result": str(result)})]
         try:
             self.turn(1)  # which also fills the cache
-        except RuntimeError as fault:
+        except SpecError as fault:
             self.fault = str(fault)
         else:
             with np.load(result) as arrays:
@@ -135,7 +137,7 @@ class Starter:
         done = subprocess.run(self._command, env=environment, capture_output=True, text=True, check=False)
         seconds = time.perf_counter() - began
         if done.returncode:
-            raise RuntimeError((done.stderr.strip().splitlines() or ["it failed"])[-1])
+            raise SpecError((done.stderr.strip().splitlines() or ["it failed"])[-1])
         told = json.loads(done.stdout)
         return seconds - told["torch"], told["computing"]
 
@@ -155,14 +157,14 @@ class CaffeProgram:
         self.fault = ""
         try:
             self.turn(1)
-        except (OSError, RuntimeError) as fault:
+        except (OSError, SpecError) as fault:
             self.fault = str(fault)
 
     def turn(self, passes: int) -> list[Pass]:
         """See :class:`Contestant`."""
         found = self._iterations(passes) if self.training else self._passes(passes)
         if not found:
-            raise RuntimeError(f"{self.binary} logs no times that are known here")
+            raise SpecError(f"{self.binary} logs no times that are known here")
         return [(seconds, math.nan) for seconds in found]
 
     def _passes(self, count: int) -> list[float]:
@@ -189,7 +191,7 @@ class CaffeProgram:
             [self.binary, *words], env={**os.environ, **variables}, capture_output=True, text=True, check=False
         )
         if done.returncode:
-            raise RuntimeError((done.stderr.strip().splitlines() or ["it failed"])[-1])
+            raise SpecError((done.stderr.strip().splitlines() or ["it failed"])[-1])
         return done.stderr
 
     def close(self) -> None:
