@@ -190,7 +190,9 @@ def _fault(error: BaseException, path: Path, expected: str) -> InputError:
         return InputError(f"no such file; expected {expected}", path)
     if isinstance(error, InputError):
         return error
-    reason = " ".join(str(error).split()) or type(error).__name__
+    reason = " ".join(str(error).split())
+    if not reason or isinstance(error, LookupError):
+        reason = f"{type(error).__name__} {reason}".rstrip()
     return InputError(f"cannot be read ({reason}); expected {expected}", path)
 
 

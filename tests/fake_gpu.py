@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import pytest
 import torch
 import torch.utils.backend_registration as registration
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -17,6 +16,8 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 NAME = "fake"
 POSSIBLE = hasattr(registration, "_setup_privateuseone_for_python_backend")  # torch 2.9 and later
+#: The kinds of GPU that this machine and this torch have: tests are collected for these.
+GPUS = (["fake"] if POSSIBLE else []) + (["cuda"] if torch.cuda.is_available() else [])
 # Operations that may combine tensors of GPU and CPU: copies, and indices, which may be on the CPU.
 _CROSSING = {"aten::copy_", "aten::_to_copy", "aten::_foreach_copy_", "aten::index", "aten::index_put_"}
 
@@ -88,16 +89,12 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 @contextmanager
 def gpu(kind: str) -> Iterator[str]:
-    """Yield the device of a kind: ``fake``, or ``cuda``, a real one; skip the test where there is none."""
+    """Yield the device of a kind, one of ``GPUS``: ``fake``, or ``cuda``, a real one."""
     if kind == "cuda":
-        if not torch.cuda.is_available():
-            pytest.skip("no GPU here")
         yield "cuda:0"
-    elif not POSSIBLE:
-        pytest.skip("this torch cannot make a fake device")
-    else:
-        with fake_gpu():
-            yield NAME
+        return
+    with fake_gpu():
+        yield NAME
 
 
 @contextmanager

@@ -57,6 +57,8 @@ def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Whe
         raise SpecError(f'list file "{path}" cannot be read: {fault.strerror}', where or Where(path)) from None
     except UnicodeDecodeError:
         raise SpecError(f'list file "{path}" is not UTF-8 text', where or Where(path)) from None
+    if any("\0" in line for line in lines):
+        raise SpecError(f'list file "{path}" is not text: it has a NUL', where or Where(path))
     for number, line in enumerate(lines, 1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield line.strip(), Where(path, number, 1)

@@ -15,6 +15,7 @@ import loopclosure.cli
 import netspec
 import netspec.cli
 from documents import DOCUMENTS, PROGRAMS, blocks, commands
+from each import each
 from netspec.cli import run_script
 from paths import ROOT
 
@@ -42,7 +43,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace | None:
     return PARSERS[program]().parse_args(arguments)
 
 
-@pytest.mark.parametrize("where", SHELL)
+@each("where", SHELL)
 def test_every_command_is_one_that_its_parser_takes(where: str, tmp_path: Path) -> None:
     found = commands(BLOCKS[where].text, tmp_path)
     assert found, "a block without a language is a list of commands"
@@ -70,7 +71,7 @@ def unknown_words(line: str) -> list[str]:
     return [word for word in words if word.startswith("--") and word.partition("=")[0] not in known]
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
+@each("document", DOCUMENTS)
 def test_commands_in_sentences_have_commands_and_options_that_exist(document: str) -> None:
     text = re.sub(r"^```.*?^```$", "", (ROOT / document).read_text(), flags=re.M | re.S)
     for line in re.findall(r"`([^`]+)`", text):
@@ -92,7 +93,7 @@ def test_wrong_words_in_sentences_would_be_found(line: str, unknown: list[str]) 
     assert unknown_words(line) == unknown
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
+@each("document", DOCUMENTS)
 def test_every_block_says_what_it_is(document: str) -> None:
     text = (ROOT / document).read_text()
     assert len(re.findall(r"^\s*(?:```|~~~)", text, re.M)) == 2 * len(blocks(document)), "a block begins a line: ```"
@@ -127,14 +128,14 @@ def test_what_a_shell_does_not_take_is_found(text: str, tmp_path: Path) -> None:
         commands(text, tmp_path)
 
 
-@pytest.mark.parametrize("where", PYTHON)
+@each("where", PYTHON)
 def test_python_blocks_use_names_that_exist(where: str) -> None:
     for node in ast.walk(ast.parse(BLOCKS[where].text)):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "netspec":
             assert hasattr(netspec, node.attr), node.attr
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
+@each("document", DOCUMENTS)
 def test_links_lead_to_files(document: str) -> None:
     path = ROOT / document
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text()):

@@ -1,9 +1,10 @@
 """What every layer owes: a description, the shapes it declares, the gradient of what it computes, a word on misuse."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -12,6 +13,7 @@ import pytest
 import torch
 from google.protobuf import text_format
 
+from each import each
 from fake_gpu import NAME, POSSIBLE, fake_gpu
 from netspec.errors import SpecError, Where
 from netspec.layers import Context, Layer, Random, layer_class, layer_types
@@ -199,26 +201,31 @@ def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu",
     return cls(param, shapes, context)
 
 
-@pytest.fixture
-def exact() -> str:
-    return "small"
+def of_each(names: Iterable[str], exacts: Sequence[str] = ("small",)) -> Callable[..., Any]:
+    """Make one test of a check of a layer: it is run with an example of each type, in double precision."""
 
+    def decorate(check: Callable[[Layer], None]) -> Callable[..., None]:
+        @each("name, exact", [(name, exact) for name in names for exact in exacts])
+        def test(name: str, exact: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+            monkeypatch.chdir(folder)
+            layer = build(name, folder, EXAMPLES[name].shapes, exact=exact)
+            if isinstance(layer, MemoryData):
+                layer.set_input_arrays(np.zeros((4, 3, 4, 5)), np.zeros(4))
+            try:
+                check(layer.double())
+            finally:
+                layer.close()
 
-@pytest.fixture
-def layer(request: pytest.FixtureRequest, folder: Path, monkeypatch: pytest.MonkeyPatch, exact: str) -> Iterator[Layer]:
-    monkeypatch.chdir(folder)
-    built = build(request.param, folder, EXAMPLES[request.param].shapes, exact=exact)
-    if isinstance(built, MemoryData):
-        built.set_input_arrays(np.zeros((4, 3, 4, 5)), np.zeros(4))
-    yield built.double()
-    built.close()
+        return test
+
+    return decorate
 
 
 def test_every_type_has_an_example() -> None:
     assert sorted(EXAMPLES) == TYPES
 
 
-@pytest.mark.parametrize("layer", TYPES, indirect=True)
+@of_each(TYPES)
 def test_docstring_says_what_goes_in_and_out_and_where_caffe_has_it(layer: Layer) -> None:
     lines = [line.strip() for line in (type(layer).__doc__ or "").splitlines()]
     assert lines[0].endswith((".", ":"))
@@ -239,7 +246,7 @@ def _in_a_range(k: int, named: set[str]) -> bool:
     return any(int(first) <= k <= int(last) for first, last in ranges)
 
 
-@pytest.mark.parametrize("layer", TYPES, indirect=True)
+@of_each(TYPES)
 def test_declared_shapes_are_the_real_ones(layer: Layer) -> None:
     example = EXAMPLES[layer.type]
     for times in (1, 3, 1) if example.batch is not None else (1,):
@@ -249,9 +256,7 @@ def test_declared_shapes_are_the_real_ones(layer: Layer) -> None:
     assert [tuple(blob.shape) for blob in layer.blobs] == layer.blob_shapes
 
 
-@pytest.mark.parametrize("exact", ["none", "all"])
-@pytest.mark.parametrize("layer", [name for name in TYPES if EXAMPLES[name].smooth], indirect=True)
-def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
+def gradient_is_that_of_what_it_computes(layer: Layer) -> None:
     bottoms = EXAMPLES[layer.type].bottoms()
     for i, bottom in enumerate(bottoms):
         whole_numbers = bool((bottom == bottom.round()).all())
@@ -264,8 +269,13 @@ def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
     assert torch.autograd.gradcheck(compute, (*bottoms, *learned))
 
 
+SMOOTH = [name for name in TYPES if EXAMPLES[name].smooth]
+test_gradient_in_caffes_order = of_each(SMOOTH, ["all"])(gradient_is_that_of_what_it_computes)
+test_gradient_in_torchs_order = pytest.mark.slow(of_each(SMOOTH, ["none"])(gradient_is_that_of_what_it_computes))
+
+
 @pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
-@pytest.mark.parametrize("name", [name for name in TYPES if name != "Python"])  # whose code sees numpy arrays
+@each("name", [name for name in TYPES if name != "Python"])  # whose code sees numpy arrays
 def test_computes_on_the_gpu_what_it_computes_on_the_cpu(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -292,7 +302,7 @@ def test_computes_on_the_gpu_what_it_computes_on_the_cpu(
         torch.testing.assert_close(on_gpu, on_cpu, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", TYPES)
+@each("name", TYPES)
 def test_a_wrong_number_of_bottoms_is_refused(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     shapes = EXAMPLES[name].shapes

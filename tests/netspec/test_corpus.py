@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from each import each
 from netspec.check.check import check_file
 from netspec.net.table import as_json
 from netspec.proto.schema import TEST, TRAIN
@@ -34,7 +35,7 @@ def given_shapes(name: str) -> dict[str, tuple[int, ...]]:
     return {"data": (4, *image)}
 
 
-@pytest.mark.parametrize("name", sorted(SHAPES))
+@each("name", sorted(SHAPES))
 def test_net_builds_with_caffes_shapes(name: str) -> None:
     (checked,) = check_file(CORPUS / name, TEST)
     assert not checked.faults
@@ -44,7 +45,7 @@ def test_net_builds_with_caffes_shapes(name: str) -> None:
         assert found[part] == SHAPES[name][part], part
 
 
-@pytest.mark.parametrize("name", [name for name in WITH_DATA if not name.endswith(OTHERS)])
+@each("name", [name for name in WITH_DATA if not name.endswith(OTHERS)])
 def test_nets_with_data_layers_and_solvers_check(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     root = CORPUS / Path(name).parts[0]
     monkeypatch.chdir((CORPUS / name).parent if name.startswith("forresti") else root)  # where its paths begin
@@ -55,12 +56,12 @@ def test_nets_with_data_layers_and_solvers_check(name: str, monkeypatch: pytest.
         assert (checked[0].net is None) == (name in SOLVERS)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@each("name", SOLVERS)
 def test_solver_parses(name: str) -> None:
     parse_solver(CORPUS / name)
 
 
-@pytest.mark.parametrize("name", FILES)
+@each("name", FILES)
 def test_net_parses(name: str) -> None:
     if name not in SOLVERS:
         parse_net(CORPUS / name)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from fake_gpu import NAME, POSSIBLE, FakeTensor, fake_gpu, gpu
+from fake_gpu import GPUS, NAME, POSSIBLE, FakeTensor, fake_gpu, gpu
 from netspec.features.describer import Describer
 from netspec.solver.solver import load_solver
 from paths import GOLDEN
@@ -26,7 +26,7 @@ def _gpu() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(params=["fake", "cuda"])
+@pytest.fixture(params=GPUS)
 def device(request: pytest.FixtureRequest) -> Iterator[str]:
     with gpu(request.param) as found:
         yield found

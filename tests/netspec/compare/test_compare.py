@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
+from each import each, last_parts
 from netspec.cli import main
 from netspec.compare.files import compare_files
 from netspec.data.blobs import from_array
@@ -199,9 +200,7 @@ FILES = [*(ROOT / "prototxt").rglob("*.prototxt"), *(SHARED / "corpus").rglob("*
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "path", sorted(path for path in FILES if "solver" not in path.name), ids=lambda path: "/".join(path.parts[-3:])
-)
+@each("path", sorted(path for path in FILES if "solver" not in path.name), last_parts)
 def test_nets_as_they_are_found_equal_what_is_written_of_them(path: Path) -> None:
     upgraded = write_text(parse_net(path)[0])
     Path("written").write_text(upgraded)

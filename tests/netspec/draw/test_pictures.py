@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from drawn_coordinates import SCREEN, faults, texts_of
+from each import each, last_parts
 from netspec.cli import main
 from netspec.draw.blocks import find_blocks
 from netspec.draw.diagram import Box, Diagram, diagram_of
@@ -66,13 +67,13 @@ def random_diagram(seed: int) -> Diagram:
     return Diagram("random", tuple(boxes), tuple(reads), tuple(tops))
 
 
-@pytest.mark.parametrize("seed", range(60))
+@each("seed", range(60))
 def test_nothing_overlaps_whatever_the_wiring(seed: int) -> None:
     assert list(faults(picture_of(random_diagram(seed)))) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", [*OWN, *CORPUS], ids=lambda path: "/".join(path.parts[-3:]))
+@each("path", [*OWN, *CORPUS], last_parts)
 def test_nothing_overlaps_in_nets_as_they_are_found(path: Path) -> None:
     picture = picture_of(diagram_of(*parse_net(path), PHASES, shapes={"pair_data": (8, 6, 224, 224)}))
     assert [*faults(picture), *faults(picture, unfolded=True)] == []

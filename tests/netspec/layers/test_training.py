@@ -1,11 +1,13 @@
 """The kernels of training compute what autograd computes, to the last bit, pass after pass."""
 
 import copy
+from itertools import product
 
-import pytest
 import torch
 from google.protobuf import text_format
 
+from each import each
+from netspec.exact import CHOICES
 from netspec.layers import Context, Layer, Random, layer_class
 from netspec.layers.training import Learning, recorded
 from netspec.proto.schema import TRAIN, LayerParameter
@@ -68,9 +70,7 @@ def build(name: str, text: str, shapes: list[tuple[int, ...]], exact: str) -> La
     return cls(param, shapes, Context(phase=TRAIN, random=Random(0), exact=exact, accumulate_in_place=True))
 
 
-@pytest.mark.parametrize("sideways", [False, True])
-@pytest.mark.parametrize("exact", ["none", "small", "all"])
-@pytest.mark.parametrize(("name", "text", "shapes"), ALL)
+@each("name, text, shapes, exact, sideways", [(*case, *how) for case in ALL for how in product(CHOICES, (False, True))])
 def test_kernels_are_what_autograd_computes(
     name: str, text: str, shapes: list[tuple[int, ...]], exact: str, sideways: bool
 ) -> None:

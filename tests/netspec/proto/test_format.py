@@ -7,6 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from each import each, last_parts
 from netspec.cli import main
 from netspec.errors import SpecError
 from netspec.proto.format import WIDTH, format_text
@@ -147,7 +148,8 @@ def comments(text: str) -> list[str]:
     return [line.partition("#")[2].strip() for line in text.split("\n")]
 
 
-@pytest.mark.parametrize("path", [*OWN, *OTHERS], ids=lambda path: "/".join(path.parts[-3:]))
+@pytest.mark.slow
+@each("path", [*OWN, *OTHERS], last_parts)
 def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
     text = text_of(path)
     formed = format_text(text, str(path))
@@ -161,7 +163,7 @@ def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
         assert parse(formed, str(path))[0] == before
 
 
-@pytest.mark.parametrize("path", OWN, ids=lambda path: "/".join(path.parts[-3:]))
+@each("path", OWN, last_parts)
 def test_the_projects_own_files_have_the_form(path: Path) -> None:
     assert format_text(text_of(path), str(path)) == text_of(path)
 

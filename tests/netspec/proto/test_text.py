@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from google.protobuf import text_format
 
+from each import each, last_parts
 from netspec.errors import SpecError
 from netspec.proto.lexer import FLOAT, INTEGER, NAME, STRING, Lexer
 from netspec.proto.reader import read_text
@@ -235,7 +236,7 @@ def outcome(text: str) -> Any:
         return error
 
 
-@pytest.mark.parametrize("seed", range(300))
+@each("seed", range(300))
 def test_damaged_text_is_refused_or_read_alike(seed: int) -> None:
     """Whatever is done to a text: it is a SpecError, or the message that protobuf reads from it."""
     draw = random.Random(seed)
@@ -262,12 +263,13 @@ def test_damaged_text_is_refused_or_read_alike(seed: int) -> None:
 
 
 def prototxts() -> list[Path]:
-    own = sorted(set(GOLDEN.rglob("*.prototxt")) - {GOLDEN / "dnn" / "detect.prototxt"})  # that one is SSD's
+    forks = {GOLDEN / "dnn" / "detect.prototxt", *(GOLDEN / "ssd").rglob("*.prototxt")}  # with fields of their own
+    own = sorted(set(GOLDEN.rglob("*.prototxt")) - forks)
     return [*own, *sorted((SHARED / "corpus").rglob("*.prototxt"))]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", prototxts(), ids=lambda path: "/".join(path.parts[-3:]))
+@each("path", prototxts(), last_parts)
 def test_files_read_as_protobuf_reads_them(path: Path) -> None:
     cls = message_class(path)
     expected = text_format.Parse(path.read_text(encoding="utf-8"), cls())

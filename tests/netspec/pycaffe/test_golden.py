@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
+from each import each
 from golden_cases import EVERY, SAMPLED, LayerCase, assert_same_layers, lay_out_examples, promised, set_parameters
 from netspec.pycaffe import mode
 from netspec.pycaffe.solver import Solver
@@ -29,7 +30,7 @@ def exact() -> Iterator[Callable[[str], None]]:
     mode.set_exact(before)
 
 
-@pytest.mark.parametrize("folder", LAYERS, ids=lambda path: path.name)
+@each("folder", LAYERS)
 def test_blobs_hold_what_caffes_held(folder: Path) -> None:
     case = LayerCase(folder)
     found = compute(case)
@@ -42,7 +43,7 @@ def test_blobs_hold_what_caffes_held(folder: Path) -> None:
         assert worst <= TOLERANCE, f"{key}: off by {worst:.2e} of the largest element"
 
 
-@pytest.mark.parametrize("folder", LAYERS, ids=lambda path: path.name)
+@each("folder", LAYERS)
 def test_blobs_hold_caffes_bits(folder: Path, exact: Callable[[str], None], same_blas: bool) -> None:
     if not same_blas:
         pytest.skip("another kind of CPU than Caffe's: its BLAS rounds differently")

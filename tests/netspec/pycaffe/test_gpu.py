@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import netspec.pycaffe as caffe
+from each import each
 from fake_gpu import NAME, POSSIBLE, fake_gpu
 from golden_cases import LayerCase
 from netspec.pycaffe import mode
@@ -26,7 +27,7 @@ def _gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("folder", LAYERS, ids=lambda path: path.name)
+@each("folder", LAYERS)
 def test_blobs_hold_what_caffes_held(folder: Path) -> None:
     case = LayerCase(folder)
     for key, value in compute(case).items():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
+from each import each
 
 pytestmark = pytest.mark.slow
 
@@ -145,7 +146,7 @@ USES = {
 }
 
 
-@pytest.mark.parametrize("use", USES, ids=lambda use: use.replace("/", " "))
+@each("use", USES)
 def test_what_scripts_do(use: str, write: Callable[..., str]) -> None:
     for name, text in (("deploy", NET), ("memory", MEMORY), ("train", TRAINED), ("solver", SOLVER)):
         write(text, f"{name}.prototxt")

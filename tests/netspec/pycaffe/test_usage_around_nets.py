@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as pycaffe
+from each import each
 from netspec.dialects import use_dialect
 from netspec.scripts import finder
 
@@ -130,7 +131,7 @@ def as_in_netspec_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
         del sys.modules[name]
 
 
-@pytest.mark.parametrize("use", USES, ids=lambda use: use.replace("/", " "))
+@each("use", USES)
 def test_what_scripts_do(use: str) -> None:
     if "draw" in use:
         pytest.importorskip("pydot")
