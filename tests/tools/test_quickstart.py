@@ -1,5 +1,6 @@
 """The quick start keeps what is there, starts every command in its own folder, and ends with five lines."""
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -35,7 +36,9 @@ def project(tmp_path: Path) -> Path:
 
 
 def start(project: Path, folder: Path) -> list[str]:
-    done = subprocess.run([project / "tools" / "quickstart"], cwd=folder, capture_output=True, text=True, check=False)
+    own = {name: value for name, value in os.environ.items() if name != "VENV"}  # which names this run's environment
+    command = [project / "tools" / "quickstart"]
+    done = subprocess.run(command, cwd=folder, env=own, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
