@@ -17,12 +17,14 @@ import torch
 from netspec.exact.blas import gemm_routine, gemv_routine
 from netspec.exact.products import Filter, columns_of_shape
 
+SMALL = 2**14  # numbers that are copied sooner than shown
+
 
 class Matrix:
     """Shows tensors as matrices with so many columns, to BLAS, which takes them as transposed.
 
     A tensor that comes again, the same object, has its view from the last time. One whose numbers do not lie one after
-    the other is copied.
+    the other is copied, and so is a small one that is another each time: to make a view takes longer.
     """
 
     __slots__ = ("_columns", "_copy", "_last", "_shown", "_tensor")
@@ -36,7 +38,7 @@ class Matrix:
         """Return the view, (columns, rows)."""
         if tensor is self._last:
             return self._shown
-        if tensor.is_contiguous():
+        if tensor.is_contiguous() and (self._last is None or tensor.numel() > SMALL):
             self._last = tensor
             self._shown = tensor.view(-1, self._columns).numpy().T
             return self._shown

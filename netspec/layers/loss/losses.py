@@ -457,14 +457,16 @@ class EuclideanLoss(Loss):
     def prepare_training(self, learning: Learning) -> Kernels:
         shape, other = self.bottom_shapes
         difference, found = torch.empty(shape), [torch.empty(shape) if wanted else None for wanted in learning.wanted]
-        row, divisor, exact = difference.view(1, -1), 2 * shape[0], self.is_exact(difference)
+        row, squares, exact = difference.view(1, -1), torch.empty(shape), self.is_exact(difference)
+        count = torch.tensor(float(shape[0]))  # a number would be made a tensor at each pass
+        divisor = 2 * count
 
         def forward(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
             torch.sub(a, b.reshape(shape), out=difference)
-            return (RowSquares.apply(row)[0] if exact else difference.square().sum()) / divisor
+            return (RowSquares.apply(row)[0] if exact else torch.square(difference, out=squares).sum()) / divisor
 
         def backward(diff: torch.Tensor) -> Sequence[torch.Tensor | None]:
-            factor = diff / shape[0]  # rounded as diff / divisor, which is half of it
+            factor = diff / count  # twice diff / divisor, to the last bit
             if found[0] is not None:
                 torch.mul(difference, factor, out=found[0])
             if found[1] is not None:
