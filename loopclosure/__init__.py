@@ -11,8 +11,6 @@ if TYPE_CHECKING:
 
 __all__ = ["LoopDetector", "LoopResult"]
 
-__path__.append(f"{__path__[0]}/moved")  # loopclosure.baselines, a former name
-
 
 def __getattr__(name: str) -> "Any":
     if name in __all__:

@@ -56,9 +56,6 @@ def unload_ipython_extension(ipython: object) -> None:
     finder.uninstall()
 
 
-__path__.append(f"{__path__[0]}/moved")  # netspec.describe and others, by the names they had before
-
-
 def __getattr__(name: str) -> "Any":
     import importlib.util
 

@@ -24,7 +24,7 @@ from loopclosure.places.trajectory import PosedSequence, Poses
 SAME_SEQUENCE, ONE_FRAME, ONE_SCENE, OTHER_SCENE = range(4)
 NEGATIVES = ("same_sequence", "cross_sequence", "both")
 
-NEIGHBOUR_S = 3.0  # images less than this apart are neighbors in time, not two visits to a place
+NEIGHBOR_S = 3.0  # images less than this apart are neighbors in time, not two visits to a place
 NEAR_FACTOR = 2.0  # a negative pair within this factor of the rule's limits shows nearly the same
 TOO_MANY = 0.2
 
@@ -141,8 +141,8 @@ class PoseSource:
         labels = np.full(len(first), LEFT_OUT, np.int8)
         labels[comparable & same] = POSITIVE
         labels[((comparable & apart) | (relation == OTHER_SCENE)) & wanted_origin] = NEGATIVE
-        neighbours = np.abs(self.stamps[first] - self.stamps[second]) < rule.min_gap_s
-        labels[(relation == SAME_SEQUENCE) & neighbours] = LEFT_OUT
+        neighbors = np.abs(self.stamps[first] - self.stamps[second]) < rule.min_gap_s
+        labels[(relation == SAME_SEQUENCE) & neighbors] = LEFT_OUT
         return labels
 
     def positives(self) -> None:
@@ -174,10 +174,10 @@ class PoseSource:
                 "--same-frame, or --different-scenes if all scenes differ"
             )
         measures = self.measures(first, second)
-        neighbours = np.mean(measures["time gap [s]"][labels == POSITIVE] < NEIGHBOUR_S) if POSITIVE in labels else 0.0
-        if neighbours > 0.5:
+        neighbors = np.mean(measures["time gap [s]"][labels == POSITIVE] < NEIGHBOR_S) if POSITIVE in labels else 0.0
+        if neighbors > 0.5:
             found.append(
-                f"{neighbours:.0%} of the positives are images less than {NEIGHBOUR_S:g} s apart, not two visits to a "
+                f"{neighbors:.0%} of the positives are images less than {NEIGHBOR_S:g} s apart, not two visits to a "
                 "place: --min-gap sets a minimum"
             )
         negative = (labels == NEGATIVE) & (relation <= ONE_FRAME)

@@ -30,11 +30,11 @@ def contact_sheet(list_file: Path, root: Path, rows: int = 6, seed: int = 1) -> 
     pairs = read_pair_list(list_file)
     rng = np.random.default_rng(seed)
     columns = []
-    for label, title, colour in SIDES:
+    for label, title, color in SIDES:
         of_label = [pair for pair in pairs if pair.label == label]
         sample = [of_label[index] for index in sorted(rng.permutation(len(of_label))[:rows])]
-        tiles = [_title(f"{title} (label {label}, {len(of_label)} pairs)", colour)]
-        tiles += [_pair(pair, list_file, root, colour) for pair in sample]
+        tiles = [_title(f"{title} (label {label}, {len(of_label)} pairs)", color)]
+        tiles += [_pair(pair, list_file, root, color) for pair in sample]
         columns.append(np.vstack(tiles))
     height = max(len(column) for column in columns)
     gap = np.full((height, 4 * BORDER, 3), PAPER, np.uint8)
@@ -62,15 +62,15 @@ def write_contact_sheet(list_file: Path, root: Path, out: Path, rows: int = 6, s
         unfinished.write_bytes(picture.tobytes())
 
 
-def _title(text: str, colour: tuple[int, int, int]) -> NDArray:
+def _title(text: str, color: tuple[int, int, int]) -> NDArray:
     tile = np.full((TITLE, _width(), 3), PAPER, np.uint8)
-    cv2.putText(tile, text, (BORDER, TITLE - 14), FONT, 0.65, colour, 2, cv2.LINE_AA)
+    cv2.putText(tile, text, (BORDER, TITLE - 14), FONT, 0.65, color, 2, cv2.LINE_AA)
     return tile
 
 
-def _pair(pair: ListedPair, list_file: Path, root: Path, colour: tuple[int, int, int]) -> NDArray:
+def _pair(pair: ListedPair, list_file: Path, root: Path, color: tuple[int, int, int]) -> NDArray:
     tile = np.full((IMAGE_HEIGHT + 2 * BORDER + CAPTION, _width(), 3), PAPER, np.uint8)
-    cv2.rectangle(tile, (0, 0), (_width() - 1, IMAGE_HEIGHT + 2 * BORDER - 1), colour, -1)
+    cv2.rectangle(tile, (0, 0), (_width() - 1, IMAGE_HEIGHT + 2 * BORDER - 1), color, -1)
     for number, name in enumerate((pair.first, pair.second)):
         try:
             picture = read_bgr(root / name)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmdb_build.walk import textures as paint
-from lmdb_build.walk.textures import Texture, colour
+from lmdb_build.walk.textures import Texture, color
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Theme:
     furniture: tuple[Furniture, ...]
 
 
-def _timber(rng: np.random.Generator) -> paint.Colour:
-    return colour(rng.uniform(0.03, 0.1), rng.uniform(0.3, 0.75), rng.uniform(0.25, 0.75))
+def _timber(rng: np.random.Generator) -> paint.Color:
+    return color(rng.uniform(0.03, 0.1), rng.uniform(0.3, 0.75), rng.uniform(0.25, 0.75))
 
 
 def _solid(rng: np.random.Generator, width: float, depth: float, height: float, front: Texture) -> Piece:
@@ -71,20 +71,20 @@ def chest(rng: np.random.Generator, hue: float) -> Piece:
 
 def wardrobe(rng: np.random.Generator, hue: float) -> Piece:
     """A wardrobe with doors, in a color that goes with the room."""
-    tint = colour(hue + rng.choice([0.08, 0.5]), rng.uniform(0.15, 0.5), rng.uniform(0.5, 0.9))
+    tint = color(hue + rng.choice([0.08, 0.5]), rng.uniform(0.15, 0.5), rng.uniform(0.5, 0.9))
     return _solid(rng, rng.uniform(1.1, 1.6), 0.6, 2.1, paint.drawers(tint, int(rng.integers(2, 4)), 1))
 
 
 def fridge(rng: np.random.Generator, hue: float) -> Piece:
     """A tall and narrow refrigerator, white or colored."""
-    tint = colour(hue + 0.45, rng.choice([0.02, 0.6]), 0.9)
+    tint = color(hue + 0.45, rng.choice([0.02, 0.6]), 0.9)
     body = paint.plain(tint, 0.03)
     return Piece(0.65, 0.65, 1.8, (Box(0, 0.65, 0, 0.65, 0, 1.8, paint.drawers(tint, 1, 2), body, body),))
 
 
 def counter(rng: np.random.Generator, hue: float) -> Piece:
     """Kitchen cupboards with a stove among them, and a row of cupboards above."""
-    tint = colour(hue + 0.1, rng.uniform(0.3, 0.7), rng.uniform(0.5, 0.9))
+    tint = color(hue + 0.1, rng.uniform(0.3, 0.7), rng.uniform(0.5, 0.9))
     board, body = paint.plain((70, 75, 80), 0.2), paint.plain(tint)
     cupboards = paint.drawers(tint, 2, 1)
     boxes = (
@@ -104,8 +104,8 @@ def washer(rng: np.random.Generator, hue: float) -> Piece:
 
 def tub(rng: np.random.Generator, hue: float) -> Piece:
     """A bathtub with water in it."""
-    white, water = paint.plain((240, 240, 238), 0.03), paint.plain(colour(0.52, 0.4, 0.85), 0.1)
-    skirt = paint.tiles((240, 240, 240), colour(hue, 0.6, 0.7), 0.15)
+    white, water = paint.plain((240, 240, 238), 0.03), paint.plain(color(0.52, 0.4, 0.85), 0.1)
+    skirt = paint.tiles((240, 240, 240), color(hue, 0.6, 0.7), 0.15)
     boxes = (
         Box(0, 1.7, 0, 0.75, 0, 0.55, skirt, white, white),
         Box(0.1, 1.6, 0.1, 0.65, 0.54, 0.56, white, white, water),
@@ -116,9 +116,9 @@ def tub(rng: np.random.Generator, hue: float) -> Piece:
 def sofa(rng: np.random.Generator, hue: float) -> Piece:
     """A sofa with a cushion."""
     width = rng.uniform(1.6, 2.2)
-    base = colour(hue + rng.choice([0.33, 0.5, 0.67]), rng.uniform(0.4, 0.8), rng.uniform(0.35, 0.8))
-    cloth = paint.plaid(base, colour(hue, 0.4, 0.8)) if rng.uniform() < 0.5 else paint.plain(base, 0.08)
-    cushion = paint.plain(colour(rng.uniform(), 0.8, 0.9), 0.05)
+    base = color(hue + rng.choice([0.33, 0.5, 0.67]), rng.uniform(0.4, 0.8), rng.uniform(0.35, 0.8))
+    cloth = paint.plaid(base, color(hue, 0.4, 0.8)) if rng.uniform() < 0.5 else paint.plain(base, 0.08)
+    cushion = paint.plain(color(rng.uniform(), 0.8, 0.9), 0.05)
     at = rng.uniform(0.3, width - 0.7)
     boxes = (
         Box(0, width, 0, 0.85, 0, 0.42, cloth, cloth, cloth),
@@ -145,7 +145,7 @@ def bed(rng: np.random.Generator, hue: float) -> Piece:
     """A bed with its head at the wall."""
     width = rng.uniform(1.0, 1.6)
     timber = paint.plain(_timber(rng), 0.1)
-    cover = paint.plaid(colour(hue + 0.5, 0.5, 0.7), colour(hue + 0.15, 0.6, 0.9))
+    cover = paint.plaid(color(hue + 0.5, 0.5, 0.7), color(hue + 0.15, 0.6, 0.9))
     pillow = paint.plain((240, 240, 245), 0.05)
     boxes = (
         Box(0, width, 0, 2.0, 0, 0.3, timber, timber, timber),
@@ -173,7 +173,7 @@ def desk(rng: np.random.Generator, hue: float) -> Piece:
 def table(rng: np.random.Generator, hue: float) -> Piece:
     """A table on four legs with a cloth."""
     timber = paint.plain(_timber(rng), 0.1)
-    cloth = paint.plaid((235, 235, 240), colour(hue + 0.5, 0.8, 0.7))
+    cloth = paint.plaid((235, 235, 240), color(hue + 0.5, 0.8, 0.7))
     boxes = [Box(0, 1.2, 0.1, 0.9, 0.7, 0.76, cloth, cloth, cloth)]
     for left in (0.03, 1.11):
         boxes += [Box(left, left + 0.06, near, near + 0.06, 0, 0.7, timber, timber, timber) for near in (0.13, 0.81)]
@@ -184,7 +184,7 @@ def crates(rng: np.random.Generator, hue: float) -> Piece:
     """A stack of colored crates."""
     boxes = []
     for level, left in ((0, 0.0), (0, 0.55), (1, rng.uniform(0, 0.5))):
-        tint = colour(rng.uniform(), 0.75, 0.75)
+        tint = color(rng.uniform(), 0.75, 0.75)
         face = paint.stripes(tint, paint.shade(tint, 0.6), 0.1)
         boxes.append(Box(left, left + 0.5, 0, 0.5, 0.45 * level, 0.45 * level + 0.44, face, face, paint.plain(tint)))
     return Piece(1.05, 0.5, 0.9, tuple(boxes))
@@ -192,8 +192,8 @@ def crates(rng: np.random.Generator, hue: float) -> Piece:
 
 def plant(rng: np.random.Generator, hue: float) -> Piece:
     """A rectangular shrub in a pot."""
-    leaves = paint.motif(colour(0.33, 0.7, 0.35), colour(rng.uniform(0.25, 0.4), 0.8, 0.6), 0.1)
-    pot = paint.plain(colour(0.04, 0.7, rng.uniform(0.5, 0.8)))
+    leaves = paint.motif(color(0.33, 0.7, 0.35), color(rng.uniform(0.25, 0.4), 0.8, 0.6), 0.1)
+    pot = paint.plain(color(0.04, 0.7, rng.uniform(0.5, 0.8)))
     tall = rng.uniform(1.0, 1.5)
     boxes = (
         Box(0.08, 0.42, 0.08, 0.42, 0, 0.4, pot, pot, pot),
@@ -202,8 +202,8 @@ def plant(rng: np.random.Generator, hue: float) -> Piece:
     return Piece(0.5, 0.5, tall, boxes)
 
 
-def _tint(hue: float, saturation: float = 0.35, value: float = 0.85) -> paint.Colour:
-    return colour(hue, saturation, value)
+def _tint(hue: float, saturation: float = 0.35, value: float = 0.85) -> paint.Color:
+    return color(hue, saturation, value)
 
 
 LIVING_ROOM = Theme(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lmdb_build.walk import textures as paint
 from lmdb_build.walk.furniture import THEMES, Box, Piece, Theme
-from lmdb_build.walk.textures import PIXELS_PER_METRE, Image, Texture
+from lmdb_build.walk.textures import PIXELS_PER_METER, Image, Texture
 from netspec.files.opencv import cv2
 
 Vector = NDArray[np.float64]
@@ -212,8 +212,8 @@ def _furnish(
 def _openings(wall: Wall, doors: list[tuple[Vector, Vector]]) -> list[tuple[float, float]]:
     """Return the doors in the wall, as intervals along it in meters."""
     gaps = []
-    for centre, through in doors:
-        offset = centre - wall.start
+    for center, through in doors:
+        offset = center - wall.start
         along = float(offset @ wall.right)
         if abs(offset @ wall.inward) < 2 * HALF_WALL_M and abs(through @ wall.inward) > 0.5 and 0 < along < wall.length:
             gaps.append((along - DOOR_WIDTH_M / 2, along + DOOR_WIDTH_M / 2))
@@ -240,13 +240,13 @@ def _wall_with_doors(room: int, wall: Wall, gaps: list[tuple[float, float]], tex
     return quads
 
 
-def _jamb(room: int, centre: Vector, through: Vector) -> list[Quad]:
+def _jamb(room: int, center: Vector, through: Vector) -> list[Quad]:
     """Return the four faces of the wall's thickness in a doorway."""
     across = np.array([through[1], -through[0]])  # to the right when walking through
     timber = np.full((64, 16, 3), (90, 130, 170), np.uint8)
     depth, down = np.append(2 * HALF_WALL_M * through, 0), np.array([0, 0, -DOOR_HEIGHT_M])
-    left = np.append(centre - DOOR_WIDTH_M / 2 * across - HALF_WALL_M * through, DOOR_HEIGHT_M)
-    right = np.append(centre + DOOR_WIDTH_M / 2 * across + HALF_WALL_M * through, DOOR_HEIGHT_M)
+    left = np.append(center - DOOR_WIDTH_M / 2 * across - HALF_WALL_M * through, DOOR_HEIGHT_M)
+    right = np.append(center + DOOR_WIDTH_M / 2 * across + HALF_WALL_M * through, DOOR_HEIGHT_M)
     width = np.append(DOOR_WIDTH_M * across, 0)
     return [
         Quad(left, depth, down, timber, room),
@@ -340,10 +340,10 @@ def _shadows(floor: Image, room: Room) -> None:
     x0, _, _, y1 = room.bounds
     dark = np.zeros(floor.shape[:2], np.float32)
     for p0, o0, p1, o1 in room.footprints:
-        corner = (round((p0 - x0) * PIXELS_PER_METRE), round((y1 - o1) * PIXELS_PER_METRE))
-        opposite = (round((p1 - x0) * PIXELS_PER_METRE), round((y1 - o0) * PIXELS_PER_METRE))
+        corner = (round((p0 - x0) * PIXELS_PER_METER), round((y1 - o1) * PIXELS_PER_METER))
+        opposite = (round((p1 - x0) * PIXELS_PER_METER), round((y1 - o0) * PIXELS_PER_METER))
         cv2.rectangle(dark, corner, opposite, 0.55, -1)
-    dark = cv2.GaussianBlur(dark, (0, 0), 0.1 * PIXELS_PER_METRE)
+    dark = cv2.GaussianBlur(dark, (0, 0), 0.1 * PIXELS_PER_METER)
     floor[:] = (floor * (1 - dark[..., None])).astype(np.uint8)
 
 

@@ -32,13 +32,13 @@ class Camera:
     focal: float
 
     @property
-    def centre(self) -> tuple[float, float]:
+    def center(self) -> tuple[float, float]:
         """The principal point (column, row): the center of the picture."""
         return (self.width - 1) / 2, (self.height - 1) / 2
 
     def project(self, points: Array) -> Array:
         """Project points (..., 3) in camera coordinates, in front of the camera, to pixels (..., 2)."""
-        return points[..., :2] / points[..., 2:] * self.focal + np.array(self.centre)
+        return points[..., :2] / points[..., 2:] * self.focal + np.array(self.center)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Renderer:
         self._normals = np.cross(downs, rights)
         self._across = rights / (rights**2).sum(axis=1, keepdims=True)
         self._along = downs / (downs**2).sum(axis=1, keepdims=True)
-        u, v = camera.centre
+        u, v = camera.center
         self._rays = np.array(
             [[1 / camera.focal, 0, -u / camera.focal], [0, 1 / camera.focal, -v / camera.focal], [0, 0, 1]]
         )
@@ -138,8 +138,8 @@ class Renderer:
         seen = cv2.moments(mask, binaryImage=True)
         if not seen["m00"]:
             return
-        centre = np.array([x0 + seen["m10"] / seen["m00"], y0 + seen["m01"] / seen["m00"], 1])
-        texture = pyramid[_level(to_unit, centre, pyramid)]
+        center = np.array([x0 + seen["m10"] / seen["m00"], y0 + seen["m01"] / seen["m00"], 1])
+        texture = pyramid[_level(to_unit, center, pyramid)]
         to_texture = np.array([[texture.shape[1], 0, -0.5], [0, texture.shape[0], -0.5], [0, 0, 1]]) @ to_unit
         patch = cv2.warpPerspective(
             texture,

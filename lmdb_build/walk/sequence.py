@@ -119,7 +119,7 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
         yield path
     camera = walk.camera
     calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "
-    calibration += f"{camera.centre[0]:g} {camera.centre[1]:g} {camera.width} {camera.height}\n"
+    calibration += f"{camera.center[0]:g} {camera.center[1]:g} {camera.width} {camera.height}\n"
     with whole_file(folder / "calibration.txt") as unfinished:
         unfinished.write_text(calibration, encoding="utf-8")
     write_groundtruth(

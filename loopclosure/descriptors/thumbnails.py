@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -29,11 +29,8 @@ class Thumbnailer:
     height: int = 24
     normalize: str = "image"
     patch: int = 8
-    normalise: InitVar[str | None] = None  # British spelling of normalize, still accepted
 
-    def __post_init__(self, normalise: str | None) -> None:
-        if normalise is not None:
-            object.__setattr__(self, "normalize", normalise)
+    def __post_init__(self) -> None:
         if self.normalize not in NORMALIZATIONS:
             raise InputError(f'unknown normalization "{self.normalize}"; known: {", ".join(NORMALIZATIONS)}')
         if min(self.width, self.height, self.patch) < 1:

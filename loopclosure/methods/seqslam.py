@@ -50,8 +50,6 @@ class SequenceSettings:
     edges: str = "shorten"
 
     def __post_init__(self) -> None:
-        if self.anchor == "centre":  # the British spelling, still accepted
-            object.__setattr__(self, "anchor", "center")
         for value, choices, name in (
             (self.directions, DIRECTIONS, "directions"),
             (self.anchor, ANCHORS, "anchor"),

@@ -10,8 +10,6 @@ from loopclosure.errors import InputError
 YES_NO = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 # Not settable: the name is the method's, the seed is that of the whole evaluation.
 FIXED = ("name", "seed")
-# Other names of settings: a British spelling, and a shorter word.
-ALIASES = {"normalise": "normalize", "inliers": "min_inliers"}
 
 
 def configure(method: str, argument: str, *parts: Any) -> list[Any]:
@@ -24,7 +22,6 @@ def configure(method: str, argument: str, *parts: Any) -> list[Any]:
     known = {f.name: i for i, part in reversed(list(enumerate(parts))) for f in fields(part) if _settable(part, f.name)}
     for item in filter(None, (text.strip() for text in argument.split(","))):
         key, equals, value = (text.strip() for text in item.partition("="))
-        key = ALIASES.get(key, key)
         if not equals or key not in known:
             raise InputError(f'{method} has no setting "{item}"; write setting=value with {", ".join(sorted(known))}')
         changes[known[key]][key] = _read(method, key, value, getattr(parts[known[key]], key))

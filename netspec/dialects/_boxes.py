@@ -74,11 +74,11 @@ def coverage(first: Array, second: Array) -> Array:
 
 def encode(boxes: Array, priors: Array, variances: Array | None, code: int) -> Array:
     """Return boxes (n, 4) relative to their priors (n, 4), divided by the variances (n, 4) unless None."""
-    (low, high), (extent, centre) = _corners(priors), _centres(priors)
+    (low, high), (extent, center) = _corners(priors), _centers(priors)
     box_low, box_high = _corners(boxes)
     if code == CENTER_SIZE:
-        box_extent, box_centre = _centres(boxes)
-        codes = np.concatenate([(box_centre - centre) / extent, np.log(box_extent / extent)], axis=1)
+        box_extent, box_center = _centers(boxes)
+        codes = np.concatenate([(box_center - center) / extent, np.log(box_extent / extent)], axis=1)
     else:
         scale = extent if code == CORNER_SIZE else np.float32(1)
         codes = np.concatenate([(box_low - low) / scale, (box_high - high) / scale], axis=1)
@@ -87,13 +87,13 @@ def encode(boxes: Array, priors: Array, variances: Array | None, code: int) -> A
 
 def decode(codes: Array, priors: Array, variances: Array | None, code: int) -> Array:
     """Return the boxes (n, 4) of which :func:`encode` makes ``codes``."""
-    (low, high), (extent, centre) = _corners(priors), _centres(priors)
+    (low, high), (extent, center) = _corners(priors), _centers(priors)
     if variances is not None:
         codes = codes * variances
     first, second = _corners(codes)
     if code == CENTER_SIZE:
-        box_centre, half = first * extent + centre, np.exp(second) * extent / np.float32(2)
-        return np.concatenate([box_centre - half, box_centre + half], axis=1)
+        box_center, half = first * extent + center, np.exp(second) * extent / np.float32(2)
+        return np.concatenate([box_center - half, box_center + half], axis=1)
     scale = extent if code == CORNER_SIZE else np.float32(1)
     return np.concatenate([low + first * scale, high + second * scale], axis=1)
 
@@ -102,7 +102,7 @@ def _corners(boxes: Array) -> tuple[Array, Array]:
     return boxes[:, :2], boxes[:, 2:]
 
 
-def _centres(boxes: Array) -> tuple[Array, Array]:
+def _centers(boxes: Array) -> tuple[Array, Array]:
     low, high = _corners(boxes)
     return high - low, (low + high) / np.float32(2)
 

@@ -120,8 +120,8 @@ def _msra(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor
 def _bilinear(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
     width = shape[3]
     factor = (width + 1) // 2
-    centre = (width - 1) / (2.0 * factor)
-    ramp = 1 - (torch.arange(width, dtype=torch.float64) / factor - centre).abs()
+    center = (width - 1) / (2.0 * factor)
+    ramp = 1 - (torch.arange(width, dtype=torch.float64) / factor - center).abs()
     return torch.outer(ramp, ramp).float().expand(shape).contiguous()
 
 

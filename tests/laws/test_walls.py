@@ -1,6 +1,5 @@
 """The rules for imports between packages, and light imports that must stay light."""
 
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -40,13 +39,3 @@ def test_nobody_imports_the_doors() -> None:
                 words = line.split()
                 if words[:1] in (["import"], ["from"]):
                     assert words[1].split(".")[0] not in ("tools", "prototxt", "tests"), path
-
-
-@pytest.mark.parametrize(
-    ("old", "name"),
-    [("netspec.describe", "Describer"), ("loopclosure.baselines.thumbnails", "Thumbnailer")],
-)
-def test_names_in_users_commands_stay_valid(old: str, name: str) -> None:
-    found = getattr(importlib.import_module(old), name)
-    assert found.__module__ != old
-    assert getattr(importlib.import_module(found.__module__), name) is found

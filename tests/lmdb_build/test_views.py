@@ -94,17 +94,17 @@ def test_batches_that_cannot_be_made_are_refused(settings: dict, words: str) -> 
 
 
 def test_two_views_about_one_point_overlap() -> None:
-    # Colours that say where a pixel was: blue its row, green its column.
+    # Colors that say where a pixel was: blue its row, green its column.
     rows, columns = np.mgrid[0:120, 0:200]
     image = np.dstack([rows, columns, np.zeros_like(rows)]).astype(np.uint8)
     rng = np.random.default_rng(3)
-    centres = []
+    centers = []
     for about in ([0.0, 0.0], [1.0, 1.0]):
         views = [cut_view(image, (64, 48), np.array(about), rng) for _ in range(20)]
         assert all(view.shape == (48, 64, 3) and view.dtype == np.uint8 for view in views)
         assert len({view.tobytes() for view in views}) == 20
-        centres.append(np.mean([view[20:28, 28:36, 1].mean() for view in views]))
-    assert centres[1] > centres[0] + 20
+        centers.append(np.mean([view[20:28, 28:36, 1].mean() for view in views]))
+    assert centers[1] > centers[0] + 20
 
 
 def test_the_points_of_view_of_a_place_differ_as_strongly_as_asked() -> None:

@@ -50,7 +50,7 @@ def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
 def test_evaluate_the_whole_system_on_another_recording(two_laps, two_laps_features, tmp_path, capsys):
     features = f"features:{two_laps_features}"
     line = f"evaluate {two_laps},start=20,references={two_laps} --fov 50 --overlap 0.4 --out {tmp_path}"
-    line += f" --method verified:k=2,inliers=8+{features} --method verified+seqslam+{features}"
+    line += f" --method verified:k=2,min_inliers=8+{features} --method verified+seqslam+{features}"
     assert main(line.split()) == 0
     assert "soft zone" in capsys.readouterr().out
     summary = json.loads((tmp_path / "report.json").read_text())

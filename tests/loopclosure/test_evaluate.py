@@ -80,7 +80,7 @@ def test_methods_that_refine_another():
 
 
 def test_methods_that_refine_one_that_refines_another():
-    outer = make_method("verified:k=7,inliers=9,ratio=0.7+seqslam:length=6+features:a.npz", MethodContext(3))
+    outer = make_method("verified:k=7,min_inliers=9,ratio=0.7+seqslam:length=6+features:a.npz", MethodContext(3))
     assert isinstance(outer, Verified)
     assert (outer.k, outer.check.min_inliers, outer.check.ratio, outer.exclude_frames) == (7, 9, 0.7, 3)
     assert isinstance(outer.inner, SeqSlam)

@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from loopclosure.descriptors.thumbnails import Thumbnailer
-from loopclosure.detector.run import load_describe
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, MethodContext, make_method
 from loopclosure.methods.baselines import BagOfWordsMethod, FabMapMethod, ThumbnailMethod
@@ -95,19 +93,6 @@ def test_training_images_are_needed_and_are_not_tested(spec: str, images: dict[s
         make_method(spec).score(Images(images["again"], images["first"]), silent)
     with pytest.raises(InputError, match=r"8 of 16 test images are training images too"):
         make_method(spec).score(Images(images["again"], images["first"], images["first"]), silent)
-
-
-@pytest.mark.parametrize(
-    ("american", "british"),
-    [
-        ("thumbnails:normalize=none", "thumbnails:normalise=none"),
-        ("seqslam:normalize=image,anchor=center", "seqslam:normalise=image,anchor=centre"),
-    ],
-)
-def test_settings_may_be_spelled_the_british_way(american: str, british: str) -> None:
-    assert make_method(british) == make_method(american) != make_method(american.partition(":")[0])
-    options = {"normalise": "patch"}
-    assert load_describe("loopclosure.baselines.thumbnails:Thumbnailer", options) == Thumbnailer(normalize="patch")
 
 
 def test_settings_reach_the_part_they_belong_to() -> None:

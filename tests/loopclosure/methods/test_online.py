@@ -24,7 +24,7 @@ def test_it_scores_only_what_it_accepts(two_laps, two_laps_features):
 
 
 def test_without_a_threshold_its_candidates_are_verified(two_laps, two_laps_features):
-    method = make_method(f"detector:{two_laps_features}:verify=yes,inliers=500", MethodContext(9))
+    method = make_method(f"detector:{two_laps_features}:verify=yes,min_inliers=500", MethodContext(9))
     result = method.score(Images(load_tum(two_laps).query_images), silent)
     assert not np.isfinite(result.scores).any()
     assert "30 not verified" in result.answer

@@ -98,7 +98,7 @@ def test_another_method_of_the_run_finds_nothing_again(walls, monkeypatch):
     scores = make_method("verified:k=6+thumbnails", context).score(images, silent).scores
     monkeypatch.setattr(GeometricCheck, "describe", None)
     monkeypatch.setattr(GeometricCheck, "agreement", None)
-    again = make_method("verified:k=6,inliers=25+thumbnails", context).score(images, silent).scores
+    again = make_method("verified:k=6,min_inliers=25+thumbnails", context).score(images, silent).scores
     np.testing.assert_array_equal(scores, again)
 
 
@@ -131,7 +131,7 @@ def test_excluded_frames_are_no_candidates(walls):
 
 def test_a_known_camera(walls):
     camera = "focal_px=260,center_x_px=160,center_y_px=120"
-    method = make_method(f"verified:{camera},k=12,inliers=25+thumbnails", MethodContext())
+    method = make_method(f"verified:{camera},k=12,min_inliers=25+thumbnails", MethodContext())
     found = first(method.score(Images(walls), silent).scores, np.zeros(1))
     assert found == [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]
 
@@ -141,7 +141,7 @@ def test_a_known_camera(walls):
     [
         ("verified", "write verified\\+METHOD"),
         ("verified:k=0+thumbnails", "k = 0; expected 1 or more"),
-        ("verified:inliers=3+thumbnails", "expected at least 8"),
+        ("verified:min_inliers=3+thumbnails", "expected at least 8"),
         ("verified:focal_px=300+thumbnails", "needs focal_px, center_x_px and center_y_px"),
         ("verified:order=size+thumbnails", 'order of verified is "size"; expected score or inliers'),
         ("verified:depth=3+thumbnails", 'verified has no setting "depth=3"'),

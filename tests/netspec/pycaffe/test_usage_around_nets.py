@@ -99,7 +99,6 @@ USES = {
         "import caffe.coord_map\n"
         "assert caffe.coord_map.crop(up, data).fn.params['crop_param']['offset'] == [1]"
     ),
-    "from caffe.model_libs import *": "from caffe.model_libs import *; VGGNetBody; CreateMultiBoxHead; L; P; caffe_pb2",
     "import caffe.draw": "import caffe.draw; caffe.draw.draw_net_to_file",
     "caffe.draw.draw_net_to_file": (
         "import caffe.draw\ncaffe.draw.draw_net_to_file(L.ReLU(L.Input()).to_proto(), 'net.dot', 'TB')"

@@ -1,1 +1,0 @@
-"""Old homes of names that users have written into their commands. They stay valid."""

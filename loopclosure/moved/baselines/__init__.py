@@ -1,1 +1,0 @@
-"""Former name of loopclosure.methods and loopclosure.words."""

@@ -1,3 +1,0 @@
-"""Former name of loopclosure.descriptors.thumbnails."""
-
-from loopclosure.descriptors.thumbnails import Thumbnailer as Thumbnailer

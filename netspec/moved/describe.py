@@ -1,3 +1,0 @@
-"""Was netspec.describe."""
-
-from netspec.features.describer import Describer as Describer
