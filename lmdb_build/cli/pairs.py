@@ -52,9 +52,9 @@ NEEDED = {
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]...
 
 Sequences with poses, several of them (KIND is seen from the files, or named):
-{chr(10).join(f"  {kind + ':':11} {what.replace('--', '')}" for kind, what in LAYOUTS.items())}
+{chr(10).join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())}
   with poses=FILE, {POSES_HELP},
-  and pose-form: {POSE_FORM_HELP.replace("--", "")}; topic, pose-topic: of a bag that has several
+  and pose-form: {POSE_FORM_HELP}; topic, pose-topic: of a bag that has several
 Or one of these:
   images:     images in natural order, truth=MASK of loops (.mat .npy .txt or image), camera={"|".join(CAMERAS)}
   traverses:  queries, references=FOLDER, truth=MASK or ground_truth*.npy

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from loopclosure.cli.data_set import add_poses, add_topics, sequence, source_of
+from loopclosure.cli.data_set import sequence, typed
 from loopclosure.cli.run import show_progress, warn
 from loopclosure.closing.close import Closed, close, summary, write_closed
 from loopclosure.closing.drift import drifted
@@ -18,6 +18,7 @@ from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
 from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.sequences import ImageSequence
+from loopclosure.places.source import POSES, TOPICS
 from netspec.terminal.commands import Commands, WrongUsage
 from netspec.terminal.options import seed
 
@@ -28,10 +29,6 @@ OF_FRAMES = (
     "drift",
     "odometry_form",
     "seed",
-    "poses",
-    "pose_form",
-    "topic",
-    "pose_topic",
     "camera",
 )
 
@@ -42,7 +39,9 @@ def add_to(commands: Commands) -> None:
     p.add_argument(
         "source",
         nargs="?",
-        help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag",
+        metavar="SOURCE",
+        help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; with "
+        f"{', '.join((*POSES, *TOPICS))} behind it, as in drive.mp4,poses=slam.txt",
     )
     p.add_argument("--graph", type=Path, metavar="IN.g2o", help="a pose graph to solve as it is, instead of frames")
     p.add_argument("--loops", type=Path, metavar="CSV", help="the loops.csv that detect wrote")
@@ -51,10 +50,8 @@ def add_to(commands: Commands) -> None:
     path.add_argument(
         "--drift", type=float, metavar="PERCENT", help="simulate odometry that drifts, from the true poses"
     )
-    p.add_argument("--odometry-form", metavar="WORDS", help="how --odometry is written, as --pose-form")
+    p.add_argument("--odometry-form", metavar="WORDS", help="how --odometry is written, as pose-form")
     p.add_argument("--seed", type=seed, metavar="N", help="of --drift (default: 1)")
-    add_poses(p)
-    add_topics(p)
     p.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source does not say")
     p.add_argument("--out", required=True, metavar="FOLDER", help="where closed.g2o, closed.txt and paths.png go")
 
@@ -72,7 +69,7 @@ def _close(a: argparse.Namespace) -> None:
         raise WrongUsage("--odometry-form means nothing without --odometry")
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed means nothing without --drift")
-    frames = sequence(source_of(a, a.source), a.out)
+    frames = sequence(typed(a.source, {"": (*POSES, *TOPICS)}), a.out)
     camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
     if camera is None:
         raise InputError(f"does not say what its camera is; give --camera {intrinsics.FORM}", frames.source)
@@ -109,10 +106,12 @@ def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
     if a.odometry:
         read = read_poses(a.odometry, pose_form(a.odometry_form or ""))
         for doubt in read.doubts:
-            warn(f"{a.odometry}: {doubt}".replace("--pose-form", "--odometry-form"))
+            warn(f"{a.odometry}: {doubt}".replace("pose-form=", "--odometry-form "))
         return read.of_images(len(frames), frames.stamps, a.odometry)
     if frames.poses is None:
-        raise InputError("has no true poses to simulate drift on; give --odometry, or --poses", frames.source)
+        raise InputError(
+            "has no true poses to simulate drift on; give --odometry, or the source ,poses=FILE", frames.source
+        )
     known = np.all(np.isfinite(frames.poses), axis=1)
     path = frames.poses.copy()
     path[known] = drifted(path[known], a.drift, 1 if a.seed is None else a.seed)

@@ -10,11 +10,10 @@ from loopclosure.errors import InputError
 from loopclosure.places import datasets
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
-from loopclosure.places.frames import Selection
 from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import ImageSequence, benchmark_parts, layout_of, read_sequence
-from loopclosure.places.source import FRAMES, POSES, TOPICS, Source, read_source
+from loopclosure.places.source import FRAMES, POSES, TOPICS, Kinds, Source, read_source
 from loopclosure.places.truth import Exclusion
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.options import above_zero
@@ -33,7 +32,7 @@ KINDS = {
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]..., for example tum:desk,stop=50%,stride=2.
 
 Truth from poses (KIND is seen from the files, or named):
-{chr(10).join(f"  {kind + ':':11} {what.replace('--', '')}" for kind, what in LAYOUTS.items())}
+{chr(10).join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())}
   images:     a folder or list of images, with poses=FILE, or truth=MASK: which frames show the same place
 Truth from elsewhere:
   fabmap:     FAB-MAP's New College or City Centre; truth=, coordinates=, camera={"|".join(CAMERAS)} (default: both)
@@ -43,7 +42,7 @@ Truth from elsewhere:
 
 KEYs: start, stop (frame N or share P%), stride, limit: which frames; references=PATH: another sequence to look in;
 truth=FILE (.mat .npy .txt or image); poses=FILE ({POSES_HELP}),
-pose-form ({POSE_FORM_HELP.replace("--", "")});
+pose-form ({POSE_FORM_HELP});
 topic, pose-topic: of a bag that has several."""
 RULE = ("max_distance", "max_angle", "soft_distance", "soft_angle", "fov", "overlap", "exclude_seconds")
 TRAVERSES = ("tolerance", "soft_tolerance")
@@ -84,24 +83,12 @@ def add_data_set(p: argparse.ArgumentParser) -> None:
     )
 
 
-def add_poses(p: argparse.ArgumentParser) -> None:
-    """Add the options of a file of poses, for :func:`source_of`."""
-    p.add_argument("--poses", metavar="FILE", help=POSES_HELP)
-    p.add_argument("--pose-form", metavar="WORDS", help=POSE_FORM_HELP)
-
-
-def add_topics(p: argparse.ArgumentParser) -> None:
-    """Add the options of bags, for :func:`source_of`."""
-    p.add_argument("--topic", help="of the images of a bag that has several")
-    p.add_argument("--pose-topic", metavar="TOPIC", help="of the poses of a bag that has several")
-
-
-def source_of(a: argparse.Namespace, path: str) -> Source:
-    """Return the source whose poses and topics are options."""
-    names = {name: getattr(a, name.replace("-", "_")) for name in (*POSES, *TOPICS)}
-    if a.pose_form and not a.poses:
-        raise WrongUsage("--pose-form means nothing without --poses")
-    return Source("", Path(path), {name: value for name, value in names.items() if value})
+def typed(text: str, kinds: Kinds) -> Source:
+    """Read a source of the command line."""
+    try:
+        return read_source(text, kinds)
+    except InputError as fault:
+        raise WrongUsage(str(fault)) from None
 
 
 def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence:
@@ -118,25 +105,9 @@ def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence
     return read
 
 
-def add_selection(p: argparse.ArgumentParser, prefix: str, of: str) -> None:
-    """Add the options of :func:`selection`, named ``prefix`` start and so on; ``of`` begins their help."""
-    p.add_argument(f"{prefix}start", default="0", metavar="N|P%", help=f"{of}the first frame, from 0 or as a share")
-    p.add_argument(f"{prefix}stop", metavar="N|P%", help=f"{of}the frame to stop before")
-    p.add_argument(f"{prefix}stride", type=int, default=1, metavar="N", help=f"{of}every N-th frame")
-    p.add_argument(f"{prefix}limit", type=int, metavar="N", help=f"{of}at most N frames")
-
-
-def selection(a: argparse.Namespace, prefix: str = "") -> Selection:
-    """Return the selection of frames that the options with this prefix describe."""
-    return Selection(*(getattr(a, f"{prefix}{name}") for name in FRAMES))
-
-
 def data_set(a: argparse.Namespace) -> datasets.DataSet:
     """Load the data set that the arguments describe."""
-    try:
-        source = read_source(a.source, KINDS)
-    except InputError as fault:
-        raise WrongUsage(str(fault)) from None
+    source = typed(a.source, KINDS)
     truth, references = source.get("truth", str), source.get("references", str)
     kind = source.kind or ("images" if truth else "")
     posed = not kind or kind in LAYOUTS or (kind == "images" and "poses" in source.settings)

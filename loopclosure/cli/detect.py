@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.cli.data_set import add_selection, add_topics, selection
+from loopclosure.cli.data_set import typed
 from loopclosure.cli.run import show_progress, warn
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
@@ -21,6 +21,7 @@ from loopclosure.methods.drive import whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.bags import is_bag
 from loopclosure.places.extraction import extract
+from loopclosure.places.source import FRAMES, TOPICS
 from netspec.files.whole_file import whole_file
 from netspec.terminal.commands import Commands, WrongUsage
 
@@ -41,9 +42,12 @@ ONLINE = ("top_k", "consistency", "consistency_window")
 def add_to(commands: Commands) -> None:
     """Add the command."""
     p = commands.add("detect", _detect, "find the loops in a folder of images or a video")
-    p.add_argument("source", help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag")
-    add_selection(p, "--", "")
-    add_topics(p)
+    p.add_argument(
+        "source",
+        metavar="SOURCE",
+        help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag; with "
+        f"{', '.join((*FRAMES, *TOPICS))} behind it, as in drive.bag,stride=2,topic=/cam0",
+    )
     p.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv, and loops.g2o with poses, go")
     how = p.add_mutually_exclusive_group()
     how.add_argument(
@@ -86,13 +90,14 @@ def add_to(commands: Commands) -> None:
 
 def _detect(a: argparse.Namespace) -> None:
     options = _checked_options(a)
-    source = Path(a.source)
-    if is_bag(source):
-        source, said = extract(source, Path(a.out) / "frames", a.topic or "", a.pose_topic or "", show_progress)
+    source = typed(a.source, {"": (*FRAMES, *TOPICS)})
+    path, topics = source.path, [source.get(name, str) or "" for name in TOPICS]
+    if is_bag(path):
+        path, said = extract(path, Path(a.out) / "frames", *topics, show_progress)
         print(said)
-    elif a.topic or a.pose_topic:
-        raise WrongUsage("--topic and --pose-topic belong to bags")
-    recording = run.open_recording(source, selection(a))
+    elif any(topics):
+        raise WrongUsage(f"{source}: topics belong to bags")
+    recording = run.open_recording(path, source.selection())
     for doubt in recording.doubts:
         warn(doubt)
     features = read_features(a.features) if a.features else None

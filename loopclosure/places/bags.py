@@ -45,9 +45,9 @@ class Bag:
         self._reader, self.path = reader, path
         images = {c.topic: c for c in reader.connections if c.msgtype in IMAGES}
         color = [name for name in images if "depth" not in name]
-        self.topic = self._chosen(topic, list(images), color or list(images), "images", "--topic", needed=True)
+        self.topic = self._chosen(topic, list(images), color or list(images), "images", "topic=", needed=True)
         poses = [c.topic for c in reader.connections if c.msgtype in POSES]
-        self.pose_topic = self._chosen(pose_topic, poses, poses, "poses", "--pose-topic", needed=False)
+        self.pose_topic = self._chosen(pose_topic, poses, poses, "poses", "pose-topic=", needed=False)
         self.frame = ""  # of the images: known when they have been read
         self.count = images[self.topic].msgcount
 

@@ -24,12 +24,12 @@ LAYOUTS = {
     "euroc": "an EuRoC sequence (mav0/)",
     "kitti": "a KITTI odometry sequence (sequences/00)",
     "bag": "a ROS 1 or ROS 2 bag",
-    "video": "a video (with --poses)",
+    "video": "a video (with poses)",
 }
 RECORDED = ("bag", "video")  # their frames are extracted first
 POSES_HELP = "the camera's poses, in the form of TUM, KITTI or EuRoC, instead of the sequence's own"
 POSE_FORM_HELP = (
-    f"how --poses are written, if it is not seen: {', '.join((*FORMS, *ORDERS, *DIRECTIONS))}; commas between"
+    f"how poses are written, if it is not seen: {', '.join((*FORMS, *ORDERS, *DIRECTIONS))}; commas between"
 )
 
 

@@ -177,14 +177,14 @@ def doubts(poses: np.ndarray, stamps: np.ndarray | None, form: PoseForm = PoseFo
     if shorter and _one_way(back) > ONE_WAY:
         found.append(
             f"read as {direction}, the path is less than half as long, and the camera always moves one way: if that is "
-            f"right, say so with --pose-form {direction}"
+            f"right, say so with pose-form={direction}"
         )
     if form.form != "kitti" and _one_way(poses) < ALL_WAYS:
         order = ORDERS[form.order != ORDERS[1]]
         if _one_way(np.hstack([poses[:, :3], _other_order(poses[:, 3:], form.order)])) > ONE_WAY:
             found.append(
                 "the camera would move now forward, now sideways or back as it turns; with the quaternion read "
-                f"{order} it always moves one way: if that is right, say so with --pose-form {order}"
+                f"{order} it always moves one way: if that is right, say so with pose-form={order}"
             )
     return found
 

@@ -135,10 +135,10 @@ def test_detect_writes_loops_and_a_pose_graph(two_laps, tmp_path, capsys):
 
 def test_detect_saves_and_resumes(two_laps, two_laps_features, tmp_path, capsys):
     features = ["--features", str(two_laps_features)]
-    first = ["detect", str(two_laps), "--stop", "30", "--threshold", "-0.2", "--exclude-recent", "10", *features]
+    first = ["detect", f"{two_laps},stop=30", "--threshold", "-0.2", "--exclude-recent", "10", *features]
     assert main([*first, "--save", str(tmp_path / "d.npz"), "--out", str(tmp_path)]) == 0
     assert "10 loops in 30 frames" in capsys.readouterr().out
-    again = ["detect", str(two_laps), "--start", "30", "--resume", str(tmp_path / "d.npz"), *features]
+    again = ["detect", f"{two_laps},start=30", "--resume", str(tmp_path / "d.npz"), *features]
     assert main([*again, "--out", str(tmp_path)]) == 0
     assert "10 loops in 10 frames" in capsys.readouterr().out
     with (tmp_path / "loops.csv").open() as stream:

@@ -75,7 +75,7 @@ def test_what_uses_a_bag_keeps_its_own_errors(tmp_path: Path) -> None:
 def test_a_topic_must_be_chosen_where_there_are_several(tmp_path: Path) -> None:
     bag = Bag(tmp_path / "two.bag", 1, second_camera=True).file
     with pytest.raises(
-        InputError, match="several topics with images: /cam/image, /other/image; choose one with --topic"
+        InputError, match="several topics with images: /cam/image, /other/image; choose one with topic="
     ):
         extract(bag, tmp_path / "frames")
     assert not (tmp_path / "frames").exists()

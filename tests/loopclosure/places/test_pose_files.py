@@ -49,9 +49,9 @@ def test_the_wrong_order_and_the_wrong_direction_are_noticed(tmp_path: Path) -> 
     rows = [row.split() for row in tum_rows(path()).splitlines()]
     turned = "".join(" ".join([*row[:4], row[7], *row[4:7]]) + "\n" for row in rows)
     (doubt,) = read_poses(write(tmp_path / "a.txt", turned)).doubts
-    assert doubt.endswith("say so with --pose-form w-first")
+    assert doubt.endswith("say so with pose-form=w-first")
     (doubt,) = read_poses(write(tmp_path / "b.txt", kitti_rows(np.linalg.inv(path())))).doubts
-    assert doubt.endswith("say so with --pose-form world-to-camera")
+    assert doubt.endswith("say so with pose-form=world-to-camera")
 
 
 def test_a_jump_is_noticed(tmp_path: Path) -> None:
