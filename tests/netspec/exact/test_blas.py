@@ -1,18 +1,21 @@
 """BLAS' routines compute what they say."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import torch
 
+from each import each
 from netspec.exact.blas import add_sums, dot, dots, gemm, sum_in_order, sum_of_magnitudes, sum_of_squares
 
 TYPES = [torch.float32, torch.float64]
 
 
-@pytest.mark.parametrize("dtype", TYPES)
-@pytest.mark.parametrize("a_t", [False, True])
-@pytest.mark.parametrize("b_t", [False, True])
-@pytest.mark.parametrize("sizes", [(2, 3, 4), (1, 1, 1), (5, 1, 7), (1, 6, 1), (40, 300, 50)])
+SIZES = [(2, 3, 4), (1, 1, 1), (5, 1, 7), (1, 6, 1), (40, 300, 50)]
+
+
+@each("dtype, a_t, b_t, sizes", product(TYPES, (False, True), (False, True), SIZES))
 def test_gemm_multiplies_and_adds_in_place(
     dtype: torch.dtype, a_t: bool, b_t: bool, sizes: tuple[int, int, int]
 ) -> None:

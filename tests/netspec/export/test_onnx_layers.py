@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from each import each
 from exported import ONNX_EXTRA, assert_same, golden_net, here, in_onnxruntime, in_opencv, other_inputs
 from netspec.export.onnx import onnx_model
 from netspec.export.shapes import find_shapes
@@ -15,21 +16,16 @@ pytest.importorskip("onnx", reason=ONNX_EXTRA)
 OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
-def test_golden_layer_computes_the_same_in_onnxruntime_and_opencv(case: Path) -> None:
+@each("case", CASES, lambda path: path.name)
+def test_golden_layer_computes_the_same_in_onnxruntime_and_opencv_and_at_other_sizes(case: Path) -> None:
     net, inputs = golden_net(case)
     model, _ = onnx_model(net)
     expected = here(net, inputs)
     assert_same(in_onnxruntime(model, inputs), expected)
     if OPENCV_5 and expected:
         assert_same(in_opencv(model, inputs), expected, scalars_have_an_axis=True)
-
-
-@pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
-def test_golden_layer_computes_the_same_at_other_sizes(case: Path) -> None:
-    net, inputs = golden_net(case)
-    model, _ = onnx_model(net)
-    names = {size.dim_param for each in model.graph.input for size in each.type.tensor_type.shape.dim}
+    names = {size.dim_param for value in model.graph.input for size in value.type.tensor_type.shape.dim}
+    net, inputs = golden_net(case)  # a recurrent net remembers what it saw
     shapes = find_shapes(net)
     for free in shapes.free:
         if free.name not in names:
