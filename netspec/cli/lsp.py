@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from netspec.cli.run import Commands
 from netspec.errors import SpecError
@@ -23,4 +24,6 @@ def _serve(arguments: argparse.Namespace) -> None:
         raise SpecError("the language server needs pygls: pip install pygls, or 'netspec-caffe[lsp]'") from None
     from importlib.metadata import version
 
-    make_server(version("netspec-caffe")).start_io()
+    from netspec.editor.messages import Messages
+
+    make_server(version("netspec-caffe")).start_io(Messages(sys.stdin.buffer))  # type: ignore[arg-type]

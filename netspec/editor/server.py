@@ -6,7 +6,10 @@ from typing import Any
 from urllib.parse import urlparse
 
 from lsprotocol import types as lsp
+from pygls.exceptions import JsonRpcException, JsonRpcInvalidParams
 from pygls.lsp.server import LanguageServer
+from pygls.protocol import LanguageServerProtocol
+from pygls.protocol.json_rpc import JsonRPCNotification
 from pygls.uris import to_fs_path
 
 from netspec.editor.answers import ERROR, HINT, WARNING, Diagnostic, Shapes, file_faults, text_faults
@@ -18,6 +21,8 @@ from netspec.proto.format import format_text
 from netspec.terminal import log
 
 NAME = "netspec"
+MOST_CHARACTERS = 1 << 20  # of a document: more is no prototxt that a person edits
+TOO_LARGE = "the document has more than a megabyte: it is not looked at"
 SEVERITIES = {
     ERROR: lsp.DiagnosticSeverity.Error,
     WARNING: lsp.DiagnosticSeverity.Warning,
@@ -31,23 +36,52 @@ KINDS = {
 }
 
 
+class _Protocol(LanguageServerProtocol):
+    """Answers a request whose parameters are of other types than the protocol's, which pygls only logs."""
+
+    def structure_message(self, data: dict[str, Any]) -> Any:
+        try:
+            return super().structure_message(data)
+        except JsonRpcException as fault:
+            if "method" in data and isinstance(data.get("id"), int | str):
+                self._send_response(data["id"], error=fault.to_response_error())
+            return JsonRPCNotification(method="$/refused", jsonrpc=self.VERSION, params=None)
+
+
 def make_server(version: str) -> LanguageServer:
     """Return the server: diagnostics, hover, definition, completion, formatting."""
-    server = LanguageServer(NAME, version, text_document_sync_kind=lsp.TextDocumentSyncKind.Full)
+    kind = lsp.TextDocumentSyncKind.Full
+    server = LanguageServer(NAME, version, text_document_sync_kind=kind, protocol_cls=_Protocol)
     shapes: dict[str, Shapes] = {}
 
     def document(params: Any) -> Any:
-        return server.workspace.get_text_document(params.text_document.uri)
+        """Return the document of a request. Raises JsonRpcInvalidParams."""
+        file = server.workspace.get_text_document(params.text_document.uri)
+        try:
+            large = len(file.source) > MOST_CHARACTERS
+        except (OSError, ValueError) as fault:  # one that was not opened
+            raise JsonRpcInvalidParams(f"{params.text_document.uri}: cannot be read: {fault}") from None
+        if large:
+            raise JsonRpcInvalidParams(TOO_LARGE)
+        return file
+
+    def faults_of(params: Any) -> list[Diagnostic]:
+        uri = params.text_document.uri
+        name = to_fs_path(uri) or uri
+        try:
+            return text_faults(document(params).source, name)
+        except JsonRpcInvalidParams as fault:
+            return [Diagnostic(Where(name, 1, 1), str(fault), ERROR)]
 
     def publish(uri: str, found: list[Diagnostic]) -> None:
-        own = to_fs_path(uri)
+        own = to_fs_path(uri) or uri
         told = [_diagnostic(each) for each in found if each.where.file == own]
         server.text_document_publish_diagnostics(lsp.PublishDiagnosticsParams(uri, told))
 
     def look(params: Any) -> None:
         """Check a saved file; its text alone where it is not on disk."""
         uri, path = params.text_document.uri, to_fs_path(params.text_document.uri)
-        faults = text_faults(document(params).source, path or uri)
+        faults = faults_of(params)
         if not faults and path and urlparse(uri).scheme == "file":
             with log.silent():
                 faults, shapes[uri] = file_faults(path)
@@ -63,8 +97,7 @@ def make_server(version: str) -> LanguageServer:
 
     @server.feature(lsp.TEXT_DOCUMENT_DID_CHANGE)
     def _changed(params: lsp.DidChangeTextDocumentParams) -> None:
-        uri = params.text_document.uri
-        publish(uri, text_faults(document(params).source, to_fs_path(uri) or uri))
+        publish(params.text_document.uri, faults_of(params))
 
     @server.feature(lsp.TEXT_DOCUMENT_HOVER)
     def _hover(params: lsp.HoverParams) -> lsp.Hover | None:
