@@ -21,7 +21,7 @@ import numpy as np
 import scipy.io
 import torch
 
-from faults import recordings
+from faults import recordings, written
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.detector.detector import LoopDetector
@@ -293,6 +293,9 @@ def solved(path: Path) -> None:
 FORMATS = {
     "net.prototxt": Format(".prototxt", text(LAYERS), built),
     "solver.prototxt": Format(".prototxt", text(SOLVER), solved),
+    "exported net": Format(".prototxt", text(LAYERS), written.exported),
+    "drawn net": Format(".prototxt", text(LAYERS), written.drawn),
+    "language server": Format(".rpc", written.talk, written.answered),
     "caffemodel": Format(".caffemodel", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)),
     "caffemodel.h5": Format(
         ".caffemodel.h5", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)

@@ -1,0 +1,138 @@
+"""What is written about a damaged net, and what the language server says to a damaged talk: for formats.py."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import logging
+import traceback
+from pathlib import Path
+from xml.etree import ElementTree
+
+from netspec.draw.diagram import diagram_of
+from netspec.draw.html import html_of
+from netspec.draw.picture import picture_of
+from netspec.draw.svg import svg_of
+from netspec.editor.messages import Messages
+from netspec.editor.server import make_server
+from netspec.errors import SpecError
+from netspec.export.convert import blob_tensors
+from netspec.export.deploy import fold
+from netspec.export.onnx import onnx_model
+from netspec.export.pt2 import torch_module
+from netspec.export.torch import torch_source
+from netspec.files.limits import limited
+from netspec.graph.filter import with_state
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.options import BuildOptions
+from netspec.proto.schema import TEST, TRAIN
+from netspec.proto.text import parse_net_text, write_text
+
+MOST = 1 << 22  # bytes of a net: large ones show nothing more
+SENT = [
+    {"id": 1, "method": "initialize", "params": {"capabilities": {}, "processId": None, "rootUri": None}},
+    {
+        "method": "textDocument/didOpen",
+        "params": {
+            "textDocument": {
+                "uri": "file:///no/x.prototxt",
+                "languageId": "prototxt",
+                "version": 1,
+                "text": 'layer { name: "in" type: "Input" top: "x" input_param { shape { dim: 1 } } }\n',
+            }
+        },
+    },
+    *(
+        {
+            "id": 2 + k,
+            "method": f"textDocument/{method}",
+            "params": {
+                "textDocument": {"uri": "file:///no/x.prototxt"},
+                "position": {"line": 0, "character": 28},
+                **more,
+            },
+        }
+        for k, (method, more) in enumerate(
+            [
+                ("hover", {}),
+                ("definition", {}),
+                ("completion", {}),
+                ("formatting", {"options": {"tabSize": 2, "insertSpaces": True}}),
+            ]
+        )
+    ),
+    {"id": 9, "method": "shutdown", "params": None},
+    {"method": "exit", "params": None},
+]
+
+
+def _net(path: Path) -> Net:
+    """Return the net of a damaged text. Raises SpecError for most."""
+    message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
+    return build_net(with_state(message, TEST), source, BuildOptions(seed=0))
+
+
+def exported(path: Path) -> None:
+    """Write a net in all forms: each parses, or a SpecError says why it cannot be."""
+    with limited(MOST):
+        net = _net(path)
+        for write in (
+            lambda: ast.parse(torch_source(net, "x.prototxt")[0]),
+            lambda: torch_module(net),
+            lambda: onnx_model(net)[0].SerializeToString(),
+            lambda: write_text(fold(net)),
+            lambda: {name: tensor.numpy() for name, tensor in blob_tensors(net).items()},
+        ):
+            try:
+                write()
+            except SpecError as fault:
+                if "\n" in str(fault):
+                    raise ValueError("an error of several lines") from fault
+
+
+def drawn(path: Path) -> None:
+    """Draw a net as SVG and HTML: both parse."""
+    with limited(MOST):
+        message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
+        diagram = diagram_of(message, source, [TRAIN, TEST])
+        picture = picture_of(diagram)
+        ElementTree.fromstring(svg_of(picture).encode())
+        html = html_of(diagram, picture)
+        json.loads(html.partition("const layers = ")[2].partition(";\n")[0])
+        html.encode()
+
+
+def talk(path: Path) -> None:
+    """Write what an editor says."""
+    bodies = [json.dumps({"jsonrpc": "2.0", **message}).encode() for message in SENT]
+    path.write_bytes(b"".join(b"Content-Length: %d\r\n\r\n%s" % (len(body), body) for body in bodies))
+
+
+def answered(path: Path) -> None:
+    """Let the server hear a talk; raise what it raised in netspec, which pygls logs."""
+    raised: list[BaseException] = []
+
+    class Kept(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            fault = record.exc_info[1] if record.exc_info else None
+            while fault is not None:
+                last = traceback.extract_tb(fault.__traceback__)[-1].filename if fault.__traceback__ else ""
+                if "/netspec/" in last and not type(fault).__name__.startswith("JsonRpc"):
+                    raised.append(fault)
+                fault = fault.__cause__
+
+    logger, kept, answers = logging.getLogger("pygls"), Kept(), io.BytesIO()
+    before, logger.propagate = logger.propagate, False
+    logger.addHandler(kept)
+    answers.close = lambda: None  # type: ignore[method-assign]
+    try:
+        make_server("1").start_io(Messages(io.BytesIO(path.read_bytes())), answers)  # type: ignore[arg-type]
+    except SystemExit:
+        pass
+    finally:
+        logger.removeHandler(kept)
+        logger.propagate = before
+    for fault in raised:
+        raise fault
