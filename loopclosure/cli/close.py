@@ -18,7 +18,7 @@ from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
 from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.sequences import ImageSequence
-from loopclosure.places.source import POSES, TOPICS
+from loopclosure.places.source import FRAMES, POSES, TOPICS
 from netspec.terminal.commands import Commands, WrongUsage
 from netspec.terminal.options import seed
 
@@ -69,11 +69,13 @@ def _close(a: argparse.Namespace) -> None:
         raise WrongUsage("--odometry-form means nothing without --odometry")
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed means nothing without --drift")
-    frames = sequence(typed(a.source, {"": (*POSES, *TOPICS)}), a.out)
+    source = typed(a.source, {"": (*FRAMES, *POSES, *TOPICS)})
+    frames = sequence(source, a.out)
     camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
     if camera is None:
         raise InputError(f"does not say what its camera is; give --camera {intrinsics.FORM}", frames.source)
-    odometry = _odometry(a, frames)
+    odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
+    frames = frames.taken(source.selection())
     loops = measure(frames, read_loops(a.loops, frames.names), camera, show_progress)
     closed = close(odometry, loops, frames.poses)
     write_closed(out, closed, frames.stamps, frames.names)

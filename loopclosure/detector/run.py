@@ -85,12 +85,9 @@ def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Rec
             raise InputError("does not say how many frames it has; save its frames as images", source)
         numbers = selection.numbers(count)
         return Recording(source, [f"frame {number}" for number in numbers], None, numbers)
-    sequence = read_sequence(source)
-    taken = selection.numbers(len(sequence))
-    images = [sequence.images[i] for i in taken]
-    stamps, poses = (None if values is None else values[taken] for values in (sequence.stamps, sequence.poses))
-    names = [sequence.names[i] for i in taken]
-    return Recording(source, names, images, taken, stamps, poses, sequence.doubts)
+    every = read_sequence(source)
+    s = every.taken(selection)
+    return Recording(source, list(s.names), list(s.images), selection.numbers(len(every)), s.stamps, s.poses, s.doubts)
 
 
 def run_detector(

@@ -101,8 +101,8 @@ def load_sequence(
 ) -> DataSet:
     """Make a data set of a sequence with poses; truth by the paper's rule, with wider limits for soft truth, if given.
 
-    Frames without a pose are left out before ``selection`` counts. Without an ``exclusion``, pairs less than 10 s apart
-    are excluded; 10 frames where the frames have no time.
+    ``selection`` counts all frames; then those without a pose are left out. Without an ``exclusion``, pairs less than
+    10 s apart are excluded; 10 frames where the frames have no time.
 
     references    another sequence, with poses in the same frame of reference: each query against all its frames;
                   ``selection`` applies to the queries only, and no pair is excluded
@@ -163,16 +163,16 @@ class _PosedImages:
 
 
 def _posed_images(sequence: ImageSequence, selection: Selection) -> _PosedImages:
+    sequence = sequence.taken(selection)
     with_pose = posed(sequence)
-    taken = selection.numbers(len(with_pose))
-    images = _existing([sequence.folder / with_pose.frames[i].path for i in taken])
+    images = _existing([sequence.folder / frame.path for frame in with_pose.frames])
     assert sequence.poses is not None, "posed refuses it"
-    numbers = np.flatnonzero(np.all(np.isfinite(sequence.poses), axis=1))[taken]
+    numbers = np.flatnonzero(np.all(np.isfinite(sequence.poses), axis=1))
     depths = [] if sequence.depths is None else [sequence.depths[i] for i in numbers]
-    stamps = None if sequence.stamps is None else with_pose.stamps[taken]
+    stamps = None if sequence.stamps is None else with_pose.stamps
     notes = [f"frames without a pose, left out: {with_pose.dropped}"] if with_pose.dropped else []
     notes += with_pose.doubts
-    return _PosedImages(sequence.name, images, stamps, views(with_pose.poses[taken], depths), notes)
+    return _PosedImages(sequence.name, images, stamps, views(with_pose.poses, depths), notes)
 
 
 def load_fabmap(

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
+from loopclosure.places.frames import Selection
 from loopclosure.places.intrinsics import Intrinsics, kitti_projection, read_intrinsics, yaml_numbers
 from loopclosure.places.pose_files import PoseForm, matrix_fault, moved, read_poses
 from loopclosure.places.trajectory import (
@@ -66,6 +67,18 @@ class ImageSequence:
     def folder(self) -> Path:
         """What the names are relative to."""
         return self.source if self.source.is_dir() else self.source.parent
+
+    def taken(self, selection: Selection) -> ImageSequence:
+        """Return some of the images: a selection counts the rows of the sequence, with a pose or without."""
+        numbers = selection.numbers(len(self))
+        return replace(
+            self,
+            images=tuple(self.images[i] for i in numbers),
+            names=tuple(self.names[i] for i in numbers),
+            stamps=None if self.stamps is None else self.stamps[numbers],
+            poses=None if self.poses is None else self.poses[numbers],
+            depths=None if self.depths is None else tuple(self.depths[i] for i in numbers),
+        )
 
 
 @dataclass(frozen=True)

@@ -167,3 +167,20 @@ def test_fr1_rpy_where_the_camera_turns_gets_rotations_only(tmp_path: Path, caps
     line = f"close {folder} --loops {tmp_path / 'loops.csv'} --drift 2 --camera {camera} --out {tmp_path / 'out'}"
     assert main(line.split()) == 0
     assert re.search(r"\d+ loops give a rotation only", capsys.readouterr().out)
+
+
+def test_every_third_frame(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The table of ``detect WALK,stride=3`` counts the frames that were taken, and names them."""
+    sequence = read_posed(walk)
+    with (walk.parent / "loops.csv").open() as stream:
+        ends = [(int(row["query_id"]) // 3, int(row["match_id"]) // 3) for row in csv.DictReader(stream)]
+    table = tmp_path / "thirds.csv"
+    names = [sequence.frames[3 * i].path for i in range(FRAMES // 3)]
+    rows = [f"{a},{b},{names[a]},{names[b]}" for a, b in dict.fromkeys(ends)]
+    table.write_text("query_id,match_id,query_name,match_name\n" + "\n".join(rows) + "\n")
+    line = ["close", f"{walk},stride=3", "--loops", str(table), "--drift", "2", "--out", str(tmp_path / "out")]
+    assert main(line) == 0
+    said = capsys.readouterr().out
+    before, after = errors(said)
+    assert after < before
+    assert len(read_poses(tmp_path / "out" / "closed.txt").poses) == FRAMES // 3

@@ -1,5 +1,6 @@
 """EuRoC, KITTI, VPR benchmarks and videos: the same path from each, and one clear line for what is missing."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,12 @@ import pytest
 
 from loopclosure.cli import main
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import load_sequence, load_traverses
+from loopclosure.places.datasets import load_sequence, load_traverses, load_tum
 from loopclosure.places.extraction import extract
+from loopclosure.places.frames import Selection
 from loopclosure.places.masks import read_matches
 from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, posed, read_posed, read_sequence
+from loopclosure.places.truth import Exclusion
 from places_layouts import (
     kitti_rows,
     path,
@@ -240,3 +243,15 @@ def test_detect_takes_euroc_with_its_poses(tmp_path: Path, capsys: pytest.Captur
     line = ["detect", str(folder), "--threshold", "-0.001", "--exclude-recent", "10", "--out", str(tmp_path / "found")]
     assert main(line) == 0
     assert "24 of 24 loops are the same place by their poses" in capsys.readouterr().out
+
+
+def test_a_selection_counts_frames_without_a_pose_too(two_laps, tmp_path):
+    shutil.copytree(two_laps, tmp_path / "laps")
+    truth = (tmp_path / "laps" / "groundtruth.txt").read_text().splitlines()
+    (tmp_path / "laps" / "groundtruth.txt").write_text("\n".join(line for line in truth if line[:2] != "4.") + "\n")
+    every_fourth = read_sequence(tmp_path / "laps").taken(Selection(stride=4))
+    assert every_fourth.names[:3] == ("rgb/0.png", "rgb/4.png", "rgb/8.png")
+    assert every_fourth.poses is not None
+    assert np.isnan(every_fourth.poses[1]).all()
+    data = load_tum(tmp_path / "laps", Selection(stride=4), Exclusion(2))
+    assert [path.name for path in data.query_images[:2]] == ["0.png", "8.png"]
