@@ -41,7 +41,6 @@ SUPPOSED = {
 GIVEN = "import numpy, torch; images, image = torch.rand(2, 3, 32, 32), numpy.zeros((32, 32, 3), numpy.uint8)\n"
 # What stands in a page, and what runs in its place: the same on less.
 LESS = {
-    "loopclosure/README.md": {"--size 160x120 --seed 60": "--frames 60 --size 160x120 --seed 60"},
     "README.md": {"--frames 400": "--frames 60", "step(100)": "step(2)"},
     "netspec/README.md": {"step(100)": "step(2)", "--iterations 50": "--iterations 2"},
     "prototxt/README.md": {
