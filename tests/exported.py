@@ -18,6 +18,7 @@ from netspec.export.shapes import NetShapes
 from netspec.export.source import class_name
 from netspec.export.torch import torch_source
 from netspec.net.net import Net
+from netspec.run.walk import Step, walk
 
 ONNX_EXTRA = "the onnx extra is not installed: pip install 'netspec-caffe[onnx]'"
 Arrays = Mapping[str, np.ndarray]
@@ -72,15 +73,19 @@ def trained(net: Net, seed: int = 1) -> Net:
 
 def calibrated(net: Net, inputs: Arrays) -> Net:
     """Set the statistics of BatchNorm layers to those of these inputs, so that deep nets do not saturate."""
-    values: dict[int, torch.Tensor] = {}
+    values = net.given(inputs)
+
+    def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
+        layer = net.layers[step.node]
+        if layer.type == "BatchNorm":
+            data = bottoms[0].transpose(0, 1).flatten(1)
+            layer.blobs[0].copy_(data.mean(1))
+            layer.blobs[1].copy_(data.var(1, correction=0) + 1e-3)
+            layer.blobs[2].fill_(1)
+        return step.run(*bottoms)
+
     with torch.no_grad():
-        for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
-            if layer.type == "BatchNorm":
-                data = values[node.bottoms[0]].transpose(0, 1).flatten(1)
-                layer.blobs[0].copy_(data.mean(1))
-                layer.blobs[1].copy_(data.var(1, correction=0) + 1e-3)
-                layer.blobs[2].fill_(1)
-            values.update(zip(node.tops, net.run_layer(i, values, inputs), strict=False))
+        walk(net.eager.one_by_one(), values, net.exact, visit)
     return net
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -188,3 +189,11 @@ def _check_solver(
     if not faults and not any(part.faults for part in parts):
         advice += findings(SOLVER, solver, node, nets)
     return [Checked(str(path), None, faults, not_ignored(advice, str(path))), *parts]
+
+
+def as_json(net: Net) -> dict[str, Any]:
+    """Return ``blobs`` name -> shape, ``params`` layer -> shapes, ``inputs``, ``outputs`` of a net."""
+    layers = zip(net.plan.nodes, net.layers, strict=True)
+    params = {node.name: [list(shape) for shape in layer.blob_shapes] for node, layer in layers if layer.blob_shapes}
+    blobs = {name: list(shape) for name, shape in net.shapes.items()}
+    return {"blobs": blobs, "params": params, "inputs": net.inputs, "outputs": net.outputs}

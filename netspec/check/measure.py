@@ -7,6 +7,7 @@ import time
 import torch
 
 from netspec.net.net import Net
+from netspec.run.timed import timed
 from netspec.solver.tally import Outputs, Tally, score_lines, scorers
 from netspec.terminal.log import info, number
 
@@ -78,52 +79,8 @@ def time_forward(net: Net, iterations: int) -> None:
 
 
 def _pass(net: Net, forward: list[float], backward: list[float]) -> float:
-    """Run each layer forward, then each layer backward on its own graph; add the seconds; return the loss.
-
-    The inputs of the net are zeros.
-    """
-    inputs = {name: torch.zeros(net.shapes[name], device=net.device) for name in net.inputs}
-    values: dict[int, torch.Tensor] = {}
-    made: list[tuple[list[torch.Tensor], tuple[torch.Tensor, ...]]] = []
-    loss = 0.0
-    for i, node in enumerate(net.plan.nodes):
-        leaves = {
-            v: values[v].detach().requires_grad_(wanted and values[v].is_floating_point())
-            for v, wanted in zip(node.bottoms, net.backward_plan.bottoms[i], strict=True)
-        }
-        _wait(net)
-        start = time.perf_counter()
-        tops = net.run_layer(i, leaves, inputs)
-        _wait(net)
-        forward[i] += time.perf_counter() - start
-        made.append(([leaves[v] for v in node.bottoms], tops))
-        values.update(zip(node.tops, tops, strict=False))
-        loss += sum(w * top.detach().sum().item() for top, w in zip(tops, net.loss_weights[i], strict=True) if w)
-    gradients: dict[int, torch.Tensor] = {}
-    for i in reversed(range(len(made))):
-        node = net.plan.nodes[i]
-        leaves, tops = made[i]
-        outs, diffs = [], []
-        for j, top in enumerate(tops):
-            diff = gradients.get(node.tops[j]) if j < len(node.tops) else None
-            if net.loss_weights[i][j]:
-                diff = torch.full_like(top, net.loss_weights[i][j])
-            if diff is not None and top.requires_grad:
-                outs.append(top)
-                diffs.append(diff)
-        _wait(net)
-        start = time.perf_counter()
-        if outs:
-            torch.autograd.backward(outs, diffs)
-        _wait(net)
-        backward[i] += time.perf_counter() - start
-        for v, leaf in zip(node.bottoms, leaves, strict=True):
-            if leaf.grad is not None:
-                gradients[v] = gradients[v] + leaf.grad if v in gradients else leaf.grad
+    """Run each layer forward, then each backward; add the seconds; return the loss. The inputs are zeros."""
+    given = {name: torch.zeros(net.shapes[name], device=net.device) for name in net.inputs}
+    loss = timed(net.eager.one_by_one(), net.given(given), net.exact, net.backward_plan.bottoms, forward, backward)
     net.zero_grad()
     return loss
-
-
-def _wait(net: Net) -> None:
-    if net.device.type == "cuda":
-        torch.cuda.synchronize(net.device)

@@ -30,7 +30,7 @@ def plan_text(net: Net) -> str:
         why = net.training_step()
         how = f"each pass goes through autograd: {why}" if isinstance(why, str) else "by kernels prepared once"
         return f"no passes: nets run layer by layer in phase TRAIN. Training in fp32, {how}; {bfloat16}"
-    if net.programs is None:
+    if net.prepared is None:
         return f"no passes: nets run layer by layer where passes are switched off; {bfloat16}"
     given = tuple(
         (v, shape, torch.float32)
@@ -38,12 +38,12 @@ def plan_text(net: Net) -> str:
         if not node.bottoms
         for v, shape in zip(node.tops, layer.top_shapes, strict=False)
     )
-    program = net.programs.program(given, frozenset(net.plan.outputs.values()))
+    program = net.prepared.program(given, frozenset(net.plan.outputs.values()))
     steps = program.schedule.steps
     used = [kind for kind in KINDS if kind in program.kinds]
     names = [_name(net, step) for step in steps]
     width = max((len(kind) for kind in used), default=0)
-    passes = ", ".join(name for name in PASSES if name in net.programs.passes)
+    passes = ", ".join(name for name in PASSES if name in net.prepared.passes)
     layers = sum(bool(node.bottoms) for node in net.plan.nodes)
     return "\n".join(
         [

@@ -42,10 +42,10 @@ def add_to(commands: Commands) -> None:
 
 @no_collection()  # of the whole command: of the text and the table too
 def _check(arguments: argparse.Namespace) -> int:
-    from netspec.check.check import check_file
+    from netspec.check.check import as_json, check_file
     from netspec.check.findings import said_as_json
     from netspec.check.plan import plan_text
-    from netspec.net.table import as_json, table
+    from netspec.net.table import table
 
     if not arguments.plan:
         refuse(arguments, ("passes",), "needs --plan, which prints what they do")
@@ -84,7 +84,7 @@ def _check(arguments: argparse.Namespace) -> int:
         print(json.dumps(next(iter(found.values())) if len(found) == 1 else found))
         return 0
     for label, net in nets:
-        print(f"{label}: {printable(net.name) or 'a net without a name'}\n{table(net)}")
+        print(f"{label}: {printable(net.name) or 'a net without a name'}\n{table(net.plan, list(net.layers))}")
         print(f"memory: at least {net.need}\n")
         if arguments.plan:
             print(plan_text(net) + "\n")

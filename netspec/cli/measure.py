@@ -64,9 +64,9 @@ def _time(arguments: argparse.Namespace) -> None:
     from netspec.check.measure import time_forward, time_net
 
     net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343", write_files=False)
-    engine = run_by(net, arguments, None)
-    if engine is net:
+    run_by(net, arguments, None)
+    if net.runners[0] in (net.prepared, net.eager):  # an engine's kernels are not by layer
         time_net(net, arguments.iterations)
     else:
-        time_forward(engine, arguments.iterations)
+        time_forward(net, arguments.iterations)
     net.close()

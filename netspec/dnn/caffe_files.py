@@ -63,7 +63,7 @@ class CaffeFiles:
             if layer.type in ("PriorBox", "DetectionOutput"):
                 from netspec.dnn.opencv_layers import LAYERS  # it registers SSD's layers, for nets that have them
 
-                net.layers[i] = LAYERS[layer.type](layer.param, layer.bottom_shapes, layer.context)
+                net.replace_layer(i, LAYERS[layer.type](layer.param, layer.bottom_shapes, layer.context))
         if self.weights is not None and device != "meta":
             self._load(net, self.weights)
         return net

@@ -24,6 +24,7 @@ from netspec.files.whole_file import whole_file
 from netspec.layers.base import Layer as CaffeLayer
 from netspec.layers.base import Shape
 from netspec.net.net import Net as CaffeNet
+from netspec.run.walk import Step, walk
 
 Array = np.ndarray
 Shapes = list[Shape]
@@ -414,13 +415,17 @@ class Net:
 
     def _walk(self, end: int, seconds: dict[int, float] | None = None) -> dict[int, torch.Tensor]:
         """Run the nodes up to ``end`` one by one; return all values, and note in ``seconds`` what each takes."""
-        values: dict[int, torch.Tensor] = {}
-        for i, node in enumerate(self._net.plan.nodes[: end + 1]):
+        net = self._net
+        values = net.given(self._values)
+
+        def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
             begin = time.perf_counter()
-            tops = self._net.run_layer(i, values, self._values)
-            values.update(zip(node.tops, tops, strict=False))
+            tops = step.run(*bottoms)
             if seconds is not None:
-                seconds[i] = time.perf_counter() - begin
+                seconds[step.node] = time.perf_counter() - begin
+            return tops
+
+        walk([step for step in net.eager.one_by_one() if step.node <= end], values, net.exact, visit)
         return values
 
     # What can be wrong

@@ -1,15 +1,15 @@
-"""A net whose forward pass an engine computes; all else is that of :class:`netspec.net.net.Net`."""
+"""An engine as one of the runners of a net: it computes forward passes, all else is the net's."""
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Collection, Iterable, Mapping
+import weakref
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from typing_extensions import override
 
 from netspec.data.blobs import Shape
 from netspec.engines.choice import TORCH, Choice
@@ -18,12 +18,16 @@ from netspec.engines.model import Model, Origin
 from netspec.engines.runners import Unable, tell_unable
 from netspec.exact import SMALL
 from netspec.export.convert import Source
+from netspec.graph.plan import Node
 from netspec.graph.steps import PASSES
 from netspec.layers.learned import Stamp, is_lent, stamp
 from netspec.net import build
-from netspec.net.net import Array, Net
+from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.shapes import fitted
+from netspec.run.walk import Result, walk, weighted_sum
+
+Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path, with these blobs besides its outputs
 
 
 def load_net(
@@ -60,9 +64,9 @@ def load_net(
 def with_engine(
     net: Net, choice: Choice, path: str | Path, weights: Iterable[str | Path], level: int, stages: Iterable[str]
 ) -> Net:
-    """Return a net, read from ``path`` and ``weights``, that the chosen engine runs: an :class:`EngineNet`.
+    """Let the chosen engine run a net that was read from ``path`` and ``weights``; return the net.
 
-    It is the net itself where torch does: by choice, or because a warning said what the engine cannot do.
+    Torch does by choice, or where a warning says what the engine cannot do.
     """
     if choice.engine == TORCH:
         tell_unable(choice, "")
@@ -76,140 +80,92 @@ def with_engine(
     if reason:
         tell_unable(choice, reason)
         return net
-    made: Any = EngineNet(net, choice, Path(path), [Path(each) for each in weights], level, tuple(stages))
-    return made  # it has all that a Net has
+    origin = Origin([path, *weights], {"level": level, "stages": tuple(stages)})
+    net.runners.insert(0, Engine(net, choice, origin if weights else None, _writer(net, Path(path), level, stages)))
+    return net
 
 
-class EngineNet(torch.nn.Module):
-    """A net that an engine runs: ``net`` is the torch one, which reads the data and has the parameters.
+class Engine:
+    """Runs a net by an engine, as one of its runners; it keeps the plan and the layers, which read data, of ``net``.
 
-    Outputs carry no gradient; a pass whose input asks for one is torch's, and so is every pass once the engine turned
-    out to be unable. Where parameters were changed the net is exported anew; as long as somebody holds memory through
-    which they could change unseen (``.data``, an array), torch runs the net.
+    ``origin`` says of which files it is made, None where its parameters are random; ``write`` exports it. Outputs carry
+    no gradient; a pass whose input asks for one is torch's, and so is every pass once the engine turned out to be
+    unable. Where parameters were changed the net is exported anew; as long as somebody holds memory through which they
+    could change unseen (``.data``, an array), torch runs the net.
     """
 
-    def __init__(
-        self, net: Net, choice: Choice, path: Path, weights: list[Path], level: int, stages: tuple[str, ...]
-    ) -> None:
-        super().__init__()
-        self.net = net
-        self._choice, self._path, self._weights, self._level, self._stages = choice, path, weights, level, stages
-        self._blobs: dict[str, torch.Tensor] = {}
+    def __init__(self, net: Net, choice: Choice, origin: Origin | None, write: Write) -> None:
+        self._plan, self._layers, self._exact = net.plan, list(net.layers), net.exact
+        self._choice, self._from, self._write = choice, origin, write
+        self._losses = [tuple((j, w) for j, w in enumerate(row) if w) for row in net.loss_weights]
+        self._readers = [step for step in net.eager.one_by_one() if self._layers[step.node].reads_data]
+        layers = zip(net.plan.nodes, net.layers, strict=True)
+        ends = [node for node, layer in layers if layer.is_input or layer.reads_data]
+        self._ends = {v: net.plan.blobs[v] for node in ends for v in node.tops}  # what no layer computes
+        self._built = {blob: net.shapes[blob] for blob in self._ends.values()}
         self._model: Model | None = None
         self._opened_for: tuple[Any, ...] | None = None
         self._as_loaded = self._exported = self._stamps()
-        self._readers = [i for i, layer in enumerate(net.layers) if layer.reads_data]
         self._unable, self._told = False, False
-        self._fits: tuple[dict[str, Shape], dict[str, Shape]] = {}, {}  # of the inputs at the last pass, of all blobs
+        self._fits: tuple[dict[int, Shape], dict[int, Shape]] = {}, {}  # of the inputs at the last pass, of all values
 
-    def __getattr__(self, name: str) -> Any:
-        """Return what the torch net has."""
+    def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
+        """Run the net on the values of its inputs; None where torch has to."""
+        if self._unable or any(value.requires_grad for value in given.values()) or self._are_lent():
+            return None
         try:
-            return super().__getattr__(name)
-        except AttributeError:
-            return getattr(super().__getattr__("net"), name)
-
-    def __repr__(self) -> str:
-        """Return the net as a table of its layers."""
-        return f"{self.net!r}\nrun by {'torch' if self._unable else self._choice.engine}"
-
-    @property
-    def keep(self) -> str | Iterable[str]:
-        """The blobs that are kept besides the outputs; see :class:`netspec.net.net.Net`."""
-        return self.net.keep
-
-    @keep.setter
-    def keep(self, names: str | Iterable[str]) -> None:
-        self.net.keep = names
-
-    @property
-    def blobs(self) -> dict[str, torch.Tensor]:
-        """The blobs kept by the last pass."""
-        return self._blobs
-
-    @override
-    def forward(self, **inputs: Array) -> dict[str, torch.Tensor]:
-        """Run the net and return its output blobs; ``inputs`` are the values of the blobs in ``inputs``."""
-        return self.forward_loss(**inputs)[1]
-
-    def forward_loss(self, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
-        wants_gradient = any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs.values())
-        usable = not self._unable and not wants_gradient and set(inputs) == set(self.net.inputs)
-        if usable and not self._are_lent():
-            try:
-                return self._pass(inputs)
-            except Unable as fault:
-                tell_unable(self._choice, str(fault))
-                self._unable = True
-        loss, outputs = self.net.forward_loss(**inputs)
-        self._blobs = self.net.blobs
-        return loss, outputs
+            return self._pass(given, kept)
+        except Unable as fault:
+            tell_unable(self._choice, str(fault))
+            self._unable = True
+            return None
 
     def _are_lent(self) -> bool:
         """Return whether the parameters may change unseen; say so once."""
-        lent = any(is_lent(parameter) for parameter in self.net.parameters())
+        lent = any(is_lent(blob) for layer in self._layers for blob in layer.blobs)
         if lent and not self._told:
             self._told = True
             tell_unable(self._choice, "parameters may change unseen while their memory is held, by .data or an array")
         return lent
 
-    def _pass(self, inputs: Mapping[str, Array]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        losses = self._losses()
-        wanted = {**dict.fromkeys(self.net.outputs), **dict.fromkeys(self._kept()), **dict.fromkeys(losses)}
-        model = self._current(tuple(wanted))
-        given = {name: _array(value) for name, value in inputs.items()}
-        given.update(self._read())
-        shapes = self._shapes({name: value.shape for name, value in given.items()})
-        found = {**given, **model.run(given)}
-        for name, value in found.items():
-            if shapes.get(name, value.shape) != value.shape:
-                raise Unable(f"{name} has shape {value.shape} there, expected {shapes[name]}")
-        values = {name: torch.from_numpy(found[name]) for name in wanted}
+    def _pass(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
+        names = self._plan.blobs
+        weighted = [(node.tops[j], w) for node, losses in self._losses_by_node() for j, w in losses]
+        wanted = (*sorted(kept), *(v for v, _ in weighted))
+        model = self._current(tuple(dict.fromkeys(names[v] for v in wanted)))
+        values = dict(given)
+        walk(self._readers, values, self._exact)
+        shapes = self._shapes({v: tuple(values[v].shape) for v in self._ends})
+        arrays = {names[v]: _array(values[v]) for v in self._ends}
+        found = {**arrays, **model.run(arrays)}
+        for v in wanted:
+            if shapes.get(v, found[names[v]].shape) != found[names[v]].shape:
+                raise Unable(f"{names[v]} has shape {found[names[v]].shape} there, expected {shapes[v]}")
+        values = {v: torch.from_numpy(found[names[v]]) for v in wanted}
         loss = torch.zeros(())
-        for name, weight in losses.items():
-            loss = loss + self.net.weighted_sum(values[name], weight)
-        self._blobs = {name: values[name] for name in values if name in self.net.outputs or name in self._kept()}
-        return loss, {name: values[name] for name in self.net.outputs}
+        for v, weight in weighted:
+            loss = loss + weighted_sum(values[v], weight, self._exact)
+        return loss, values
 
-    def _read(self) -> dict[str, np.ndarray]:
-        """Return the tops of the layers that read data."""
-        read = {}
-        for i in self._readers:
-            layer = self.net.layers[i]
-            for blob, top in zip(layer.param.top, self.net.run_layer(i, {}, {}), strict=False):
-                read[blob] = _array(top)
-        return read
+    def _losses_by_node(self) -> list[tuple[Node, list[tuple[int, float]]]]:
+        """Return the nodes whose tops are losses with a name, and which of them with what weight."""
+        nodes = zip(self._plan.nodes, self._losses, strict=True)
+        return [(node, [(j, w) for j, w in losses if j < len(node.tops)]) for node, losses in nodes]
 
-    def _shapes(self, given: Mapping[str, Shape]) -> dict[str, Shape]:
-        """Return the shapes of the blobs for inputs of these. Raises SpecError where a layer cannot take them."""
+    def _shapes(self, given: dict[int, Shape]) -> dict[int, Shape]:
+        """Return the shapes of the values for inputs of these. Raises SpecError where a layer cannot take them."""
         if given != self._fits[0]:
-            plan, layers = self.net.plan, list(self.net.layers)
-            ends = [node for node, layer in zip(plan.nodes, layers, strict=True) if layer.is_input or layer.reads_data]
-            values = {v: tuple(given[plan.blobs[v]]) for node in ends for v in node.tops}
-            _, shapes = fitted(plan, layers, values)
-            self._fits = dict(given), {plan.blobs[v]: shape for v, shape in shapes.items()}
+            self._fits = given, fitted(self._plan, self._layers, given)[1]
         return self._fits[1]
 
-    def _kept(self) -> list[str]:
-        if self.net.keep == "all":
-            return list(dict.fromkeys(self.net.plan.blobs))
-        return [self.net.keep] if isinstance(self.net.keep, str) else list(self.net.keep)
-
-    def _losses(self) -> dict[str, float]:
-        """Return the blobs that are part of the loss, and their weights."""
-        weighted = {}
-        for layer, row in zip(self.net.layers, self.net.loss_weights, strict=True):
-            weighted.update({blob: w for blob, w in zip(layer.param.top, row, strict=False) if w})
-        return weighted
-
     def _stamps(self) -> tuple[Stamp, ...]:
-        return tuple(stamp(parameter) for parameter in self.net.parameters())
+        return tuple(stamp(blob) for layer in self._layers for blob in layer.blobs)
 
     def _current(self, blobs: tuple[str, ...]) -> Model:
         """Return the model of the net as it is, with these blobs."""
         if self._model is None or self._opened_for != (self._stamps(), blobs):
-            self._model = Model(self._choice, self._origin(blobs), lambda path: self._write(path, blobs))
+            computed = [blob for blob in blobs if blob not in self._built]
+            self._model = Model(self._choice, self._origin(blobs), lambda path: self._write(path, computed))
             if self._as_loaded == self._exported:
                 self._as_loaded = self._stamps()
             self._opened_for = (self._stamps(), blobs)  # the export, too, counts as handing them out
@@ -218,27 +174,30 @@ class EngineNet(torch.nn.Module):
     def _origin(self, blobs: tuple[str, ...]) -> Origin | None:
         """Return what the net is made of; None where its parameters are no longer, or never were, those of files."""
         self._exported = self._stamps()
-        if self._exported != self._as_loaded or (not self._weights and self._exported):
+        if self._exported != self._as_loaded or (self._from is None and self._exported):
             return None
-        shapes = {blob: self.net.shapes[blob] for blob in self._data_blobs()}
-        options = {"level": self._level, "stages": self._stages, "blobs": blobs, "shapes": shapes}
-        return Origin([self._path, *self._weights], options)
+        files, options = (self._from.files, self._from.options) if self._from else ([], {})
+        return Origin(files, {**options, "blobs": blobs, "shapes": self._built})
 
-    def _data_blobs(self) -> list[str]:
-        layers = [layer for layer in self.net.layers if layer.reads_data or layer.is_input]
-        return [blob for layer in layers for blob in layer.param.top]
 
-    def _write(self, path: Path, blobs: tuple[str, ...]) -> None:
-        net = self.net
-        if self._readers:
-            shapes = {blob: self.net.shapes[blob] for i in self._readers for blob in self.net.layers[i].param.top}
-            net = Source(self._path, (), "TEST", self._level, self._stages, shapes).net()
-            net.share_weights_with(self.net)
-        write_model(net, path, [blob for blob in blobs if blob not in self._data_blobs()])
+def _writer(net: Net, path: Path, level: int, stages: Iterable[str]) -> Write:
+    """Return what exports a net as it is, read from ``path``; it does not keep the net alive."""
+    held, stages = weakref.ref(net), tuple(stages)
+    readers = [blob for layer in net.layers if layer.reads_data for blob in layer.param.top]
+
+    def write(to: Path, blobs: Sequence[str]) -> None:
+        original = held()
+        assert original is not None, "it is run by what calls this"
+        if readers:
+            shapes = {blob: original.shapes[blob] for blob in readers}
+            copy = Source(path, (), "TEST", level, stages, shapes).net()
+            copy.share_weights_with(original)
+            original = copy
+        write_model(original, to, blobs)
         gc.collect()  # the writer's parts refer to each other, and to arrays that share the parameters' memory
 
+    return write
 
-def _array(value: Array) -> np.ndarray:
-    if isinstance(value, torch.Tensor):
-        value = value.detach().cpu().numpy()
-    return np.asarray(value, np.float32)
+
+def _array(value: torch.Tensor) -> np.ndarray:
+    return np.asarray(value.detach().cpu().numpy(), np.float32)

@@ -18,13 +18,13 @@ from netspec.graph import raise_fault
 from netspec.graph.filter import filter_net
 from netspec.graph.fold import origins
 from netspec.net.build import build_net
-from netspec.net.fold import Fold, find_folds
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions, not_to_be_given
 from netspec.proto.schema import NetParameter, ParamSpec
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.upgrade.rewrite import copy_without
+from netspec.run.fold import Fold, find_folds
 
 
 def with_inputs(
@@ -72,7 +72,7 @@ def with_inputs(
 def fold(net: Net) -> NetParameter:
     """Return a net with its weights, folded, without Splits, Dropouts and others that only pass their bottom on.
 
-    netspec/net/fold.py says what is folded. Blobs keep their names where they still exist, outputs always do;
+    netspec/run/fold.py says what is folded. Blobs keep their names where they still exist, outputs always do;
     layers that share parameters share them still where folding left them equal.
     """
     folds = find_folds(net.plan, list(net.layers))

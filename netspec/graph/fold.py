@@ -1,7 +1,7 @@
 """Which layers of a net can do the work of those that follow: a plan without what only scales, shifts or passes on.
 
 The pass knows no layer type. Its callers say of each layer whether it is an affine map of its channels, can take one
-on, or hands its bottom on unchanged; netspec/net/fold.py asks the layers.
+on, or hands its bottom on unchanged; netspec/run/fold.py asks the layers.
 """
 
 from __future__ import annotations

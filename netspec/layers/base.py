@@ -182,7 +182,7 @@ class Layer(torch.nn.Module):
     reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
     ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
     shares: frozenset[str] = frozenset()  # of "data", "diff": its tops lie where its bottom lies, in Caffe's memory
-    gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (of it), "top": see net/in_place.py
+    gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (of it), "top": see run/in_place.py
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
     reads_data: ClassVar[bool] = False  # its tops are records; exported nets take them as inputs
@@ -194,7 +194,7 @@ class Layer(torch.nn.Module):
     gathers: ClassVar[bool] = False  # in a test its top is not averaged over the batches: see ``score``
     solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
     ahead: int = 0  # bytes of batches that it reads before they are asked for
-    traceable: ClassVar[bool] = False  # torch.compile can follow its forward pass: see netspec/net/segments.py
+    traceable: ClassVar[bool] = False  # torch.compile can follow its forward pass: see netspec/run/segments.py
     not_exported: ClassVar[str] = "its class does not define it"  # the reason, where it cannot be exported
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
@@ -257,7 +257,7 @@ class Layer(torch.nn.Module):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         """Return the bottom's gradient as Caffe computes it, step by step, from the data in memory at backward.
 
-        Only for layers of one bottom and top whose ``gradient_reads`` is not empty: see netspec/net/in_place.py.
+        Only for layers of one bottom and top whose ``gradient_reads`` is not empty: see netspec/run/in_place.py.
         """
         raise NotImplementedError
 

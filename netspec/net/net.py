@@ -20,24 +20,21 @@ from typing_extensions import override
 from netspec.errors import SpecError, Where
 from netspec.exact import ALL
 from netspec.exact.blas import other_kernels
-from netspec.exact.sums import RowSums
-from netspec.exact.switch import applies, is_recorded
 from netspec.files.limits import amount, is_out_of_memory
 from netspec.files.limits import memory as memory_of_machine
 from netspec.graph import Report, check_blobs, raise_fault
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
-from netspec.net.chains import chains
 from netspec.net.ignored_fields import unused_fields
-from netspec.net.in_place import Memory, is_overwritten, run_overwritten
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.net.options import BuildOptions
-from netspec.net.programs import Programs
-from netspec.net.segments import Segment, find_segments
 from netspec.net.table import table
-from netspec.proto.schema import PHASE_NAMES, TEST
+from netspec.proto.schema import PHASE_NAMES, TEST, TRAIN
+from netspec.run.eager import Eager, last_uses
+from netspec.run.prepared import Prepared
 from netspec.run.training import TrainingStep, obstacle
+from netspec.run.walk import Runner, weighted_sum
 from netspec.terminal import log
 
 Array = np.ndarray | torch.Tensor
@@ -82,41 +79,45 @@ class Net(torch.nn.Module):
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
         self.learnable: list[Learnable] = []
-        self._last_use = _last_uses(plan)
-        self.need = Need(plan, self._last_use)
+        self.need = Need(plan, last_uses(plan))
         self._surveyed, self._too_much = False, None  # whether the whole net was looked at, and what was found
         seed = int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed
         self.random = Random(seed)
         if self.exact == ALL and self.device.type == "cpu" and (said := other_kernels()):
             log.warning("net.cpp:53", said)
         self.layers = self._build_layers(options)
-        self._overwritten = [
-            is_overwritten(layer, node, plan) for layer, node in zip(self.layers, plan.nodes, strict=False)
-        ]
-        self._chains: list[list[int]] = [[] for _ in plan.nodes]
-        self._segments: dict[int, Segment] = {}
-        if len(self.layers) == len(plan.nodes):  # otherwise errors were collected: it will not run
-            apart = self._apart()
-            self._chains = chains(plan, list(self.layers), apart)
-            self._segments = find_segments(self, apart) if options.compiled else {}
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
         self._given = [
             v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
         ]
-        self.programs = Programs(self, options.passes) if self.phase == TEST and options.passes else None
-        self._training: TrainingStep | str | None = None  # made at the first pass
+        self._passes, self._compiled = options.passes, options.compiled
+        if len(self.layers) == len(plan.nodes):  # otherwise errors were collected: it will not run
+            self._set_runners()
+
+    def _set_runners(self) -> None:
+        """Make what runs the net: of ``runners`` the first that can. The last, ``eager``, always can."""
+        made = self.plan, list(self.layers), self.loss_weights, self.exact
+        self.eager = Eager(*made, self._compiled, learns=self.phase == TRAIN)
+        self.prepared = Prepared(*made, self._passes) if self.phase == TEST and self._passes else None
+        self._training: TrainingStep | str | None = None  # made at the first pass that trains
+        self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]
+
+    def replace_layer(self, i: int, layer: Layer) -> None:
+        """Let another layer, of the same blobs and shapes, be layer ``i``."""
+        self.layers[i] = layer
+        self._set_runners()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without what was prepared from it."""
-        prepared = self.programs and Programs(self, self.programs.passes)
-        return {
-            **super().__getstate__(),
-            "programs": prepared,
-            "_segments": {},
-            "_training": None,
-            "_passing": _Passing(),
-        }
+        """Return the state without what runs the net."""
+        gone = {"runners", "eager", "prepared", "_training", "_passing"}
+        return {name: value for name, value in self.__dict__.items() if name not in gone}
+
+    @override
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._passing = _Passing()
+        self._set_runners()
 
     # Building
 
@@ -218,17 +219,6 @@ class Net(torch.nn.Module):
         with log.silent():
             return Net(self.plan, seen).need
 
-    def _apart(self) -> list[bool]:
-        """Return which layers must run by themselves, whatever they compute."""
-        final = self.plan.final
-        read_again = {
-            final[node.tops[0]] for node, is_read in zip(self.plan.nodes, self._overwritten, strict=True) if is_read
-        }
-        overwritten = [any(final[v] in read_again for v in node.tops) for node in self.plan.nodes]
-        blocked = [any(node.blocked) for node in self.plan.nodes]
-        weighted = [any(weights) for weights in self.loss_weights]
-        return [any(flags) for flags in zip(overwritten, blocked, weighted, strict=True)]
-
     def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer, report: Report) -> None:
         """Connect the shared parameters of layer ``i`` to their owners; list the others as learnable."""
         node = self.plan.nodes[i]
@@ -283,7 +273,8 @@ class Net(torch.nn.Module):
 
     def __repr__(self) -> str:
         """Return the net as a table of its layers."""
-        return f"{self.name or 'a net without a name'}, phase {PHASE_NAMES[self.phase]}\n{table(self)}"
+        head = f"{self.name or 'a net without a name'}, phase {PHASE_NAMES[self.phase]}"
+        return f"{head}\n{table(self.plan, list(self.layers))}"
 
     # Running
 
@@ -295,58 +286,17 @@ class Net(torch.nn.Module):
     def forward_loss(self, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
         with self._passing.lock:
-            return self._run(inputs)
+            given, kept = self.given(inputs), self._kept()
+            loss, values = next(found for runner in self.runners if (found := runner.run(given, kept)) is not None)
+            blobs = self.plan.blobs
+            self._passing.own.blobs = self._passing.last = {blobs[v]: values[v] for v in sorted(kept)}
+        outputs = {name: values[v] for name, v in self.plan.outputs.items()}
+        return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
     @property
     def blobs(self) -> dict[str, torch.Tensor]:
         """The blobs kept by the last pass of this thread, or of any where it made none; see ``keep``."""
         return getattr(self._passing.own, "blobs", self._passing.last)
-
-    def _keep_blobs(self, blobs: dict[str, torch.Tensor]) -> None:
-        self._passing.own.blobs = self._passing.last = blobs
-
-    def _run(self, inputs: Mapping[str, Array]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        unknown = sorted(set(inputs) - set(self.inputs))
-        missing = [name for name in self.inputs if name not in inputs]
-        if unknown or missing:
-            found = f"unknown input {unknown[0]!r}" if unknown else f"no value for input {missing[0]!r}"
-            known = ", ".join(self.inputs) or "none (it reads its own data)"
-            raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
-        kept = self._kept()
-        if self.programs and not torch.is_grad_enabled() and not is_recorded():
-            return self._run_prepared(self.programs, inputs, kept)
-        values: dict[int, torch.Tensor] = {}
-        memories: dict[int, Memory] = {}
-        loss: torch.Tensor | None = None
-        tops: tuple[torch.Tensor, ...] = ()
-        end = -1  # the layer whose tops are the last computed
-        for i, node in enumerate(self.plan.nodes):
-            segment = self._segments.get(i) if i > end else None
-            if segment and segment.serves(values, kept):
-                end, tops = segment.last, segment.run(values)
-            elif following := self._following(i, kept) if i > end else ():
-                run, tops = self.layers[i].run_with(following, *(values[v] for v in node.bottoms))
-                end = i + run
-            elif i > end:
-                memory = memories.setdefault(self.plan.final[node.tops[0]], Memory()) if self._overwritten[i] else None
-                tops = self.run_layer(i, values, inputs, memory)
-                end = i
-            if i == end:
-                for v, top in zip(node.tops, tops, strict=False):
-                    values[v] = top
-                    if v in memories:
-                        memories[v].data = top.detach()
-                for top, weight in zip(tops, self.loss_weights[i], strict=True):
-                    if weight:
-                        term = self.weighted_sum(top, weight)
-                        loss = term if loss is None else loss + term
-            for v in self._last_use[i]:
-                if v not in kept:
-                    values.pop(v, None)
-        tops = ()
-        self._keep_blobs({self.plan.blobs[v]: values[v] for v in sorted(kept)})
-        outputs = {name: values[v] for name, v in self.plan.outputs.items()}
-        return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
     def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]] | None:
         """Run forward and backward by kernels prepared once; return the loss and the outputs, as forward_loss does.
@@ -360,60 +310,27 @@ class Net(torch.nn.Module):
             return None
         with self._passing.lock:
             loss, outputs = self._training.run()
-            self._keep_blobs(outputs)
+            self._passing.own.blobs = self._passing.last = outputs
         return loss, outputs
 
     def training_step(self) -> TrainingStep | str:
         """Return what trains the net by kernels prepared once, or in words why there is none."""
-        if self._segments:
+        if self.eager.segments:
             return "its layers are compiled"
-        if why := obstacle(self.plan, list(self.layers), self._chains):
+        if why := obstacle(self.plan, list(self.layers), self.eager.chains):
             return why
-        return TrainingStep(self.plan, list(self.layers), self.loss_weights, self._overwritten, self.weighted_sum)
+        weighted = partial(weighted_sum, exact=self.exact)
+        return TrainingStep(self.plan, list(self.layers), self.loss_weights, self.eager.overwritten, weighted)
 
-    def _following(self, i: int, kept: frozenset[int]) -> list[Layer]:
-        """Return the layers that may run with layer ``i``: nobody looks at what lies between."""
-        chain = self._chains[i]
-        if any(self.layers[k]._forward_hooks for k in (i, *chain)):
-            return []
-        seen = next((k for k in chain if self.plan.nodes[k].bottoms[0] in kept), None)
-        return [self.layers[k] for k in (chain if seen is None else chain[: chain.index(seen)])]
-
-    def _run_prepared(
-        self, programs: Programs, inputs: Mapping[str, Array], kept: frozenset[int]
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        given = {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
-        loss, values = programs.run(given, kept)
-        blobs = self.plan.blobs
-        self._keep_blobs({blobs[v]: values[v] for v in sorted(kept)})
-        outputs = {name: values[v] for name, v in self.plan.outputs.items()}
-        return (torch.zeros((), device=self.device) if loss is None else loss), outputs
-
-    def run_layer(
-        self, i: int, values: Mapping[int, torch.Tensor], inputs: Mapping[str, Array], memory: Memory | None = None
-    ) -> tuple[torch.Tensor, ...]:
-        """Run layer ``i`` alone on ``values`` (by value number) and return its tops.
-
-        ``memory`` is what its gradient reads if later layers overwrite its top in place.
-        """
-        node, layer = self.plan.nodes[i], self.layers[i]
-        if layer.is_input:
-            return tuple(self._as_input(inputs[blob]) for blob in _tops(self.plan, node))
-        bottoms = []
-        for v, blocked in zip(node.bottoms, node.blocked, strict=True):
-            stop = blocked and not self.param.force_backward
-            bottom = values[v].detach() if stop else values[v]
-            half = layer.is_loss and bottom.dtype in (torch.bfloat16, torch.float16)
-            bottoms.append(bottom.float() if half else bottom)  # losses are float32 in every precision
-        if memory is not None and torch.is_grad_enabled():
-            return run_overwritten(layer, bottoms[0], memory, node.in_place[0])
-        return layer.run(*bottoms)
-
-    def weighted_sum(self, top: torch.Tensor, weight: float) -> torch.Tensor:
-        """Return the contribution of a top to the net's loss (Caffe: Layer::Forward)."""
-        if top.numel() > 1 and applies(self.exact, top):
-            return RowSums.apply(top.reshape(1, -1), weight)[0]
-        return top.sum() if weight == 1 else top.sum() * weight
+    def given(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:
+        """Return the values of the net's inputs. Raises SpecError where one is missing, or unknown."""
+        unknown = sorted(set(inputs) - set(self.inputs))
+        missing = [name for name in self.inputs if name not in inputs]
+        if unknown or missing:
+            found = f"unknown input {unknown[0]!r}" if unknown else f"no value for input {missing[0]!r}"
+            known = ", ".join(self.inputs) or "none (it reads its own data)"
+            raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
+        return {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
 
     def _as_input(self, value: Array) -> torch.Tensor:
         if isinstance(value, torch.Tensor):
@@ -547,26 +464,10 @@ class _Tie:
                 log.info("net.cpp:382", f"{node.name} -> {blobs[v]}")
 
 
-def _tops(plan: Plan, node: Node) -> list[str]:
-    return [plan.blobs[v] for v in node.tops]
-
-
 def _spec(node: Node, layer: Layer, j: int) -> Param:
     """Return the settings of learnable blob ``j``, from the prototxt or the layer."""
     spec = node.params[j] if j < len(node.params) else Param("", layer.default_param_lr, 1.0, False, None)
     return replace(spec, lr_mult=0.0, decay_mult=0.0) if j in layer.not_learned else spec
-
-
-def _last_uses(plan: Plan) -> list[list[int]]:
-    """Return, by node, the values that are no longer needed once it has run."""
-    last: dict[int, int] = {}
-    for i, node in enumerate(plan.nodes):
-        for v in (*node.tops, *node.bottoms):
-            last[v] = i
-    ends: list[list[int]] = [[] for _ in plan.nodes]
-    for v, i in last.items():
-        ends[i].append(v)
-    return ends
 
 
 def _loss_weights(layer: Layer, report: Report) -> list[float]:

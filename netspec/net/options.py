@@ -28,7 +28,7 @@ class BuildOptions:
     ``exact`` sets which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
     ``accumulate_in_place`` makes layers add the gradients that they sum up to ``grad`` themselves, like Caffe;
     hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see these gradients.
-    With ``compiled``, torch.compile makes functions of the layers that it can (netspec/net/segments.py).
+    With ``compiled``, torch.compile makes functions of the layers that it can (netspec/run/segments.py).
     ``passes`` are those of netspec/graph/steps.py that a net of phase TEST may use when it runs without gradients.
     """
 

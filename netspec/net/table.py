@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import islice
-from typing import TYPE_CHECKING, Any
 
 from netspec.errors import printable
-
-if TYPE_CHECKING:
-    from netspec.net.net import Net
+from netspec.graph.plan import Plan
+from netspec.layers.base import Layer
 
 _HEAD = ("layer", "type", "bottoms", "tops", "shapes", "parameters", "MiB", "multiply-adds")
 MOST_WORDS = 20  # blobs of one layer that are listed
 _WORDS = 5  # columns of words, aligned left; then come the numbers
 
 
-def as_json(net: Net) -> dict[str, Any]:
-    """Return ``blobs`` name -> shape, ``params`` layer -> shapes, ``inputs``, ``outputs``."""
-    params = {}
-    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
-        if layer.blob_shapes:
-            params[node.name] = [list(shape) for shape in layer.blob_shapes]
-    blobs = {name: list(shape) for name, shape in net.shapes.items()}
-    return {"blobs": blobs, "params": params, "inputs": net.inputs, "outputs": net.outputs}
-
-
-def table(net: Net) -> str:
+def table(plan: Plan, layers: Sequence[Layer]) -> str:
     """Return one line per layer: its name and type, its blobs, the shapes of its tops, its costs; and totals.
 
     Costs: number of learnable values ("shared" if an earlier layer owns them), memory of its tops, multiply-adds of
@@ -36,14 +24,14 @@ def table(net: Net) -> str:
     rows: list[tuple[str, ...]] = [_HEAD]
     totals = [0, 0, 0]
     counted: set[int] = set()
-    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+    for node, layer in zip(plan.nodes, layers, strict=True):
         parameters = sum(blob.numel() for blob in layer.blobs if id(blob) not in counted)
         shared = len(layer.blobs) > 0 and parameters == 0
         counted.update(id(blob) for blob in layer.blobs)
         memory, work = 4 * sum(map(math.prod, layer.top_shapes)), layer.multiply_adds()
         totals = [total + cost for total, cost in zip(totals, (parameters, memory, work), strict=True)]
         shapes = _listed("x".join(map(str, shape)) or "scalar" for shape in layer.top_shapes)
-        blobs = [_listed(net.plan.blobs[v] for v in values) for values in (node.bottoms, node.tops)]
+        blobs = [_listed(plan.blobs[v] for v in values) for values in (node.bottoms, node.tops)]
         rows.append(
             (
                 printable(node.name),

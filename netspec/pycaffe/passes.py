@@ -26,6 +26,7 @@ from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
 from netspec.net.net import Net
+from netspec.run.walk import Step, walk
 from netspec.terminal import log
 
 AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
@@ -204,21 +205,19 @@ class Passes:
         if self._prepares and (start, end) == (0, len(self._layers) - 1) and not self._has_hooks():
             return self._forward_prepared()
         with one_thread() if any(self._has_kernels) else nullcontext():
-            return self._forward_by_layers(start, end)
+            loss = walk(self._steps(start, end), {}, self.net.exact)
+        return torch.zeros((), device=self.net.device) if loss is None else loss
 
-    def _forward_by_layers(self, start: int, end: int) -> torch.Tensor:
-        loss: torch.Tensor | None = None
+    def _steps(self, start: int, end: int) -> Iterator[Step]:
+        """Yield the passes of layers through memory, and what hooks do before and after them."""
         before, after = self.hooks["before_forward"], self.hooks["after_forward"]
         for i in range(start, end + 1):
             for hook in before:
-                hook(i)
-            self._forward(i)
-            for top, weight in self._losses[i]:
-                term = self.net.weighted_sum(top.data_memory.tensor(top.shape), weight)
-                loss = term if loss is None else loss + term
+                yield Step(i, partial(hook, i), (), ())
+            losses = tuple((j, weight) for j, (_, weight) in enumerate(self._losses[i]))
+            yield Step(i, partial(self._forward, i), (), (), losses)
             for hook in after:
-                hook(i)
-        return torch.zeros((), device=self.net.device) if loss is None else loss
+                yield Step(i, partial(hook, i), (), ())
 
     def _has_hooks(self) -> bool:
         return bool(self.hooks["before_forward"] or self.hooks["after_forward"])
@@ -226,7 +225,7 @@ class Passes:
     def _can_prepare(self) -> bool:
         """Return whether a whole pass may run as netspec's own: only its results matter, blob by blob."""
         return (
-            self.net.programs is not None
+            self.net.prepared is not None
             and self.net.device.type == "cpu"
             and not any(self._records)
             and not any(isinstance(layer, Python) or layer.filled_once() for layer in self._layers)
@@ -246,10 +245,12 @@ class Passes:
         return False
 
     def _forward_prepared(self) -> torch.Tensor:
-        """Run the whole net as netspec does (netspec/net/programs.py), and put what it computes where views look."""
-        assert self.net.programs is not None
+        """Run the whole net as netspec does (netspec/run/prepared.py), and put what it computes where views look."""
+        assert self.net.prepared is not None
         given = {v: self.blobs[b].data_memory.tensor(self.blobs[b].shape) for v, b in self._given}
-        loss, values = self.net.programs.run(given, self._final_values)
+        found = self.net.prepared.run(given, self._final_values)
+        assert found is not None, "a pass of pycaffe records no gradients"
+        loss, values = found
         taken = _storages(list(given.values()))
         for v, blob, shares, fresh in self._results:
             tensor = values[v]
@@ -331,7 +332,12 @@ class Passes:
             if top.shape != shape:
                 top.reshape(*shape)
 
-    def _forward(self, i: int) -> None:
+    def _forward(self, i: int) -> tuple[torch.Tensor, ...]:
+        """Run layer ``i``; return its losses as they are in memory."""
+        self._compute(i)
+        return tuple([top.data_memory.tensor(top.shape) for top, _ in self._losses[i]])
+
+    def _compute(self, i: int) -> None:
         layer, bottoms, tops = self._layers[i], self.bottoms[i], self.tops[i]
         if layer.is_input:
             return

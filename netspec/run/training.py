@@ -30,7 +30,7 @@ Values = list[Any]  # by value number, a tensor or None
 def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int]] = ()) -> str:
     """Return why a net is not trained by prepared kernels, in words; "" if it is.
 
-    ``chained[i]`` has the layers that may run together with layer i (netspec/net/chains.py).
+    ``chained[i]`` has the layers that may run together with layer i (netspec/run/chains.py).
     """
     for node, row in zip(plan.nodes, chained, strict=False):
         if row:
@@ -83,7 +83,7 @@ class TrainingStep:
     """Forward and backward passes of a net that trains.
 
     ``loss_weights[i][j]`` is the loss weight of layer i's top j, ``weighted(top, weight)`` its part of the loss.
-    ``overwritten[i]``: layer i's gradient reads memory that is overwritten in place (netspec/net/in_place.py).
+    ``overwritten[i]``: layer i's gradient reads memory that is overwritten in place (netspec/run/in_place.py).
     """
 
     def __init__(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import torch
 
@@ -11,20 +11,33 @@ from netspec.exact.sums import RowSums
 from netspec.exact.switch import applies
 
 Values = dict[int, torch.Tensor]  # by value number of a Plan
+Result = tuple[torch.Tensor | None, Values]  # the weighted sum of the losses, if there are any, and what was computed
 
 
 class Step(NamedTuple):
     """One piece of a run: ``run`` takes the values ``bottoms`` and returns the values ``tops``, one or a tuple.
 
-    ``losses`` are the tops, by their place, that the net's loss sums up, with their weights; after the step the values
-    ``ends`` are not needed any more.
+    ``node`` is the number of the last layer that it runs. ``losses`` are the tops, by their place, that the net's loss
+    sums up, with their weights; after the step the values ``ends`` are not needed any more.
     """
 
+    node: int
     run: Callable[..., Any]
     bottoms: tuple[int, ...]
     tops: tuple[int, ...]
     losses: tuple[tuple[int, float], ...] = ()
     ends: tuple[int, ...] = ()
+
+
+class Runner(Protocol):
+    """One way to run a net."""
+
+    def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
+        """Run the net on the values of its inputs; the values ``kept`` are there afterwards.
+
+        None where this runner cannot: now, or at all.
+        """
+        ...
 
 
 Visit = Callable[[Step, list[torch.Tensor]], Any]  # runs a step on its bottoms; returns what it returns
@@ -38,12 +51,14 @@ def walk(steps: Iterable[Step], values: Values, exact: str, visit: Visit | None 
     """
     loss: torch.Tensor | None = None
     for step in steps:
-        run, bottoms, tops, losses, ends = step
+        _, run, bottoms, tops, losses, ends = step
         given = [values[v] for v in bottoms]
         made = run(*given) if visit is None else visit(step, given)
-        if not isinstance(made, tuple):
+        if isinstance(made, tuple):
+            values.update(zip(tops, made, strict=False))
+        elif tops:
+            values[tops[0]] = made
             made = (made,)
-        values.update(zip(tops, made, strict=False))
         for j, weight in losses:
             term = weighted_sum(made[j], weight, exact)
             loss = term if loss is None else loss + term

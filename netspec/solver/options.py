@@ -27,7 +27,7 @@ class TrainingOptions:
     SpecError, "warn" warns once. In another ``precision`` than "fp32" (netspec/solver/precision.py) the training net
     computes no sums in Caffe's order, whatever ``exact`` says. Of several ``processes`` each has one training net and
     calls the same methods; the root tests and writes the snapshots. ``compiled`` nets run through torch.compile
-    (netspec/net/segments.py); they compute no sums in Caffe's order either.
+    (netspec/run/segments.py); they compute no sums in Caffe's order either.
     """
 
     device: torch.device | None = None

@@ -17,13 +17,13 @@ from netspec.errors import SpecError, Where
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
-from netspec.net.segments import missing_tool
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
 from netspec.process import waiting
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import write_text
+from netspec.run.segments import missing_tool
 from netspec.solver import nets, update
 from netspec.solver.blocks import Blocks
 from netspec.solver.checks import check_prefix, check_settings, fields_without_effect

@@ -46,7 +46,6 @@ from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.options import BuildOptions
 from netspec.net.stamp import Stamp, sealed
-from netspec.net.table import table
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text, parse_solver_text
@@ -236,7 +235,7 @@ def built(path: Path) -> None:
     """Build a net without memory, data or files, and what it says."""
     message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
     options = BuildOptions(torch.device("meta"), seed=0, open_data=False, write_files=False)
-    table(build_net(with_state(message, TEST, 0, ["x"]), source, options))
+    repr(build_net(with_state(message, TEST, 0, ["x"]), source, options))
 
 
 def text(words: str) -> Callable[[Path], object]:

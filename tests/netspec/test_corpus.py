@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from each import each
-from netspec.check.check import check_file
-from netspec.net.table import as_json
+from netspec.check.check import as_json, check_file
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_solver
 from paths import SHARED

@@ -12,8 +12,8 @@ import torch
 
 from golden_cases import train
 from netspec.net.net import Net
-from netspec.net.segments import missing_tool
 from netspec.proto.schema import TEST, TRAIN
+from netspec.run.segments import missing_tool
 from netspec.solver.solver import Solver, load_solver
 
 NET = """
@@ -60,7 +60,7 @@ def traced_only(monkeypatch: pytest.MonkeyPatch) -> None:
 def segments(net: Net) -> list[str]:
     """Return the segments, as "first-last"; those that were run have a "!"."""
     names = [node.name for node in net.plan.nodes]
-    return [f"{names[i]}-{names[one.last]}{'!' * bool(one.compiled)}" for i, one in net._segments.items()]
+    return [f"{names[i]}-{names[one.last]}{'!' * bool(one.compiled)}" for i, one in net.eager.segments.items()]
 
 
 def random(*shape: int) -> torch.Tensor:
@@ -140,7 +140,7 @@ def test_each_segment_is_compiled_once(net_of: Callable[..., Net], monkeypatch: 
     for _ in range(3):
         net.forward_loss(x=random(4, 3, 11, 11))[0].backward()
         gc.collect()
-    assert len(made) == len(net._segments)
+    assert len(made) == len(net.eager.segments)
 
 
 @pytest.mark.usefixtures("traced_only")

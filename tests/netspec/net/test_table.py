@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
+from netspec.check.check import as_json
 from netspec.net.net import Net
-from netspec.net.table import as_json
 
 WEIGHTS = 'param { name: "w" } inner_product_param { num_output: 4 bias_term: false }'
 NET = f"""

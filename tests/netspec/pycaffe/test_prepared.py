@@ -49,8 +49,8 @@ def test_all_blobs_are_there_after_a_prepared_pass(net: caffe.Net) -> None:
     for blob in net.blobs.values():
         blob.data[...] = 0 if blob is not net.blobs["data"] else blob.data
     net.forward()
-    assert net.passes.net.programs is not None
-    assert net.passes.net.programs.made
+    assert net.passes.net.prepared is not None
+    assert net.passes.net.prepared.made
     assert_same(net, expected)
 
 

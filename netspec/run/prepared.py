@@ -14,33 +14,33 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from netspec.exact import ALL
 from netspec.exact.blas import one_thread
-from netspec.graph.steps import PACK, Schedule, Step, schedule
+from netspec.exact.switch import is_recorded
+from netspec.graph import steps as planned
+from netspec.graph.plan import Plan
+from netspec.graph.steps import PACK, Schedule, schedule
 from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape
 from netspec.layers.learned import Stamp, is_lent, stamp
-from netspec.net.fold import absorbed_by, roles_of
 from netspec.process.heap import give_back_freed_memory
+from netspec.run.fold import absorbed_by, roles_of
 from netspec.run.shapes import fitted
-
-if TYPE_CHECKING:
-    from netspec.net.net import Net
+from netspec.run.walk import Result, Step, Values, walk
 
 PROGRAMS = 64  # kept for a net: pyramids of images need one for each size
 RUNS = 4  # times what one run needs: so much may programs keep together, in bytes
-Values = dict[int, torch.Tensor]
 Given = tuple[int, Shape, torch.dtype]
 
 
 @dataclass
 class Program:
-    """The kernels of a run in order, each with the values that it takes and makes, its losses, and what ends."""
+    """The kernels of a run in order, for one set of shapes of the inputs and of values to keep."""
 
-    line: list[tuple[Kernel, int, tuple[int, ...], tuple[int, ...], list[tuple[int, float]], tuple[int, ...]]]
+    line: list[Step]
     schedule: Schedule
     kinds: list[str]
     one_thread: bool
@@ -61,53 +61,45 @@ class Program:
         return not any(resting)
 
 
-class Programs:
-    """The programs of a net, by shapes and kept blobs."""
+class Prepared:
+    """Runs a net by programs, made when they are first needed, by shapes and kept values."""
 
-    def __init__(self, net: Net, passes: Collection[str]) -> None:
-        self.net = net
+    def __init__(
+        self,
+        plan: Plan,
+        layers: Sequence[Layer],
+        loss_weights: Sequence[Sequence[float]],
+        exact: str,
+        passes: Collection[str],
+    ) -> None:
         self.passes = frozenset(passes)
-        self._sources = [i for i, node in enumerate(net.plan.nodes) if not node.bottoms and not net.layers[i].is_input]
+        self._plan, self._layers, self._exact = plan, list(layers), exact
+        self._device = layers[0].context.device if len(layers) else None
+        self._losses = [tuple((j, w) for j, w in enumerate(row) if w) for row in loss_weights]
+        self._sources = [
+            Step(i, layer.run, (), node.tops, self._losses[i])
+            for i, (node, layer) in enumerate(zip(plan.nodes, self._layers, strict=True))
+            if not node.bottoms and not layer.is_input
+        ]
         self.made: OrderedDict[Any, Program] = OrderedDict()
         self.memos: dict[Any, tuple[tuple[Stamp, ...], Any]] = {}  # what layers keep, by what they need it for
         self._seen: dict[int, Stamp] = {}
 
-    def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> tuple[torch.Tensor | None, Values]:
-        """Run the net on the values ``given`` by the caller; return the weighted sum of its losses and what is kept.
+    def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
+        """Run the net on the values ``given`` by the caller; None where torch records gradients or a graph.
 
         Layers without bottoms run first: data layers, whose records have the shapes that they have.
         """
+        if torch.is_grad_enabled() or is_recorded():
+            return None
         values: Values = dict(given)
-        loss: torch.Tensor | None = None
-        for i in self._sources:
-            layer, node = self.net.layers[i], self.net.plan.nodes[i]
-            tops = layer.run()
-            values.update(zip(node.tops, tops, strict=False))
-            for top, weight in zip(tops, self.net.loss_weights[i], strict=True):
-                loss = self._added(loss, top, weight) if weight else loss
+        loss = walk(self._sources, values, self._exact)
         program = self.program(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
         with one_thread() if program.one_thread else nullcontext():
-            loss = self._run(program, values, loss)
+            term = walk(program.line, values, self._exact)
         origin = program.schedule.origin
+        loss = term if loss is None else loss if term is None else loss + term
         return loss, {v: values[origin[v]].contiguous() for v in kept}
-
-    def _run(self, program: Program, values: Values, loss: torch.Tensor | None) -> torch.Tensor | None:
-        for kernel, bottom, bottoms, tops, losses, ends in program.line:
-            made = kernel(values[bottom]) if bottom >= 0 else kernel(*[values[v] for v in bottoms])
-            if not isinstance(made, tuple):
-                values[tops[0]] = made
-                made = (made,) if losses else ()
-            else:
-                values.update(zip(tops, made, strict=False))
-            for j, weight in losses:
-                loss = self._added(loss, made[j], weight)
-            for v in ends:
-                del values[v]
-        return loss
-
-    def _added(self, loss: torch.Tensor | None, top: torch.Tensor, weight: float) -> torch.Tensor:
-        term = self.net.weighted_sum(top, weight)
-        return term if loss is None else loss + term
 
     def program(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
         """Return the program for values of these shapes and types, made now or before."""
@@ -124,7 +116,7 @@ class Programs:
 
     def _trim(self) -> None:
         """Give up the programs that were not used for longest, until the rest keeps no more than it may."""
-        learned = sum(blob.nbytes for layer in self.net.layers for blob in layer.blobs)
+        learned = sum(blob.nbytes for layer in self._layers for blob in layer.blobs)
         most = RUNS * (learned + max(program.need for program in self.made.values()))
         while True:
             used = set[Any]().union(*(program.memos for program in self.made.values()))
@@ -140,11 +132,11 @@ class Programs:
         return sum({id(tensor): tensor.nbytes for tensor in tensors}.values())
 
     def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
-        net, plan = self.net, self.net.plan
-        found, shapes = fitted(plan, list(net.layers), {v: tuple(shape) for v, shape, _ in given})
-        layers = [fit or layer for fit, layer in zip(found, net.layers, strict=True)]
+        plan = self._plan
+        found, shapes = fitted(plan, self._layers, {v: tuple(shape) for v, shape, _ in given})
+        layers = [fit or layer for fit, layer in zip(found, self._layers, strict=True)]
         changing = self._changing()
-        probe = torch.empty(1, dtype=next((dtype for *_, dtype in given), torch.float32), device=net.device)
+        probe = torch.empty(1, dtype=next((dtype for *_, dtype in given), torch.float32), device=self._device)
         exact = [fit is not None and fit.is_exact(probe, fit.small) for fit in found]
         as_is = [fit is None or bool(changing & _ids(fit)) for fit in found]
         roles = roles_of(plan, layers)
@@ -160,18 +152,16 @@ class Programs:
             finishes=[fit is not None and fit.finishing() is not None for fit in found],
             fresh=[fit is not None and fit.fresh for fit in found],
             given=[v for v, *_ in given],
-            kept=kept | {v for i, node in enumerate(plan.nodes) if any(net.loss_weights[i]) for v in node.tops},
+            kept=kept | {v for node, losses in zip(plan.nodes, self._losses, strict=True) if losses for v in node.tops},
             passes=self.passes,
         )
         line, kinds, memos = [], [], set[Any]()
         for step in order.steps:
             kernel, kind = self._kernel(step, layers, found[step.node] is None, as_is[step.node], memos)
             kinds.append("exact" if exact[step.node] else kind)
-            losses = [(j, weight) for j, weight in enumerate(net.loss_weights[step.node]) if weight]
-            single = step.bottoms[0] if len(step.bottoms) == 1 else -1
-            line.append((kernel, single, step.bottoms, step.tops, losses, step.ends))
+            line.append(Step(step.node, kernel, step.bottoms, step.tops, self._losses[step.node], step.ends))
         blobs = [
-            (owner, *each) for owner in (layer.blobs._parameters for layer in net.layers) for each in owner.items()
+            (owner, *each) for owner in (layer.blobs._parameters for layer in self._layers) for each in owner.items()
         ]
         return Program(
             line,
@@ -185,7 +175,7 @@ class Programs:
         )
 
     def _kernel(
-        self, step: Step, layers: Sequence[Layer], unknown: bool, as_is: bool, memos: set[Any]
+        self, step: planned.Step, layers: Sequence[Layer], unknown: bool, as_is: bool, memos: set[Any]
     ) -> tuple[Kernel, str]:
         """Return what runs a step, and in which way: "by value", "as is", "packed" or "prepared".
 
@@ -215,7 +205,7 @@ class Programs:
         finish = layers[step.finish].finishing() if step.finish is not None else None
         how = Preparation(finish, step.reuse, memo, PACK in self.passes)
         kernel = Layer.prepare(layer, how) if as_is else layer.prepare(how)
-        if not layer.any_layout or self.net.exact == ALL:
+        if not layer.any_layout or self._exact == ALL:
             inner = kernel
             kernel = lambda *bottoms: inner(*(bottom.contiguous() for bottom in bottoms))  # noqa: E731
         if type(layer).prepare is Layer.prepare or as_is:
@@ -225,7 +215,7 @@ class Programs:
     def _changing(self) -> set[int]:
         """Return which learned blobs somebody may be writing to: those that changed, and those that are lent."""
         found = set()
-        for layer in self.net.layers:
+        for layer in self._layers:
             for blob in layer.blobs:
                 now = stamp(blob)
                 if self._seen.get(id(blob), now) != now or is_lent(blob):
@@ -249,7 +239,7 @@ def _checked(kernel: Kernel, layer: Layer) -> Kernel:
     return checked
 
 
-def _most_alive(steps: Sequence[Step], shapes: Mapping[int, Shape]) -> int:
+def _most_alive(steps: Sequence[planned.Step], shapes: Mapping[int, Shape]) -> int:
     """Return the bytes of the values that are alive at one time, as far as their shapes are known."""
     alive, most = dict[int, int](), 0
     for step in steps:

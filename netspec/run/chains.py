@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+import torch
 
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
@@ -27,3 +29,17 @@ def chains(plan: Plan, layers: Sequence[Layer], apart: Sequence[bool]) -> list[l
                 break
             found[i].append(k)
     return found
+
+
+def together(layers: Sequence[Layer]) -> Callable[..., tuple[torch.Tensor, ...]]:
+    """Return what runs layers of a chain: by one kernel where there is one and no hook looks at what lies between."""
+    first, following = layers[0], list(layers[1:])
+
+    def run(*bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        hooked = any(layer._forward_hooks for layer in layers)
+        done, tops = first.run_with([] if hooked else following, *bottoms)
+        for layer in following[done:]:
+            tops = layer.run(*tops)
+        return tops
+
+    return run

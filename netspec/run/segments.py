@@ -13,22 +13,21 @@ import os
 import shutil
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
 from types import FunctionType, MethodType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from netspec.errors import SpecError
+from netspec.exact import NONE
 from netspec.files.limits import is_out_of_memory
+from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
-from netspec.proto.schema import TRAIN
+from netspec.run.walk import Step, walk
 from netspec.terminal import log
-
-if TYPE_CHECKING:
-    from netspec.net.net import Net
 
 FEWEST = 2  # layers: a single one gains nothing
 _numbers = count()
@@ -47,68 +46,72 @@ def missing_tool(device: torch.device) -> str:
     return f'found no C++ compiler "{compiler}"; install one, or name another in the environment variable CXX'
 
 
-def find_segments(net: Net, apart: Sequence[bool]) -> dict[int, Segment]:
-    """Return the segments of a net by the number of their first layer; layers that are ``apart`` belong to none."""
-    found: dict[int, Segment] = {}
+def rows(layers: Sequence[Layer], apart: Sequence[bool]) -> Iterator[list[int]]:
+    """Yield the numbers of layers in a row that make a segment; layers that are ``apart`` belong to none."""
     row: list[int] = []
-    for i in range(len(net.layers) + 1):
-        if i < len(net.layers) and net.layers[i].traceable and not apart[i]:
+    for i in range(len(layers) + 1):
+        if i < len(layers) and layers[i].traceable and not apart[i]:
             row.append(i)
             continue
         if len(row) >= FEWEST:
-            found[row[0]] = Segment(net, row)
+            yield row
         row = []
-    return found
 
 
 class Segment:
-    """Layers in a row, compiled at their first pass. ``last`` is the number of the last one.
+    """Layers in a row, compiled at their first pass: ``run`` takes the values ``bottoms`` and returns ``tops``.
 
-    It serves the passes that are repeated: with the shapes that the net was built with, and with gradients in phase
-    TRAIN, without in phase TEST. Others, and passes that look at what lies within, run layer by layer.
+    ``last`` is the number of the last one; the values ``within`` are seen by nobody. What is compiled serves the passes
+    that are repeated: with the shapes that the net was built with, and with gradients where the net ``learns``, else
+    without. In others, and where hooks look at what lies within, its layers run by the steps of ``line``.
     """
 
-    def __init__(self, net: Net, row: Sequence[int]) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        layers: Sequence[Layer],
+        row: Sequence[int],
+        learns: bool,
+        line: Callable[[Sequence[int], frozenset[int], bool], list[Step]],
+    ) -> None:
         self.last = row[-1]
-        nodes = [net.plan.nodes[i] for i in row]
-        self._layers: list[Layer] = [net.layers[i] for i in row]
+        nodes = [plan.nodes[i] for i in row]
+        self._layers = [layers[i] for i in row]
         self._steps = [(layer, node.bottoms, node.tops) for layer, node in zip(self._layers, nodes, strict=True)]
         # Protobuf makes a message's fields anew at each access unless they are held; torch would compile anew, too.
         self._held = [getattr(layer.param, name.partition(".")[0]) for layer in self._layers for name in layer.reads]
         self._shapes = [list(layer.bottom_shapes) for layer in self._layers]
         made = {v for node in nodes for v in node.tops}
-        read = {v for node in net.plan.nodes[self.last + 1 :] for v in node.bottoms} | {*net.plan.outputs.values()}
-        self._given = {
+        read = {v for node in plan.nodes[self.last + 1 :] for v in node.bottoms} | {*plan.outputs.values()}
+        given = {
             v: shape
             for node, shapes in zip(nodes, self._shapes, strict=True)
             for v, shape in zip(node.bottoms, shapes, strict=True)
             if v not in made
         }
-        self._tops = sorted(made & read)
-        self._within = made - read
-        self._learns = net.phase == TRAIN
+        self.bottoms, self._given_shapes = tuple(given), list(given.values())
+        self.tops = tuple(sorted(made & read))
+        self.within = made - read
+        self._learns = learns
+        self._line = line(row, frozenset((*self.tops, *self.bottoms)), True)
         self.compiled: Any = None  # the function, once there is one
 
-    def serves(self, values: Mapping[int, torch.Tensor], kept: frozenset[int]) -> bool:
-        """Return whether a pass on these values, which is to keep some, can be compiled."""
-        return (
-            torch.is_grad_enabled() == self._learns
-            and not kept & self._within
-            and all(tuple(values[v].shape) == shape for v, shape in self._given.items())
-            and not any(layer._forward_hooks for layer in self._layers)
-        )
-
-    def run(self, values: dict[int, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Add to ``values`` what later layers read; return the tops of the last layer.
-
-        Raises SpecError where the layers cannot be compiled.
-        """
+    def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the tops. Raises SpecError where the layers cannot be compiled."""
+        if not self._serves(bottoms):
+            values = dict(zip(self.bottoms, bottoms, strict=True))
+            walk(self._line, values, NONE)
+            return tuple(values[v] for v in self.tops)
         for layer, shapes in zip(self._layers, self._shapes, strict=True):
             layer.fit(shapes)
-        bottoms = [values[v] for v in self._given]
-        tops = self.compiled(*bottoms) if self.compiled else self._compile(bottoms)
-        values.update(zip(self._tops, tops, strict=True))
-        return tuple(values[v] for v in self._steps[-1][2])
+        return self.compiled(*bottoms) if self.compiled else self._compile(bottoms)
+
+    def _serves(self, bottoms: Sequence[torch.Tensor]) -> bool:
+        return (
+            torch.is_grad_enabled() == self._learns
+            and [tuple(bottom.shape) for bottom in bottoms] == self._given_shapes
+            and not any(layer._forward_hooks for layer in self._layers)
+        )
 
     def _compile(self, bottoms: Sequence[torch.Tensor]) -> Any:
         """Make the function; return what its first call returns."""
@@ -148,8 +151,8 @@ def _quiet() -> Iterator[None]:
 
 def _run(segment: Segment, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """Run the layers of a segment one by one, to be traced; return what later layers read."""
-    values = dict(zip(segment._given, bottoms, strict=True))
+    values = dict(zip(segment.bottoms, bottoms, strict=True))
     for layer, numbers, made in segment._steps:
         tops = layer.forward(*[values[v] for v in numbers])
         values.update(zip(made, tops if isinstance(tops, tuple) else (tops,), strict=True))
-    return tuple([values[v] for v in segment._tops])
+    return tuple([values[v] for v in segment.tops])

@@ -17,10 +17,10 @@ from netspec.graph.steps import PASSES
 from netspec.layers.activation import ReLU
 from netspec.layers.base import Layer
 from netspec.layers.vision.convolution import Convolution
-from netspec.net import programs
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, write_binary
 from netspec.proto.schema import TRAIN
+from netspec.run import prepared as programs
 
 FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 8 dim: 40 dim: 40 } } }'
@@ -63,8 +63,8 @@ def assert_same(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor
 
 
 def last_program(net: Net) -> programs.Program:
-    assert net.programs is not None
-    return next(reversed(net.programs.made.values()))
+    assert net.prepared is not None
+    return next(reversed(net.prepared.made.values()))
 
 
 def test_norms_fold_into_the_convolution_and_the_activation_fuses(net_of: Callable[..., Net]) -> None:
@@ -101,7 +101,7 @@ def test_deconvolutions_are_laid_out_too(how: str, net_of: Callable[..., Net]) -
 def test_each_pass_can_be_switched(passes: tuple[str, ...], net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED, passes=passes))
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
-    assert (net.programs is None) == (not passes)
+    assert (net.prepared is None) == (not passes)
 
 
 @pytest.mark.parametrize("keep", ["all", ["conv"], ["bn", "left"]], ids=str)
@@ -211,8 +211,8 @@ def test_shapes_may_change_from_run_to_run(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED))
     for shape in ((1, 8, 40, 40), (3, 8, 20, 31), (1, 8, 5, 5), (1, 8, 40, 40), (3, 8, 20, 31)):
         assert_same(quickly(net, data=images(*shape)), slowly(net, data=images(*shape)))
-    assert net.programs is not None
-    assert len(net.programs.made) == 3
+    assert net.prepared is not None
+    assert len(net.prepared.made) == 3
 
 
 @pytest.mark.parametrize("exact", ["none", "small"])
@@ -221,12 +221,12 @@ def test_what_was_prepared_for_a_shape_is_there_when_it_comes_again(exact: str, 
     sizes = (5, 40, 7)
     for size in sizes:
         quickly(net, data=images(1, 8, size, size))
-    assert net.programs is not None
-    prepared = list(net.programs.made.values())
+    assert net.prepared is not None
+    before = list(net.prepared.made.values())
     for size in sizes:
         quickly(net, data=images(1, 8, size, size))
-    assert all(a is b for a, b in zip(net.programs.made.values(), prepared, strict=True))
-    assert "as is" not in {kind for program in prepared for kind in program.kinds}
+    assert all(a is b for a, b in zip(net.prepared.made.values(), before, strict=True))
+    assert "as is" not in {kind for program in before for kind in program.kinds}
 
 
 def test_programs_of_a_net_are_bounded(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,8 +234,8 @@ def test_programs_of_a_net_are_bounded(net_of: Callable[..., Net], monkeypatch: 
     net = trained(net_of(BLOCK))
     for size in (7, 8, 9, 7):
         assert_same(quickly(net, data=images(1, 8, size, size)), slowly(net, data=images(1, 8, size, size)))
-    assert net.programs is not None
-    assert len(net.programs.made) == 2
+    assert net.prepared is not None
+    assert len(net.prepared.made) == 2
 
 
 @pytest.mark.parametrize(("runs", "fewest", "most"), [(programs.RUNS, 2, 16), (0, 1, 1)])
@@ -244,15 +244,15 @@ def test_what_programs_keep_is_bounded_by_what_runs_need(
 ) -> None:
     monkeypatch.setattr(programs, "RUNS", runs)
     net = trained(net_of(BLOCK + SHARED))
-    assert net.programs is not None
+    assert net.prepared is not None
     learned = sum(item.parameter.nbytes for item in net.learnable)
     for size in range(8, 24):
         quickly(net, data=images(1, 8, size, 9))
-        made = net.programs.made.values()
+        made = net.prepared.made.values()
         limit = runs * (learned + max(program.need for program in made))
-        assert len(made) == 1 or net.programs.kept_bytes() <= limit
-        assert set().union(*(program.memos for program in made)) == set(net.programs.memos)
-    assert fewest <= len(net.programs.made) <= most
+        assert len(made) == 1 or net.prepared.kept_bytes() <= limit
+        assert set().union(*(program.memos for program in made)) == set(net.prepared.memos)
+    assert fewest <= len(net.prepared.made) <= most
     assert_same(quickly(net, data=images(1, 8, 8, 9)), slowly(net, data=images(1, 8, 8, 9)))
 
 
@@ -283,7 +283,7 @@ def test_runs_of_many_sizes_take_little_more_memory_than_one(tmp_path: Path) -> 
 
 
 def test_nets_that_train_are_not_prepared(net_of: Callable[..., Net]) -> None:
-    assert net_of(BLOCK, TRAIN).programs is None
+    assert net_of(BLOCK, TRAIN).prepared is None
 
 
 def test_inputs_and_earlier_outputs_are_never_overwritten(net_of: Callable[..., Net]) -> None:

@@ -1,0 +1,152 @@
+"""Layers run one by one as they are, with gradients where torch records them; some of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+
+from netspec.graph.plan import Plan
+from netspec.layers.base import Layer
+from netspec.run.chains import chains, together
+from netspec.run.in_place import Memory, is_overwritten, run_overwritten
+from netspec.run.segments import Segment, rows
+from netspec.run.walk import Result, Step, Values, Visit, walk
+
+
+class Eager:
+    """Runs the layers of a plan; every net can be run so.
+
+    ``loss_weights[i][j]`` is the loss weight of layer i's top j. ``exact`` is as in netspec/exact. With ``compiled``,
+    torch.compile makes functions of the layers that it can (netspec/run/segments.py); with gradients where ``learns``.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        layers: Sequence[Layer],
+        loss_weights: Sequence[Sequence[float]],
+        exact: str,
+        compiled: bool = False,
+        learns: bool = False,
+    ) -> None:
+        self._plan, self._layers, self._exact = plan, list(layers), exact
+        self._losses = [tuple((j, w) for j, w in enumerate(row) if w) for row in loss_weights]
+        self._last_uses = last_uses(plan)
+        self.overwritten = [is_overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
+        apart = self._apart()
+        self.chains = chains(plan, self._layers, apart)
+        self._lines: dict[frozenset[int], list[Step]] = {}  # by what is kept, of the last run
+        self.segments: dict[int, Segment] = {}  # by their first layer
+        for row in rows(self._layers, apart) if compiled else ():
+            self.segments[row[0]] = Segment(plan, self._layers, row, learns, self._line)
+
+    def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
+        """Run all layers on the values ``given`` by the caller; the values ``kept`` are there afterwards."""
+        values: Values = dict(given)
+        if kept not in self._lines:
+            self._lines = {kept: self._line(range(len(self._layers)), kept)}
+        return walk(self._lines[kept], values, self._exact, self._remembering()), values
+
+    def one_by_one(self) -> list[Step]:
+        """Return a step for each layer but the inputs, all by themselves; no value ends."""
+        return [step._replace(ends=()) for i in range(len(self._layers)) for step in self._alone(i)]
+
+    def _line(self, part: Sequence[int], kept: frozenset[int], inner: bool = False) -> list[Step]:
+        """Return the steps of consecutive layers for runs that keep some values; ``inner``: of those of a segment."""
+        steps: list[Step] = []
+        end = -1
+        for i in part:
+            if i <= end:
+                continue
+            segment = None if inner else self.segments.get(i)
+            following = [k for k in self._chains_to(i, kept) if k in part]
+            if segment and not kept & segment.within:
+                end = segment.last
+                step = Step(end, segment.run, segment.bottoms, segment.tops)
+            elif following:
+                end = following[-1]
+                run = together([self._layers[k] for k in (i, *following)])
+                step = Step(end, run, self._plan.nodes[i].bottoms, self._plan.nodes[end].tops)
+            else:
+                end = i
+                steps += self._alone(i, kept)
+                continue
+            steps.append(step._replace(ends=self._ends(i, end, kept)))
+        return steps
+
+    def _alone(self, i: int, kept: frozenset[int] = frozenset()) -> list[Step]:
+        """Return the step that runs layer ``i`` alone; none for an input, whose values are given."""
+        node, layer = self._plan.nodes[i], self._layers[i]
+        losses, ends = self._losses[i], self._ends(i, i, kept)
+        if not layer.is_input:
+            return [Step(i, self._as_asked(i), node.bottoms, node.tops, losses, ends)]
+        return [Step(i, lambda *tops: tops, node.tops, node.tops, losses, ends)] if losses or ends else []
+
+    def _as_asked(self, i: int) -> Callable[..., tuple[torch.Tensor, ...]]:
+        """Return what runs a layer: without gradients for blocked bottoms; losses are float32 in every precision."""
+        layer, force = self._layers[i], self._plan.net.force_backward
+        blocked = [stop and not force for stop in self._plan.nodes[i].blocked]
+        if not layer.is_loss and not any(blocked):
+            return layer.run
+
+        def run(*bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            given = [bottom.detach() if stop else bottom for bottom, stop in zip(bottoms, blocked, strict=True)]
+            if layer.is_loss:
+                given = [x.float() if x.dtype in (torch.bfloat16, torch.float16) else x for x in given]
+            return layer.run(*given)
+
+        return run
+
+    def _chains_to(self, i: int, kept: frozenset[int]) -> list[int]:
+        """Return the layers that may run with layer ``i``: nobody looks at what lies between."""
+        row = self.chains[i]
+        seen = next((n for n, k in enumerate(row) if self._plan.nodes[k].bottoms[0] in kept), len(row))
+        return row[:seen]
+
+    def _ends(self, first: int, last: int, kept: frozenset[int]) -> tuple[int, ...]:
+        return tuple(v for i in range(first, last + 1) for v in self._last_uses[i] if v not in kept)
+
+    def _apart(self) -> list[bool]:
+        """Return which layers must run by themselves, whatever they compute."""
+        final, nodes = self._plan.final, self._plan.nodes
+        read_again = {final[node.tops[0]] for node, is_read in zip(nodes, self.overwritten, strict=True) if is_read}
+        return [
+            any(node.blocked) or bool(losses) or any(final[v] in read_again for v in node.tops)
+            for node, losses in zip(nodes, self._losses, strict=True)
+        ]
+
+    def _remembering(self) -> Visit | None:
+        """Return a visit that keeps, for one run, what later layers leave in memory, where a gradient reads it."""
+        if not any(self.overwritten) or not torch.is_grad_enabled():
+            return None
+        plan, memories = self._plan, dict[int, Memory]()
+
+        def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
+            if self.overwritten[step.node]:
+                node, layer = plan.nodes[step.node], self._layers[step.node]
+                memory = memories.setdefault(plan.final[node.tops[0]], Memory())
+                stop = node.blocked[0] and not plan.net.force_backward
+                bottom = bottoms[0].detach() if stop else bottoms[0]
+                tops = run_overwritten(layer, bottom, memory, node.in_place[0])
+            else:
+                tops = step.run(*bottoms)
+            for v, top in zip(step.tops, tops, strict=False):
+                if v in memories:
+                    memories[v].data = top.detach()
+            return tops
+
+        return visit
+
+
+def last_uses(plan: Plan) -> list[list[int]]:
+    """Return, by node, the values that are no longer needed once it has run."""
+    last: dict[int, int] = {}
+    for i, node in enumerate(plan.nodes):
+        for v in (*node.tops, *node.bottoms):
+            last[v] = i
+    ends: list[list[int]] = [[] for _ in plan.nodes]
+    for v, i in last.items():
+        ends[i].append(v)
+    return ends
