@@ -1,6 +1,7 @@
 """What ``pip install`` gives: a wheel with all files of the packages, and commands that work without the source."""
 
 import configparser
+import os
 import shutil
 import subprocess
 import sys
@@ -17,10 +18,14 @@ pytestmark = pytest.mark.slow
 
 PACKAGES = ("lmdb_build", "loopclosure", "netspec")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
+NETS = [path.relative_to(ROOT).as_posix() for path in (ROOT / "prototxt").rglob("*") if path.is_file()]
+FILES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", *NETS)
 
 
 def run(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run([str(word) for word in words], cwd=cwd, capture_output=True, text=True, check=False)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}  # which names the source
+    line = [str(word) for word in words]
+    done = subprocess.run(line, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done
 
@@ -31,7 +36,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = folder / "source"
     for package in PACKAGES:
         shutil.copytree(ROOT / package, source / package, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in FILES:
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
     run(*PIP, "wheel", "--no-deps", "--no-build-isolation", "--no-index", "-w", folder, source, cwd=folder)
     (built,) = folder.glob("*.whl")
@@ -59,8 +65,10 @@ def test_it_holds_every_file_of_the_packages_and_nothing_else(wheel: Path) -> No
     }
     with zipfile.ZipFile(wheel) as file:
         found = {name for name in file.namelist() if ".dist-info/" not in name}
+    expected |= {f"netspec/{name}" for name in NETS if name.endswith(".prototxt") or "words_256/" in name}
     assert found == expected
-    assert {"netspec/proto/caffe.desc", "netspec/py.typed", "netspec/moved/describe.py"} < found
+    assert wheel.stat().st_size < 6e6
+    assert {"netspec/proto/caffe.desc", "netspec/py.typed", "netspec/features/shipped.py"} < found
 
 
 def test_it_says_what_it_is(wheel: Path) -> None:
@@ -103,3 +111,38 @@ def test_the_other_commands_run_without_the_source(commands: Path, tmp_path: Pat
     code = "import netspec, loopclosure, lmdb_build; print(netspec.__file__)"
     where = Path(run(commands / "python", "-c", code, cwd=tmp_path).stdout.strip())
     assert where.is_relative_to(commands.parent)
+
+
+def test_loops_are_detected_with_no_option(commands: Path, tmp_path: Path) -> None:
+    """The net, its weights and the settings come with the wheel."""
+    run(commands / "lmdb-build", "walk", "w", "--frames", "40", "--size", "80x60", "--laps", "2", cwd=tmp_path)
+    run(commands / "loopclosure", "detect", "w/walk_1", "--out", "found", cwd=tmp_path)
+    assert (tmp_path / "found" / "loops.csv").is_file()
+    code = "from netspec.features.shipped import folder; print(folder('siamese_8'))"
+    paper = Path(run(commands / "python", "-c", code, cwd=tmp_path).stdout.strip())
+    assert paper.is_relative_to(commands.parent)
+    assert (paper / "train_val.prototxt").read_bytes() == (ROOT / "prototxt/siamese_8/train_val.prototxt").read_bytes()
+
+
+def test_an_editable_installation_has_the_nets_too(wheel: Path, tmp_path: Path) -> None:
+    source, site = wheel.parent / "source", tmp_path / "site"
+    venv.create(site, symlinks=True)
+    editable = ("install", "--no-deps", "--no-index", "--no-build-isolation", "-e", source)
+    (packages,) = site.glob("lib/python*/site-packages")
+    (packages / "dependencies.pth").write_text(
+        "\n".join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")})
+    )
+    run(*PIP, "--python", site / "bin" / "python", *editable, cwd=tmp_path)
+    code = "from loopclosure.detector.run import load_describe; import netspec; print(netspec.__file__, load_describe"
+    said = run(site / "bin" / "python", "-c", f"{code}('small', {{}}).views)", cwd=tmp_path).stdout.split()
+    assert Path(said[0]).is_relative_to(source)
+    assert said[1] == "1"
+
+
+def test_every_weight_has_its_source_and_license() -> None:
+    weights = list((ROOT / "prototxt" / "many_negatives").glob("*/siamese_words_???.caffemodel"))
+    assert len(weights) == 2
+    for path in weights:
+        said = (path.parent / "SOURCE.md").read_text()
+        assert path.name in said
+        assert "License: " in said

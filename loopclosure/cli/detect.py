@@ -52,9 +52,9 @@ def add_to(commands: Commands) -> None:
     how = p.add_mutually_exclusive_group()
     how.add_argument(
         "--describe",
-        default="loopclosure.descriptors.thumbnails:Thumbnailer",
-        metavar="MODULE|FILE.py:FUNCTION",
-        help="image (H, W, 3) BGR -> descriptor (default: %(default)s)",
+        default="default",
+        metavar="NAME|MODULE:FUNCTION|FILE.py:FUNCTION",
+        help="image (H, W, 3) BGR -> descriptor: default and small are nets that come with it (default: %(default)s)",
     )
     how.add_argument("--features", metavar="F.npz", help="descriptors computed beforehand (netspec extract --images)")
     p.add_argument(

@@ -36,7 +36,7 @@ SAVED = "a file that LoopDetector.save wrote"
 
 @dataclass(frozen=True)
 class LoopResult:
-    """What adding one frame found.
+    """What adding one frame found. It is true if the frame closes a loop.
 
     query_id    the frame's number, from 0
     candidates  (id, score) of the best earlier frames, best first, higher = more similar
@@ -55,6 +55,9 @@ class LoopResult:
     score: float
     inliers: int | None = None
     stamp: float | None = None
+
+    def __bool__(self) -> bool:
+        return self.accepted is not None
 
 
 @dataclass(frozen=True)

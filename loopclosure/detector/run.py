@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,6 +32,7 @@ from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses
 from loopclosure.progress import Progress, silent
 
+DESCRIBERS = "loopclosure.describers"  # the group of entry points: name -> function that makes a describer
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
 
 
@@ -145,13 +148,18 @@ def judged_by_poses(detector: LoopDetector) -> str:
     return f"{right} of {len(known)} loops are the same place by their poses (2 m, 15 degrees)"
 
 
-def load_describe(specification: str, options: dict[str, str]) -> Describe:
-    """Return the ``describe`` function that ``module:name`` or ``FILE.py:name`` names.
+def load_describe(specification: str, options: dict[str, str] | None = None) -> Describe:
+    """Return the ``describe`` function that ``module:name`` or ``FILE.py:name`` names, or a name without a colon.
 
+    Such a name is that of an entry point ``loopclosure.describers`` of an installed distribution, always called with
+    ``options``.
     A class, or a function if there are options, is called with ``options`` as keywords and must return the ``describe``
     function. A module is one of an installed package: what lies in the working directory runs only if its path is
     given.
     """
+    options = options or {}
+    if re.fullmatch(r"[\w-]+", specification):
+        return _called(_entry_point(specification), specification, options)
     module_name, colon, name = specification.rpartition(":")
     if not colon or not name or not module_name:
         raise InputError(f'"{specification}" does not name a function; expected module:function or FILE.py:function')
@@ -164,13 +172,32 @@ def load_describe(specification: str, options: dict[str, str]) -> Describe:
             raise InputError(f'"{module_name}" has no "{name}" (--describe {specification})')
         target = getattr(target, part)
     if options or isinstance(target, type):
-        try:
-            target = target(**{key: _value(text) for key, text in options.items()})
-        except (TypeError, ValueError, OSError) as error:
-            raise InputError(f"--describe {specification}: {error}") from error
+        return _called(target, specification, options)
+    return _callable(target, specification)
+
+
+def _called(target: Any, specification: str, options: dict[str, str]) -> Describe:
+    try:
+        return _callable(target(**{key: _value(text) for key, text in options.items()}), specification)
+    except (TypeError, ValueError, OSError) as error:
+        raise InputError(f"--describe {specification}: {error}") from error
+
+
+def _callable(target: Any, specification: str) -> Describe:
     if not callable(target):
         raise InputError(f"--describe {specification} is a {type(target).__name__}, which cannot be called")
     return cast(Describe, target)
+
+
+def _entry_point(name: str) -> Any:
+    found = entry_points(group=DESCRIBERS)
+    if name not in found.names:
+        known = ", ".join(sorted(found.names)) or "none: install the package again (pip install)"
+        raise InputError(f'no describer has the name "{name}"; installed are {known}; or give module:function')
+    try:
+        return found[name].load()
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"--describe {name}: {found[name].value} cannot be imported: {error}") from error
 
 
 def _installed_module(name: str) -> Any:

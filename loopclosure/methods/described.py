@@ -45,11 +45,11 @@ class DescribedMethod:
 
 
 def described(argument: str, context: MethodContext, inner: Method | None) -> DescribedMethod:
-    """Build ``describe:MODULE|FILE.py:FUNCTION[:euclidean|cosine]``."""
+    """Build ``describe:NAME|MODULE:FUNCTION|FILE.py:FUNCTION[:euclidean|cosine]``."""
     refuse_inner("describe", inner)
     function, _, metric = argument.rpartition(":")
     if metric not in METRICS:
         function, metric = argument, METRICS[0]
-    if ":" not in function:
-        raise InputError(f'"describe:{argument}": expected describe:FILE.py:FUNCTION or describe:MODULE:FUNCTION')
+    if not function:
+        raise InputError(f'"describe:{argument}": expected describe:NAME, describe:FILE.py:FUNCTION or MODULE:FUNCTION')
     return DescribedMethod(function, metric)

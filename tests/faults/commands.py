@@ -131,6 +131,9 @@ def check_report() -> object:
     return None
 
 
+THUMBNAILS = "loopclosure.descriptors.thumbnails:Thumbnailer"
+
+
 def detect_inputs() -> None:
     images(30)
 
@@ -165,7 +168,7 @@ CASES = {
     ),
     "detect": Case(
         loopclosure.cli.main,
-        ["detect", "images", "--threshold", "0.5", "--out", "out", "--save", "out/d.npz"],
+        ["detect", "images", "--describe", THUMBNAILS, "--threshold", "0.5", "--out", "out", "--save", "out/d.npz"],
         detect_inputs,
         lambda: check_npz("out/d.npz"),
     ),

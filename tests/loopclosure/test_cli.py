@@ -120,6 +120,8 @@ def test_detect_writes_loops_and_a_pose_graph(two_laps, tmp_path, capsys):
             "10",
             "--consistency",
             "2",
+            "--describe",
+            "loopclosure.descriptors.thumbnails:Thumbnailer",
             "--out",
             str(tmp_path),
         ]
@@ -154,7 +156,8 @@ def test_detect_chooses_by_itself(tmp_path, capsys):
     (tmp_path / "drive").mkdir()
     for i, image in enumerate(frames):
         cv2.imwrite(str(tmp_path / "drive" / f"{i:03d}.png"), cv2.resize(image, (64, 48)))
-    line = ["detect", str(tmp_path / "drive"), "--exclude-recent", "20", "--out", str(tmp_path / "found")]
+    thumbnails = ["--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]
+    line = ["detect", str(tmp_path / "drive"), "--exclude-recent", "20", *thumbnails, "--out", str(tmp_path / "found")]
     assert main([*line, "--save", str(tmp_path / "d.npz")]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == 5
@@ -167,7 +170,7 @@ def test_detect_chooses_by_itself(tmp_path, capsys):
     assert len(loops) > 60
     assert all(abs(query - 100 - match) <= 5 for query, match in loops)
     resumed = ["detect", str(tmp_path / "drive"), "--resume", str(tmp_path / "d.npz"), "--out", str(tmp_path / "again")]
-    assert main(resumed) == 0
+    assert main([*resumed, *thumbnails]) == 0
 
 
 def test_similarity(two_laps_features, tmp_path, capsys):

@@ -296,6 +296,7 @@ def test_detect_whitens_what_describe_returns(two_laps, tmp_path, capsys):
     np.savez(tmp_path / "other.npz", features=rows)
     saved = tmp_path / "detector.npz"
     words = ["detect", str(two_laps), "--threshold", "-0.5", "--save", str(saved), "--out", str(tmp_path)]
+    words += ["--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]
     assert main([*words, "--whiten", str(tmp_path / "other.npz")]) == 0
     with np.load(saved) as detector:
         np.testing.assert_allclose(detector["rows"][:PLACES], learn_whitening(rows)(rows), atol=1e-5)

@@ -193,3 +193,10 @@ def test_faults_are_named(call, sentence):
 def test_a_misspelt_setting_is_a_programmers_fault():
     with pytest.raises(TypeError, match="has no setting treshold"):
         LoopDetector(treshold=1.0)
+
+
+def test_a_result_is_true_only_if_a_loop_was_accepted():
+    detector = LoopDetector(None, exclude_recent=0, threshold=-0.1)
+    results = [detector.add_descriptor(row) for row in ([0.0, 1.0], [1.0, 0.0], [0.0, 1.0])]
+    assert [bool(result) for result in results] == [False, False, True]
+    assert results[1].candidates  # not accepted

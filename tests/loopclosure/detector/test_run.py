@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from loopclosure.descriptors.feature_file import Features, read_features
+from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import (
     Recording,
@@ -19,6 +20,8 @@ from loopclosure.detector.run import (
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.frames import Selection
+from netspec.errors import SpecError
+from netspec.features import shipped
 
 
 def small(image):
@@ -138,3 +141,35 @@ def test_a_video_that_is_shorter_than_it_says(tmp_path, monkeypatch):
         next(frames)
     with pytest.raises(InputError, match="threshold is nan"):
         LoopDetector(threshold=float("nan"))
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """A distribution that brings two describers, one of which cannot be imported."""
+    info = tmp_path / "brings_describers-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: brings-describers\nVersion: 1\n")
+    lines = (
+        "[loopclosure.describers]\nthumbs = loopclosure.descriptors.thumbnails:Thumbnailer\nlost = nowhere:describe\n"
+    )
+    (info / "entry_points.txt").write_text(lines)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def test_a_describer_is_found_by_the_name_of_its_entry_point(installed):
+    assert load_describe("thumbs", {"width": "8"}) == Thumbnailer(width=8)
+    assert load_describe("thumbs") == Thumbnailer()
+    with pytest.raises(InputError, match=r'no describer has the name "thumb"; installed are .*thumbs; or give module'):
+        load_describe("thumb")
+    with pytest.raises(InputError, match="--describe lost: nowhere:describe cannot be imported: No module named"):
+        load_describe("lost")
+    with pytest.raises(InputError, match=r"--describe thumbs: .*unexpected keyword argument 'size'"):
+        load_describe("thumbs", {"size": "8"})
+
+
+def test_the_nets_that_come_with_the_package_describe():
+    for net in (shipped.default, shipped.small):
+        assert np.isfinite(net()(np.zeros((60, 80, 3), np.uint8))).all()
+    assert (shipped.folder("siamese_8") / "train_val.prototxt").is_file()
+    with pytest.raises(SpecError, match='the net "siamese_9" is not installed'):
+        shipped.folder("siamese_9")

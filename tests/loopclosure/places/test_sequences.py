@@ -241,7 +241,7 @@ def test_images_with_both_a_mask_and_poses_are_wrong_usage(tmp_path: Path, capsy
 def test_detect_takes_euroc_with_its_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_euroc(tmp_path)
     line = ["detect", str(folder), "--threshold", "-0.001", "--exclude-recent", "10", "--out", str(tmp_path / "found")]
-    assert main(line) == 0
+    assert main([*line, "--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]) == 0
     assert "24 of 24 loops are the same place by their poses" in capsys.readouterr().out
 
 

@@ -1,0 +1,38 @@
+"""What pyproject.toml cannot say: the nets of prototxt/ travel in the wheel, as netspec/prototxt."""
+
+import ast
+import shutil
+from pathlib import Path
+
+from setuptools import setup
+from setuptools.command.build_py import build_py
+
+NETS = Path(__file__).parent / "prototxt"
+SHIPPED = Path(__file__).parent / "netspec" / "features" / "shipped.py"
+
+
+def files():
+    """Return the files that travel: all prototxts, and of the weights those that have a name, with their source."""
+    tree = ast.parse(SHIPPED.read_text(encoding="utf-8"))
+    named = {ast.literal_eval(part.value) for part in tree.body if isinstance(part, ast.Assign)}
+    found = sorted(NETS.rglob("*.prototxt"))
+    for net in sorted(named):
+        folder = NETS / net
+        found += [folder / f"{folder.name}.caffemodel", folder / "SOURCE.md"]
+    return [path.relative_to(NETS) for path in found]
+
+
+class BuildPy(build_py):
+    """An editable installation reads prototxt/ where it is."""
+
+    def run(self):
+        """Build the packages, and copy the nets beside them."""
+        super().run()
+        if not getattr(self, "editable_mode", False):
+            for path in files():
+                target = Path(self.build_lib) / "netspec" / "prototxt" / path
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(NETS / path, target)
+
+
+setup(cmdclass={"build_py": BuildPy})
