@@ -23,7 +23,7 @@ from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
 from netspec.layers.training import Backward, Diff, Forward, Kernels, Learning, recorded
 
-LARGEST = 2**24  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
+LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
 Values = list[Any]  # by value number, a tensor or None
 
 

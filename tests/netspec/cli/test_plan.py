@@ -37,6 +37,17 @@ def test_a_training_net_has_no_passes(run: Callable[..., Any]) -> None:
     assert re.search("bfloat16 on this CPU: (yes|no|unknown)\n", out)
 
 
+def test_says_how_a_net_is_trained(run: Callable[..., Any]) -> None:
+    folder = DEPLOY.parents[1]
+    shape = ("--shape", "pair_data=2,6,64,64")
+    small = run("check", folder / "siamese_8" / "train_val.prototxt", "--plan", "--phase", "TRAIN", *shape)
+    assert "by kernels prepared once" in small.out
+    residual = run(
+        "check", folder / "siamese_resnet27_256" / "train_val.prototxt", "--plan", "--phase", "TRAIN", *shape
+    )
+    assert "runs together with the layers after it" in residual.out
+
+
 def test_extract_takes_passes(run: Callable[..., Any]) -> None:
     words = (
         "extract",
