@@ -1,45 +1,37 @@
 """Caffe's Python interface: ``import netspec.pycaffe as caffe``.
 
-Caffe: python/caffe/__init__.py
+Messages, ``caffe.io`` and NetSpec are there without torch; every other name loads :mod:`netspec.pycaffe.interface`.
 """
 
+import importlib
+import importlib.util
 import sys
+from typing import TYPE_CHECKING, Any
 
-from netspec.layers import layer_types as layer_type_list
-from netspec.layers.utility import pycaffe_shim
-from netspec.layers.utility.pycaffe_shim import TEST, TRAIN, Layer
-from netspec.pycaffe import classifier, coord_map, detector, draw, io, logs, net_spec, proto
-from netspec.pycaffe.classifier import Classifier
-from netspec.pycaffe.detector import Detector
-from netspec.pycaffe.logs import init_log
-from netspec.pycaffe.logs import log_message as log
-from netspec.pycaffe.mode import (
-    set_device,
-    set_mode_cpu,
-    set_mode_gpu,
-    set_multiprocess,
-    set_random_seed,
-    set_solver_count,
-    set_solver_rank,
-    solver_count,
-    solver_rank,
-)
-from netspec.pycaffe.net import Net
-from netspec.pycaffe.net_spec import NetSpec, layers, params, to_proto
-from netspec.pycaffe.parallel import NCCL, Timer, has_nccl
-from netspec.pycaffe.solver import (
-    AdaDeltaSolver,
-    AdaGradSolver,
-    AdamSolver,
-    NesterovSolver,
-    RMSPropSolver,
-    SGDSolver,
-    get_solver,
-)
+from netspec.pycaffe import logs
+
+if TYPE_CHECKING:
+    from netspec.pycaffe.interface import *  # noqa: F403
 
 __version__ = "1.0.0"  # of the Caffe whose interface this is
+TRAIN, TEST = 0, 1
 
-from netspec.pycaffe import _caffe, pycaffe
+_WITHOUT_TORCH = {"NetSpec": "net_spec", "layers": "net_spec", "params": "net_spec", "to_proto": "net_spec"}
+_INTERFACE = f"{__name__}.interface"
 
 logs.start()
-pycaffe_shim.offer(sys.modules[__name__])
+
+
+def __getattr__(name: str) -> Any:
+    if not name.startswith("__") and importlib.util.find_spec(f"{__name__}.{name}"):
+        return importlib.import_module(f"{__name__}.{name}")
+    if name in _WITHOUT_TORCH:
+        return getattr(importlib.import_module(f"{__name__}.{_WITHOUT_TORCH[name]}"), name)
+    dunder = name.startswith("__") and name != "__all__"
+    if not dunder and _INTERFACE not in sys.modules:  # else it has this name not, or is being loaded
+        names = vars(importlib.import_module(_INTERFACE))
+        globals().update({given: value for given, value in names.items() if not given.startswith("__")})
+        globals()["__all__"] = [given for given in names if not given.startswith("_")]
+    if name in globals():
+        return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -5,6 +5,7 @@ Caffe: python/caffe/_caffe.cpp, python/caffe/pycaffe.py
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import zip_longest
@@ -81,6 +82,7 @@ class Net:
         return made
 
     def _hold(self, net: core.Net) -> None:
+        importlib.import_module("netspec.pycaffe.interface")  # Python layers may import all of it as caffe
         mode.follow_seed(net.random)
         self.passes = passes = Passes(net)
         names = [node.name for node in net.plan.nodes]

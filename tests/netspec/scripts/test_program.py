@@ -291,6 +291,9 @@ print(caffe.Net("net.prototxt", caffe.TRAIN).forward()["l"])
 def test_nothing_is_loaded_that_the_script_does_not_ask_for(run: Run) -> None:
     script = "import sys; print([name for name in ('torch', 'scipy', 'cv2') if name in sys.modules])"
     assert run("s.py", s=script).stdout == "[]\n"
+    light = "import caffe; from caffe.proto import caffe_pb2; from caffe import layers as L, params as P, NetSpec\n"
+    light += "L.Pooling(L.Input(), pool=P.Pooling.MAX).to_proto(); caffe.io.datum_to_array; caffe.TEST\n"
+    assert run("s.py", s=light + script).stdout == "[]\n"
 
 
 def test_in_a_notebook() -> None:
