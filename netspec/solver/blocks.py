@@ -25,9 +25,20 @@ LINE = 16  # numbers, 64 bytes: where each blob begins
 class Learnable(Protocol):
     """A parameter with its multipliers, as in netspec/net/net.py."""
 
-    parameter: torch.nn.Parameter
-    lr_mult: float
-    decay_mult: float
+    @property
+    def parameter(self) -> torch.nn.Parameter:
+        """What is learned."""
+        ...
+
+    @property
+    def lr_mult(self) -> float:
+        """The rate's multiplier."""
+        ...
+
+    @property
+    def decay_mult(self) -> float:
+        """The decay's multiplier."""
+        ...
 
 
 @dataclass(frozen=True)
