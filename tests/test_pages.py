@@ -80,6 +80,7 @@ NOT_RUN = {
         "tools/bench forward": "installs OpenCV 4; " + BENCH,
         "tools/bench train small/siamese_8": BENCH,
         "tools/bench train lenet": "needs Caffe",
+        "tools/bench small": "needs Caffe",
         "tools/bench start": BENCH,
         "tools/bench waiting": "a minute of two trainings side by side",
         "tools/bench feeding": BENCH,
