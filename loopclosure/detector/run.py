@@ -192,8 +192,8 @@ def _callable(target: Any, specification: str) -> Describe:
 def _entry_point(name: str) -> Any:
     found = entry_points(group=DESCRIBERS)
     if name not in found.names:
-        known = ", ".join(sorted(found.names)) or "none: install the package again (pip install)"
-        raise InputError(f'no describer has the name "{name}"; installed are {known}; or give module:function')
+        known = ", ".join(sorted(found.names)) or "none is installed: install the package again (pip install)"
+        raise InputError(f'no describer has the name "{name}"; expected module:function, or a name ({known})')
     try:
         return found[name].load()
     except (ImportError, AttributeError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,6 @@ def described(argument: str, context: MethodContext, inner: Method | None) -> De
     function, _, metric = argument.rpartition(":")
     if metric not in METRICS:
         function, metric = argument, METRICS[0]
-    if not function:
+    if ":" not in function and not re.fullmatch(r"[\w-]+", function):
         raise InputError(f'"describe:{argument}": expected describe:NAME, describe:FILE.py:FUNCTION or MODULE:FUNCTION')
     return DescribedMethod(function, metric)

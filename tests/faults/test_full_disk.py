@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lmdb_build.cli
-from faults.commands import CASES, Case, check_npz
+from faults.commands import CASES, THUMBNAILS, Case, check_npz
 from netspec.cli import main
 from netspec.files import whole_file
 from netspec.net.build import load_net
@@ -117,7 +117,8 @@ def test_a_detector_resumed_and_saved_under_one_name(here: Path) -> None:
     assert case.main(case.words) == 0
     before = check_npz("out/d.npz")
     with full_disk():
-        assert case.main(["detect", "images", "--resume", "out/d.npz", "--save", "out/d.npz", "--out", "out"]) == 1
+        words = ["--describe", THUMBNAILS, "--resume", "out/d.npz", "--save", "out/d.npz", "--out", "out"]
+        assert case.main(["detect", "images", *words]) == 1
     assert check_npz("out/d.npz") == before
 
 

@@ -159,7 +159,9 @@ def installed(tmp_path, monkeypatch):
 def test_a_describer_is_found_by_the_name_of_its_entry_point(installed):
     assert load_describe("thumbs", {"width": "8"}) == Thumbnailer(width=8)
     assert load_describe("thumbs") == Thumbnailer()
-    with pytest.raises(InputError, match=r'no describer has the name "thumb"; installed are .*thumbs; or give module'):
+    with pytest.raises(
+        InputError, match=r'no describer has the name "thumb"; expected module:function, or a name \(.*thumbs\)'
+    ):
         load_describe("thumb")
     with pytest.raises(InputError, match="--describe lost: nowhere:describe cannot be imported: No module named"):
         load_describe("lost")
