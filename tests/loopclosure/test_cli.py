@@ -204,7 +204,7 @@ def expanded(line: str, **names: object) -> list[str]:
         ("evaluate LAPS --method bow --train LAPS --out OUT", "test images are training images"),
         ("evaluate LAPS --method features:NOWHERE.npz --out OUT", "NOWHERE.npz: no such file"),
         ("detect NOWHERE --threshold 1 --out OUT", "cannot be read"),
-        ("detect LAPS --threshold 1 --describe nothing --out OUT", "or give module:function"),
+        ("detect LAPS --threshold 1 --describe nothing --out OUT", "expected module:function"),
         ("similarity NOWHERE.npz --out OUT", "no such file"),
         ("similarity FEATURES --out OUT/no/folder.npy", "cannot be written"),
         ("detect LAPS --threshold 0.5 --out FEATURES", "FEATURES: File exists"),
