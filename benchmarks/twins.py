@@ -416,6 +416,6 @@ def _learning(twin: nn.Module) -> Iterator[nn.Conv2d | nn.Linear | nn.BatchNorm2
             yield module
 
 
-def _copy(target: Tensor | None, values: np.ndarray) -> None:
-    assert target is not None
+def _copy(target: Tensor | nn.Module | None, values: np.ndarray) -> None:
+    assert isinstance(target, Tensor)
     target.copy_(torch.from_numpy(values).reshape(target.shape))

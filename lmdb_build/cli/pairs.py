@@ -190,8 +190,8 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
         return table_source(path, root, get["group"], first.get("index", Path)), root
     if kind == "index":
         max_gap = first.get("max-gap", float)
-        columns = (str(get[name]) for name in ("group", "track", "time"))
-        return index_source(path, root, *columns, 1.0 if max_gap is None else max_gap), root
+        group, track, time = (str(get[name]) for name in ("group", "track", "time"))
+        return index_source(path, root, group, track, time, 1.0 if max_gap is None else max_gap), root
     return singles_source(path, root), root
 
 

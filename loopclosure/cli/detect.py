@@ -91,11 +91,11 @@ def add_to(commands: Commands) -> None:
 def _detect(a: argparse.Namespace) -> None:
     options = _checked_options(a)
     source = typed(a.source, {"": (*FRAMES, *TOPICS)})
-    path, topics = source.path, [source.get(name, str) or "" for name in TOPICS]
+    path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
     if is_bag(path):
-        path, said = extract(path, Path(a.out) / "frames", *topics, show_progress)
+        path, said = extract(path, Path(a.out) / "frames", topic, pose_topic, show_progress)
         print(said)
-    elif any(topics):
+    elif topic or pose_topic:
         raise WrongUsage(f"{source}: topics belong to bags")
     recording = run.open_recording(path, source.selection())
     for doubt in recording.doubts:

@@ -63,7 +63,7 @@ def read_pose_graph(path: Path) -> PoseGraph:
                 tags.add(tag.endswith("SE2"))
                 pose = _lifted(values[:3]) if tag.endswith("SE2") else _checked(values[:7], path, line)
                 if tag in (EDGE, EDGE_2D):
-                    edges.append((line, *ids, pose, _information(values, path, line)))
+                    edges.append((line, ids[0], ids[1], pose, _information(values, path, line)))
                 elif ids[0] in vertices:
                     raise InputError(f"there is a vertex {ids[0]} already", path, line, 1)
                 else:

@@ -199,7 +199,7 @@ def _places(nodes: int, first: NDArray[np.int_], second: NDArray[np.int_], held:
     place = np.full(nodes, -1)
     place[~stays] = np.arange(np.count_nonzero(~stays))
     free = (place[first] >= 0) & (place[second] >= 0)
-    place[~stays] = order(np.count_nonzero(~stays), place[first[free]], place[second[free]])
+    place[~stays] = order(int(np.count_nonzero(~stays)), place[first[free]], place[second[free]])
     return place
 
 

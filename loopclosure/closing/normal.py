@@ -6,6 +6,7 @@ step in about two thirds of the time.
 
 from __future__ import annotations
 
+from importlib import import_module
 from importlib.util import find_spec
 
 import numpy as np
@@ -37,10 +38,10 @@ def least_squares_step(derivatives: sparse.csr_matrix, errors: Array, gtsam: boo
 
 
 def _by_gtsam(derivatives: sparse.csr_matrix, errors: Array) -> Array:
-    import gtsam
+    gtsam = import_module("gtsam")  # optional, and without types
 
     blocks = derivatives.tobsr((6, 6))
-    starts, nodes, values = blocks.indptr.tolist(), blocks.indices.tolist(), blocks.data
+    starts, nodes, values = blocks.indptr.tolist(), blocks.indices.tolist(), np.asarray(blocks.data)
     unit = gtsam.noiseModel.Unit.Create(6)
     factors = gtsam.GaussianFactorGraph()
     for row, measured in enumerate(-errors.reshape(-1, 6)):
@@ -60,4 +61,4 @@ def order(nodes: int, first: NDArray[np.int_], second: NDArray[np.int_]) -> NDAr
     # Diagonally dominant, so that any order can be factored.
     dominant = sparse.diags(np.asarray(joined.sum(axis=1)).ravel() + 1) - joined
     options = {"SymmetricMode": True}
-    return splu(dominant.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options).perm_c
+    return np.asarray(splu(dominant.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options).perm_c)

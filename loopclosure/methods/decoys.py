@@ -137,7 +137,7 @@ def _owner(best: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
 def best_setting(scores: np.ndarray, allowed: np.ndarray, two: bool, precision: float) -> Found | None:
     """Return the search that finds the most loops at this precision; None if none finds any."""
     chosen, most = None, 0
-    for setting in settings(*scores.shape, two):
+    for setting in settings(scores.shape[0], scores.shape[1], two):
         found = search(scores, allowed, setting, two)
         count = np.count_nonzero(found.accepted(precision))
         if count * NEARLY > most:

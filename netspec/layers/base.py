@@ -458,6 +458,14 @@ class Layer(torch.nn.Module):
         """Return the values of all learnable blobs, in this layer's shapes, without gradients, for reading."""
         return [values_of(self.blob(j)) for j in range(len(self.blobs))]
 
+    def weight_and_bias(
+        self, learning: Learning
+    ) -> tuple[tuple[torch.Tensor, torch.Tensor | None], tuple[torch.Tensor | None, torch.Tensor | None]]:
+        """Return the values of blobs 0 and 1, and where their gradients are added up; blob 1 may be missing."""
+        values = self.values()
+        has_bias = len(values) > 1
+        return (values[0], values[1] if has_bias else None), (learning.sums[0], learning.sums[1] if has_bias else None)
+
     def possible(self, shape: Sequence[int]) -> Shape:
         """Return a shape as a tuple; refuse one with a negative size, or of more axes or numbers than Caffe's."""
         if min(shape, default=0) < 0:

@@ -95,8 +95,8 @@ class InnerProduct(Layer):
 
     @override
     def prepare_training(self, learning: Learning) -> Kernels:
-        weight, bias = (*self.values(), None)[:2]
-        sums, transposed = (*learning.sums, None)[:2], self.param.inner_product_param.transpose
+        (weight, bias), sums = self.weight_and_bias(learning)
+        transposed = self.param.inner_product_param.transpose
         top_shape, inputs, wanted = self.top_shapes[0], self.inputs, learning.wanted[0]
         if math.prod(top_shape) == 0 or inputs == 0:
             return recorded(self.run, learning)

@@ -160,9 +160,8 @@ class Prepared:
             kernel, kind = self._kernel(step, layers, found[step.node] is None, as_is[step.node], memos)
             kinds.append("exact" if exact[step.node] else kind)
             line.append(Step(step.node, kernel, step.bottoms, step.tops, self._losses[step.node], step.ends))
-        blobs = [
-            (owner, *each) for owner in (layer.blobs._parameters for layer in self._layers) for each in owner.items()
-        ]
+        owners: list[dict[str, Any]] = [layer.blobs._parameters for layer in self._layers]
+        blobs = [(owner, name, blob) for owner in owners for name, blob in owner.items()]
         return Program(
             line,
             order,

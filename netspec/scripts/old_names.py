@@ -33,7 +33,13 @@ def install(also: Mapping[str, Callable[[Any], None]], quiet: bool = False) -> N
     _PATCHES.update(also)
     if not quiet and os.environ.get(VARIABLE, "0") in ("", "0", "1"):
         process = os.getpid()
-        _PATCHES["numpy"] = lambda np: (_numpy(np), _warn_if_too_new(np) if os.getpid() == process else None)
+
+        def numpy_with_a_warning(np: Any) -> None:
+            _numpy(np)
+            if os.getpid() == process:
+                _warn_if_too_new(np)
+
+        _PATCHES["numpy"] = numpy_with_a_warning
     for name, value in (("clock", time.perf_counter),):
         _give(time, name, value)
     for name in collections.abc.__all__:

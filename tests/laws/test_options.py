@@ -1,6 +1,7 @@
 """No option is ignored: each one of each command, given alone, is read, or refused by its name."""
 
 import argparse
+import os
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -13,10 +14,13 @@ import cv2
 import numpy as np
 import pytest
 
+from lmdb_build.cli import main as lmdb_build_main
+from loopclosure.cli import main as loopclosure_main
 from paths import GOLDEN, ROOT
 
 NET, SOLVER, WEIGHTS = "train_val.prototxt", "solver.prototxt", "init.caffemodel"
 FEATURES = f"--model {NET} --weights {WEIGHTS} --blob feat"
+THUMBNAILS = "loopclosure.descriptors.thumbnails:Thumbnailer"
 SHOWN = f"{NET} --weights {WEIGHTS} --blob feat"
 # A command line of each way in which a command works; those of one command have the same options.
 WAYS = {
@@ -73,6 +77,18 @@ WAYS = {
         "mean pairs/test_lmdb mean.binaryproto",
         f"compare {SOLVER} --no-train --out out",
     ),
+    "loopclosure": (
+        "evaluate tum:walk/walk_1 --method thumbnails --exclude-frames 3 --out report",
+        "evaluate images:images,truth=truth.png --method thumbnails --exclude-frames 1 --out report",
+        "evaluate traverses:images,references=images --method thumbnails --out report",
+        "compare report/report.json reports/other/report.json --out both",
+        f"detect walk/walk_1 --describe {THUMBNAILS} --exclude-recent 3 --out found",
+        f"detect walk/walk_1 --describe {THUMBNAILS} --threshold -1 --exclude-recent 3 --out found",
+        "detect walk/walk_1 --features walk.npz --threshold -1 --exclude-recent 1 --out found",
+        "close walk/walk_1 --loops loops.csv --drift 2 --out closed",
+        "close --graph loops.g2o --out closed",
+        "similarity features.npz --out s.npz",
+    ),
 }
 # Commands that this test does not start, and why.
 NOT_STARTED = {
@@ -85,6 +101,7 @@ NOT_STARTED = {
         "mnist": "needs MNIST",
         "cifar": "needs CIFAR-10",
     },
+    "loopclosure": {},
 }
 SHARED = {"verbose", "plugin", "limit"}  # read before the command itself
 HIDDEN = argparse.SUPPRESS
@@ -127,6 +144,26 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture(scope="session")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What loopclosure reads and writes: a walk, its features, a report of it, its loops as a list and as a graph."""
+    folder = tmp_path_factory.mktemp("drive")
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        assert lmdb_build_main(["walk", "walk", "--frames", "20", "--size", "40x32"]) == 0
+        names = np.array([path.name for path in sorted(Path("walk/walk_1/rgb").iterdir())])
+        np.savez("walk.npz", features=np.random.default_rng(0).random((20, 4), np.float32), names=names)
+        known = ["walk/walk_1", "--describe", THUMBNAILS, "--exclude-recent", "3", "--out", "."]
+        assert loopclosure_main(["detect", *known]) == 0
+        again = ["walk/walk_1", "--method", "thumbnails", "--exclude-frames", "3"]
+        assert loopclosure_main(["evaluate", *again, "--out", "report"]) == 0
+    finally:
+        os.chdir(before)
+    cv2.imwrite(str(folder / "truth.png"), np.tril(np.full((3, 3), 255, np.uint8), -1))
+    return folder
+
+
 def commands(parser: argparse.ArgumentParser, words: str = "") -> Iterator[tuple[str, list[argparse.Action]]]:
     """Each command of a parser, as it is typed, and its arguments."""
     groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
@@ -153,8 +190,11 @@ def ways() -> list[tuple[str, str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("program", "line"), ways(), ids=lambda value: value.replace(" ", "_"))
 def test_every_option_is_read_or_refused(
-    folder: Path, program: str, line: str, capfd: pytest.CaptureFixture[str]
+    folder: Path, program: str, line: str, capfd: pytest.CaptureFixture[str], drive: Path
 ) -> None:
+    if program == "loopclosure":
+        shutil.copytree(drive, folder, dirs_exist_ok=True)
+        shutil.copytree(drive / "report", folder / "reports" / "other")
     words = shlex.split(line)
     main = import_module(f"{program}.cli").main
     own = next(found for name, found in options(program).items() if f"{line} ".startswith(f"{name} "))

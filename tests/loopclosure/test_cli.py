@@ -151,7 +151,7 @@ def test_detect_chooses_by_itself(tmp_path, capsys):
     """A drive that comes back: pictures that change slowly, the second time darker."""
     rng = np.random.default_rng(0)
     steps = rng.integers(0, 256, (126, 24, 32)).astype(np.float64)
-    road = [sum(steps[i + k] for k in range(6)) / 6 for i in range(120)]
+    road = [steps[i : i + 6].mean(axis=0) for i in range(120)]
     frames = [*road, *(0.8 * image for image in road[20:100])]
     (tmp_path / "drive").mkdir()
     for i, image in enumerate(frames):

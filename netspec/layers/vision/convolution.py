@@ -284,8 +284,7 @@ class Convolution(_SlidingFilter):
         if not usual or len(self.bottom_shapes) > 1 or math.prod(self.top_shapes[0]) == 0:
             return recorded(self.run, learning)
         sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
-        weight, bias = (*self.values(), None)[:2]
-        sums = (*learning.sums, None)[:2]
+        (weight, bias), sums = self.weight_and_bias(learning)
         if self.is_exact(weight, self.small):
             asked = (learning.wanted[0], learning.steady)
             bound = BoundColumns(shape, sliding, self.group, weight, bias, *sums, *asked)

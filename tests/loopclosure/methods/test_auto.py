@@ -1,5 +1,7 @@
 """Loops without settings: what sequences, decoys and verification decide, on drives whose truth is known."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -151,7 +153,7 @@ class Fixed:
 def test_as_a_method(tmp_path, monkeypatch):
     road = drive(150, 11)
     scores = alike(again(road, 1.0, 12), road)
-    method = make_method("auto:precision=0.9+thumbnails", MethodContext())
+    method: Any = make_method("auto:precision=0.9+thumbnails", MethodContext())
     assert method.name == "auto+thumbnails"
     assert method.precision == 0.9
     method.inner = Fixed(scores)

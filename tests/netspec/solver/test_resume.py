@@ -215,7 +215,7 @@ OTHERWISE = [
 
 @pytest.mark.parametrize(("changed", "options", "told"), OTHERWISE, ids=[told for *_, told in OTHERWISE])
 def test_what_changes_the_numbers_is_said(
-    changed: dict[str, str], options: dict[str, Any], told: str, warnings: Callable[[], list[str]]
+    changed: dict[str, str], options: Any, told: str, warnings: Callable[[], list[str]]
 ) -> None:
     write(NETS["crop and mirror"], "iter_size: 2 random_seed: 3")
     shutil.copytree("db", "copy")
