@@ -27,7 +27,7 @@ def timed(
     made: list[tuple[Step, list[torch.Tensor], tuple[torch.Tensor, ...]]] = []
 
     def visit(step: Step, bottoms: list[torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        asked = zip(bottoms, wanted[step.node], strict=True)
+        asked = zip(bottoms, wanted[step.node] or [False] * len(bottoms), strict=True)  # an input has none
         leaves = [x.detach().requires_grad_(want and x.is_floating_point()) for x, want in asked]
         tops, seconds = _seconds(step.run, leaves)
         forward[step.node] += seconds

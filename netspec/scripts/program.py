@@ -64,7 +64,9 @@ def run_module(name: str, arguments: Sequence[str], options: Options) -> NoRetur
 
 
 def _prepare(folder: str, options: Options) -> sources.Reader:
-    sys.path[0] = folder
+    # The folder of the console script makes room; ``python -m netspec`` has already taken its own away.
+    of_program = [os.path.dirname(os.path.abspath(sys.argv[0]))]
+    sys.path[: int(sys.path[:1] == of_program)] = [folder]
     reader = sources.Reader(folder, options.python2)
     workers.prepare(reader, options.shadow)
     for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):

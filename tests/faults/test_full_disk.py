@@ -176,7 +176,7 @@ def test_snapshots_over_2_gib_are_refused_at_the_start(
 ) -> None:
     case = CASES["train"]
     case.prepare()
-    monkeypatch.setattr(sys.modules["netspec.solver.solver"], "MOST_BYTES", 1000)
+    monkeypatch.setattr(sys.modules["netspec.solver.training"], "MOST_BYTES", 1000)
     assert case.main(case.words) == 1
     assert "a binary file; set snapshot_format: HDF5" in capsys.readouterr().err.splitlines()[-1]
     with Path("solver.prototxt").open("a") as file:

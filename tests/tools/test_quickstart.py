@@ -35,10 +35,14 @@ def project(tmp_path: Path) -> Path:
     return folder
 
 
-def start(project: Path, folder: Path) -> list[str]:
+def quickstart(project: Path, folder: Path) -> subprocess.CompletedProcess[str]:
     own = {name: value for name, value in os.environ.items() if name != "VENV"}  # which names this run's environment
     command = [project / "tools" / "quickstart"]
-    done = subprocess.run(command, cwd=folder, env=own, capture_output=True, text=True, check=False)
+    return subprocess.run(command, cwd=folder, env=own, capture_output=True, text=True, check=False)
+
+
+def start(project: Path, folder: Path) -> list[str]:
+    done = quickstart(project, folder)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
@@ -69,7 +73,7 @@ def test_started_again_it_deletes_nothing(project: Path, tmp_path: Path) -> None
 
 def test_a_step_that_fails_is_told(project: Path) -> None:
     (project / ".venv" / "bin" / "loopclosure").write_text("#!/bin/sh\necho no such net >&2; exit 1\n")
-    done = subprocess.run([project / "tools" / "quickstart"], cwd=project, capture_output=True, text=True, check=False)
+    done = quickstart(project, project)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-2:] == [
         "no such net",

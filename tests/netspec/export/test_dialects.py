@@ -179,7 +179,10 @@ def test_what_has_no_counterpart_is_refused_with_its_place_and_reason(
 def detections(
     net_of: Callable[..., Net], settings: str, images: int, priors: int, kinds: int
 ) -> tuple[Net, dict[str, np.ndarray]]:
-    """Return a net of one DetectionOutput over 3 classes, and predictions that overlap, some scores being equal."""
+    """Return a net of one DetectionOutput over 3 classes, and predictions that overlap, some scores being equal.
+
+    With keep_top_k all scores differ: exports keep the first of equal ones, the layer those that std::sort has first.
+    """
     use_dialect("ssd")
     shapes = {"loc": (images, 4 * priors * kinds), "conf": (images, 3 * priors), "prior": (1, 2, 4 * priors)}
     net = net_of(net_text(f"type: 'DetectionOutput' detection_output_param {{ num_classes: 3 {settings} }}", shapes))
@@ -188,6 +191,8 @@ def detections(
     boxes = np.concatenate([low, low + rng.uniform(0.1, 0.3, (priors, 2))], axis=1)
     prior = np.stack([boxes, np.full((priors, 4), 0.1)]).reshape(shapes["prior"])
     scores = rng.integers(0, 40, shapes["conf"]) / 40
+    if "keep_top_k" in settings:
+        scores = rng.permutation(scores.size).reshape(scores.shape) / scores.size
     given = {"loc": rng.standard_normal(shapes["loc"]) / 3, "conf": scores, "prior": prior}
     return net, {name: values.astype(np.float32) for name, values in given.items()}
 

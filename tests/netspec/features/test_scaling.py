@@ -98,4 +98,4 @@ def test_extract_and_the_describer_take_the_steps(run: Callable[..., Any], color
     np.testing.assert_array_equal(np.load("f.npz")["features"], [np.repeat([4, 14, 24], 4)])
     refused = run(*words, "--mean", "5")
     assert refused.status == 2
-    assert "--swap, --raw-scale, --mean and --scale are of --images" in refused.err
+    assert "--mean is for --images" in refused.err

@@ -21,7 +21,7 @@ TEST = ["test", "--model=sgd_step/train_val.prototxt", "--weights=sgd_step/init.
 TIME = ["time", "--model=sgd_step/train_val.prototxt", "--iterations=5"]
 
 #: A clock's, or of the threads that read ahead: where in the log they come is chance.
-OURS = " solver.py:"  # how a training resumes, which Caffe does in one way only
+OURS = " resuming.py:"  # how a training resumes, which Caffe does in one way only
 OF_THE_MOMENT = re.compile(r"Restarting data prefetching from start\.$|blocking_queue\.cpp:49\] Waiting for data")
 
 
