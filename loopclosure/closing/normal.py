@@ -40,7 +40,8 @@ def least_squares_step(derivatives: sparse.csr_matrix, errors: Array, gtsam: boo
 def _by_gtsam(derivatives: sparse.csr_matrix, errors: Array) -> Array:
     gtsam = import_module("gtsam")  # optional, and without types
 
-    blocks = derivatives.tobsr((6, 6))
+    blocks, shape = derivatives.tobsr((6, 6)), derivatives.shape
+    assert shape is not None  # SciPy's types leave that open
     starts, nodes, values = blocks.indptr.tolist(), blocks.indices.tolist(), np.asarray(blocks.data)
     unit = gtsam.noiseModel.Unit.Create(6)
     factors = gtsam.GaussianFactorGraph()
@@ -49,7 +50,7 @@ def _by_gtsam(derivatives: sparse.csr_matrix, errors: Array) -> Array:
         if at:
             factors.add(gtsam.JacobianFactor(*(part for k in at for part in (nodes[k], values[k])), measured, unit))
     found = factors.optimize(gtsam.Ordering.NaturalGaussianFactorGraph(factors))
-    return np.asarray(found.vector(gtsam.KeyVector(range(derivatives.shape[1] // 6))))
+    return np.asarray(found.vector(gtsam.KeyVector(range(shape[1] // 6))))
 
 
 def order(nodes: int, first: NDArray[np.int_], second: NDArray[np.int_]) -> NDArray[np.int_]:
