@@ -1,4 +1,4 @@
-"""What the inputs of an exported net must look like: one rule for exported source, torch.export and engines.
+"""What the inputs of an exported net must look like: one rule for exported source and torch.export.
 
 An expected shape has a number for each size that is fixed and a name for each that is free. Names are equal where the
 sizes must be.
