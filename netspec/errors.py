@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 
@@ -61,6 +62,17 @@ class SpecError(ValueError):
         self.message = message
         self.where = where
         super().__init__(printable(f"{where}: {message}" if where else message))
+
+
+class InputError(SpecError):
+    """A fault of a user's data or choice, in a file or in none.
+
+    ``str(error)`` is one line: ``file:line:column: message``; ``file: message`` if no line is known (line 0); the
+    message alone if the fault is not in a file.
+    """
+
+    def __init__(self, message: str, file: str | os.PathLike[str] = "", line: int = 0, column: int = 0) -> None:
+        super().__init__(message, Where(os.fspath(file), line, column) if os.fspath(file) else None)
 
 
 class ForkFault(SpecError):

@@ -7,9 +7,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from loopclosure.arrays import read_npz
 from loopclosure.descriptors.whitening import Whitening
 from loopclosure.errors import InputError
+from netspec.files.arrays import read_npz
 
 # Arrays of the file that are about the images and are not descriptors.
 BESIDE_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms")

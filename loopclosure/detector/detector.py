@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.arrays import check_array, from_json, read_npz
 from loopclosure.descriptors.similarity import check_metric, squared_distances
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from netspec.errors import SpecError
+from netspec.files.arrays import check_array, from_json, read_npz
 from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]

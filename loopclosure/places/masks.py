@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from loopclosure.arrays import read_lists, read_npy
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_pixels
 from loopclosure.places.mat_file import read_mat
 from netspec.errors import SpecError
+from netspec.files.arrays import read_lists, read_npy
 from netspec.files.opencv import cv2
 
 # The FAB-MAP sets call it truth; several papers' derived files GT.

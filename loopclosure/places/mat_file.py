@@ -17,8 +17,8 @@ TIMES = 100  # times the file's size
 
 def read_mat(path: str | Path) -> dict[str, Any]:
     """Return the matrices (M, N) of numbers in a .mat file, by name. Raises InputError for any other file."""
-    from loopclosure.arrays import unpack
     from loopclosure.errors import InputError
+    from netspec.files.arrays import unpack
 
     done = subprocess.run([sys.executable, __file__, str(path)], capture_output=True, check=False)
     if done.returncode:

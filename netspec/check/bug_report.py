@@ -19,8 +19,8 @@ from netspec.data.records import open_records
 from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError, printable
 from netspec.exact.blas import kernels
+from netspec.files.arrays import read_npz
 from netspec.files.limits import amount, memory
-from netspec.files.npz import read_npz
 from netspec.process import waiting
 from netspec.proto.binary import is_net_binary
 from netspec.terminal import log

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from netspec.errors import SpecError, Where, did_you_mean
-from netspec.files.npz import read_npz
+from netspec.files.arrays import read_npz
 
 PCA, TSNE = "pca", "tsne"
 _BESIDE = ("stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms", "names", "keys")

@@ -25,6 +25,7 @@ from netspec.data.database import Writer, open_reader
 from netspec.data.images import read_image
 from netspec.data.mean import read_mean_option
 from netspec.errors import SpecError
+from netspec.features import embedding
 from netspec.features.images import read_pixels as read_for_features
 from netspec.net.build import load_net
 from netspec.net.weights import load_weights
@@ -50,17 +51,19 @@ def test_an_npy_that_announces_too_much(tmp_path: Path) -> None:
         read_mean_option(str(tmp_path / "x.npy"))
 
 
-def test_an_npz_that_announces_too_much(tmp_path: Path) -> None:
+@pytest.mark.parametrize("read", [read_features, embedding.read_features])
+def test_an_npz_that_announces_too_much(read: Any, tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
         archive.writestr("features.npy", lying_header())
     with pytest.raises(InputError, match=r"shape \(1048576, 1048576\), float32, in"):
-        read_features(tmp_path / "x.npz")
+        read(tmp_path / "x.npz")
 
 
-def test_an_npz_that_unpacks_to_too_much(tmp_path: Path) -> None:
+@pytest.mark.parametrize("read", [read_features, embedding.read_features])
+def test_an_npz_that_unpacks_to_too_much(read: Any, tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "x.npz", features=np.zeros((70, 1 << 20), np.float32))
     with pytest.raises(InputError, match=r"would take 280 MiB of memory, in a file of \d+ bytes"):
-        read_features(tmp_path / "x.npz")
+        read(tmp_path / "x.npz")
 
 
 @pytest.mark.parametrize("kind", ["<U4", ">U4"])

@@ -98,6 +98,6 @@ def test_a_damaged_archive_and_a_name_that_is_not_utf8_are_told(tmp_path: Path) 
     path = tmp_path / "caf\udce9.npz"
     path.write_bytes((tmp_path / "whole.npz").read_bytes()[:100])
     text = bug_report([str(path)])
-    assert "is not an archive of arrays, or is damaged" in text
+    assert "expected an archive of arrays" in text
     assert "caf\\udce9.npz" in text
     text.encode()

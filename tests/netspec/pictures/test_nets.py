@@ -206,9 +206,15 @@ def test_the_embedding_of_a_siamese_net(run: Run) -> None:
         (("look", "filters", "none.caffemodel"), "none.caffemodel: cannot be read: No such file"),
         (("look", "maps", *NET, "--blob", "no", "--image", "a.png"), 'no blob "no"'),
         (("look", "maps", *NET, "--blob", "conv1", "--image", "no.png"), "no.png: cannot be read"),
-        (("look", "embedding", "a.png"), "a.png: is not a features.npz of netspec extract, or is damaged"),
-        (("look", "embedding", "cut.npz"), "cut.npz: is not a features.npz of netspec extract, or is damaged"),
-        (("look", "embedding", "no.npz"), "no.npz: cannot be read: No such file or directory"),
+        (
+            ("look", "embedding", "a.png"),
+            "a.png: cannot be read (File is not a zip file); expected a features.npz of netspec extract",
+        ),
+        (
+            ("look", "embedding", "cut.npz"),
+            "cut.npz: cannot be read (File is not a zip file); expected a features.npz of netspec extract",
+        ),
+        (("look", "embedding", "no.npz"), "no.npz: no such file; expected a features.npz of netspec extract"),
         (
             ("look", "embedding", "f.npz", "--array", "fea"),
             'f.npz: has no descriptors "fea"; did you mean "feat"? it has: feat',

@@ -22,7 +22,7 @@ from typing import IO, Any, TypeVar, cast
 
 import numpy as np
 
-from loopclosure.errors import InputError
+from netspec.errors import InputError
 
 T = TypeVar("T")
 _FAULTS = (
