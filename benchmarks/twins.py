@@ -24,19 +24,20 @@ def unit(feat: Tensor) -> Tensor:
 
 
 class Siamese(nn.Module):
-    """One tower of the paper's LeNet-like net, for images (N, 3, size, size)."""
+    """One tower of the paper's LeNet-like net, (N, 3, size, size); ``normalized``: descriptors of length 1."""
 
-    def __init__(self, neurons: int, size: int = 224) -> None:
+    def __init__(self, neurons: int, size: int = 224, normalized: bool = False) -> None:
         super().__init__()
+        self.finish = unit if normalized else nn.Identity()
         self.conv1, self.conv2 = nn.Conv2d(3, 20, 5), nn.Conv2d(20, 50, 5)
         self.ip1 = nn.Linear(50 * (((size - 4) // 2 - 4) // 2) ** 2, 500)
         self.feat = nn.Linear(500, neurons)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the descriptors (N, neurons), of length 1."""
+        """Return the descriptors (N, neurons)."""
         x = F.max_pool2d(self.conv1(x), 2)
         x = F.max_pool2d(self.conv2(x), 2)
-        return unit(self.feat(F.relu(self.ip1(x.flatten(1)))))
+        return self.finish(self.feat(F.relu(self.ip1(x.flatten(1)))))
 
 
 def conv_bn(inputs: int, outputs: int, size: int = 1, bias: bool = False, **others: Any) -> nn.Sequential:
@@ -57,10 +58,11 @@ class ResidualPair(nn.Module):
 
 
 class Resnet27(nn.Module):
-    """One tower of the paper's residual net, for images (N, 3, size, size)."""
+    """One tower of the paper's residual net, (N, 3, size, size); ``normalized``: descriptors of length 1."""
 
-    def __init__(self, neurons: int, size: int = 224) -> None:
+    def __init__(self, neurons: int, size: int = 224, normalized: bool = False) -> None:
         super().__init__()
+        self.finish = unit if normalized else nn.Identity()
         stages: list[nn.Module] = [conv_bn(3, 32, 3, stride=2, padding=1), nn.ReLU()]
         width = 32
         for wide, blocks in ((64, 1), (128, 2), (256, 5), (512, 3)):
@@ -71,8 +73,8 @@ class Resnet27(nn.Module):
         self.feat = nn.Linear(512 * (size // 32) ** 2, neurons)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the descriptors (N, neurons), of length 1."""
-        return unit(self.feat(self.stages(x).flatten(1)))
+        """Return the descriptors (N, neurons)."""
+        return self.finish(self.feat(self.stages(x).flatten(1)))
 
 
 class Tiny(nn.Module):
@@ -372,7 +374,8 @@ def net(name: str) -> nn.Module:
     if name in CLASSIFIERS:
         return CLASSIFIERS[name]()
     tower, _, neurons = name.rpartition("/")[2].rpartition("_")
-    return TOWERS[tower](int(neurons), 64 if name.startswith("small/") else 224)
+    small = name.startswith("small/")
+    return TOWERS[tower](int(neurons), 64 if small else 224, normalized=small)
 
 
 def load(twin: nn.Module, caffemodel: str | Path) -> None:

@@ -87,7 +87,7 @@ NOT_RUN = {
         "tools/bench growth": BENCH,
         "benchmarks/gpu_steps": "needs a GPU; tests/benchmarks/test_gpu_steps.py runs it without one",
     },
-    "prototxt/README.md": {"lmdb-build compare prototxt/siamese_8": "needs a GPU"},
+    "prototxt/README.md": {"lmdb-build compare prototxt/normalized/siamese_8": "needs a GPU"},
     "docs/faithful.md": {"tools/run_tests": "runs tests that run beside this one"},
     "docs/growth.md": {"tools/bench growth layers": BENCH, "tools/bench growth batch": BENCH},
     "docs/performance.md": {"tools/bench": "times are measured, for minutes; " + BENCH},

@@ -1,5 +1,6 @@
 """The paper's nets: towers and variants agree, deploy files fit, and the full files train one iteration as they are."""
 
+import itertools
 import re
 from pathlib import Path
 
@@ -19,7 +20,8 @@ from netspec.proto.text import parse_net_text, read_net, read_solver
 from paths import ROOT
 
 NETS = ("siamese_8", "siamese_128", "siamese_resnet27_256", "siamese_resnet27_512")
-FOLDERS = [ROOT / "prototxt" / part / name for part in ("", "small") for name in NETS]
+PARTS = ("", "normalized", "small")
+FOLDERS = [ROOT / "prototxt" / part / name for part in PARTS for name in NETS]
 SIDES = {"small": 64}
 
 
@@ -78,9 +80,9 @@ def test_deploy_is_the_first_tower(folder: Path) -> None:
 
 
 def test_the_nets_of_one_kind_differ_in_their_last_layer_alone() -> None:
-    for part in ("", "small/"):
+    for part in PARTS:
         for one, other in (("siamese_8", "siamese_128"), ("siamese_resnet27_256", "siamese_resnet27_512")):
-            texts = [(ROOT / f"prototxt/{part}{name}/train_val.prototxt").read_text() for name in (one, other)]
+            texts = [(ROOT / f"prototxt/{part}/{name}/train_val.prototxt").read_text() for name in (one, other)]
             changed = [pair for pair in zip(*(t.splitlines() for t in texts), strict=True) if pair[0] != pair[1]]
             of_last = [pair for pair in changed if "num_output:" in pair[0]]
             assert len(of_last) == 2  # one per tower
@@ -92,19 +94,39 @@ def test_the_residual_net_has_27_convolutions_and_7x7x512_reach_the_features() -
     assert checked.net is not None
     kinds = [layer.type for layer in checked.net.param.layer]
     assert kinds.count("Convolution") == kinds.count("BatchNorm") == 27
-    assert kinds.count("Scale") == 27 + 1  # the last makes descriptors of length 1
+    assert kinds.count("Scale") == 27
     assert kinds.count("Eltwise") == 1 + 2 + 5 + 3
     (last,) = (node for node in checked.net.plan.nodes if node.type == "InnerProduct")
     assert checked.net.shapes[checked.net.plan.blobs[last.bottoms[0]]] == (1, 512, 7, 7)
 
 
-@pytest.mark.parametrize("part", ["", "small/"])
+def test_the_papers_nets_are_what_the_paper_draws() -> None:
+    """It names no normalization: the last InnerProducts go straight into the loss, and nothing else follows them."""
+    for name in NETS:
+        layers = layers_of(ROOT / f"prototxt/{name}/train_val.prototxt")
+        assert [layers[last].type for last in ("feat", "feat_p")] == ["InnerProduct", "InnerProduct"]
+        assert list(layers["loss"].bottom) == ["feat", "feat_p", "sim"]
+        assert "Reduction" not in {layer.type for layer in layers.values()}
+
+
+@pytest.mark.parametrize("part", ["normalized", "small"])
 def test_what_keeps_trainings_from_diverging(part: str) -> None:
     """Distances of descriptors of length 1 stay below 2."""
     for name in NETS:
-        layers = layers_of(ROOT / f"prototxt/{part}{name}/train_val.prototxt")
+        layers = layers_of(ROOT / f"prototxt/{part}/{name}/train_val.prototxt")
         assert list(layers["feat"].bottom) == ["ip_feat", "feat_inverse"]
         assert layers["feat_inverse"].power_param.power == -0.5
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_the_normalized_nets_are_the_papers_and_the_length(name: str) -> None:
+    paper, longer = (layers_of(ROOT / f"prototxt/{part}/{name}/train_val.prototxt") for part in ("", "normalized"))
+    added = {f"{layer}{side}" for layer in ("ip_feat", "feat_sumsq", "feat_inverse") for side in ("", "_p")}
+    assert longer.keys() - paper.keys() == added
+    for layer in paper.keys() - {"feat", "feat_p"}:
+        assert paper[layer] == longer[layer]
+    for side in ("", "_p"):
+        assert paper[f"feat{side}"].inner_product_param == longer[f"ip_feat{side}"].inner_product_param
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -130,8 +152,9 @@ def test_it_trains_whatever_the_seed(name: str, seed: int, tmp_path: Path, monke
 
 
 def test_the_solvers_are_the_papers() -> None:
-    for name in NETS:
-        solver = read_solver(ROOT / f"prototxt/{name}/solver.prototxt")
+    for part, name in itertools.product(("", "normalized"), NETS):
+        solver = read_solver(ROOT / f"prototxt/{part}/{name}/solver.prototxt")
+        assert Path(solver.net) == Path("prototxt") / part / name / "train_val.prototxt"
         assert (solver.lr_policy, solver.stepsize, solver.max_iter, solver.type) == ("step", 10000, 30000, "SGD")
         assert [round(v, 6) for v in (solver.base_lr, solver.gamma, solver.momentum)] == [0.01, 0.1, 0.9]
         small = read_solver(ROOT / f"prototxt/small/{name}/solver.prototxt")
@@ -141,7 +164,7 @@ def test_the_solvers_are_the_papers() -> None:
 @pytest.mark.slow
 # One of each kind, since the others differ in their last layer alone.
 @pytest.mark.parametrize(
-    "folder", [FOLDERS[k] for k in (0, 3, 4, 7)], ids=lambda path: f"{path.parent.name}-{path.name}"
+    "folder", [FOLDERS[k] for k in (0, 3, 7, 8, 11)], ids=lambda path: f"{path.parent.name}-{path.name}"
 )
 def test_one_iteration_and_back_into_the_deploy_net(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
