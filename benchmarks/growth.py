@@ -54,8 +54,8 @@ def layers(size: int) -> Found:
     import torch
 
     from netspec.graph.filter import with_state
+    from netspec.graph.options import BuildOptions
     from netspec.net.build import build_net
-    from netspec.net.options import BuildOptions
     from netspec.proto.schema import TRAIN
     from netspec.proto.text import parse_net_text
 

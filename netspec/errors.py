@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 
 
@@ -73,6 +74,14 @@ class InputError(SpecError):
 
     def __init__(self, message: str, file: str | os.PathLike[str] = "", line: int = 0, column: int = 0) -> None:
         super().__init__(message, Where(os.fspath(file), line, column) if os.fspath(file) else None)
+
+
+Report = Callable[[SpecError], None]  # takes an error; it may raise it, or collect it and let the work go on
+
+
+def raise_fault(fault: SpecError) -> None:
+    """Raise the error: what is done with errors unless somebody collects them."""
+    raise fault
 
 
 class ForkFault(SpecError):

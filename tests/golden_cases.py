@@ -16,9 +16,9 @@ import torch
 import netspec
 from netspec.exact import CHOICES
 from netspec.graph.filter import with_state
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.proto.schema import PHASES, Datum
 from netspec.proto.text import parse_net
 from paths import GOLDEN
@@ -83,7 +83,7 @@ class LayerCase:
     def compute(self, exact: str = "small", device: str = "cpu") -> dict[str, np.ndarray]:
         """Return this project's results, under Caffe's keys."""
         net, source = parse_net(self.folder / "net.prototxt")
-        options = BuildOptions(torch.device(device), exact=exact, accumulate_in_place=True)
+        options = BuildOptions(device, exact=exact, accumulate_in_place=True)
         built = build_net(with_state(net, PHASES[self.meta["phase"]]), source, options)
         set_parameters(built, self.golden, "param_init/")
         inputs = {
@@ -101,9 +101,7 @@ class LayerCase:
     def outputs(self, exact: str = "small", device: str = "cpu") -> dict[str, np.ndarray]:
         """Return the outputs of a run without gradients, for which nets of phase TEST are prepared."""
         net, source = parse_net(self.folder / "net.prototxt")
-        built = build_net(
-            with_state(net, PHASES[self.meta["phase"]]), source, BuildOptions(torch.device(device), exact=exact)
-        )
+        built = build_net(with_state(net, PHASES[self.meta["phase"]]), source, BuildOptions(device, exact=exact))
         set_parameters(built, self.golden, "param_init/")
         inputs = {name: torch.from_numpy(self.golden[f"in/{name}"]).to(device) for name in built.inputs}
         with torch.no_grad():

@@ -13,18 +13,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from netspec.check import net_rules, solver_rules  # noqa: F401, they register their rules
 from netspec.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
 from netspec.check.forks import gathered, others, python_layers, unknown_types
 from netspec.errors import ForkFault, SpecError
 from netspec.files.limits import most
 from netspec.graph.filter import with_state, with_train_state
+from netspec.graph.options import BuildOptions
 from netspec.layers.base import Shape
 from netspec.net.build import build_net
+from netspec.net.given_shapes import not_to_be_given
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions, not_to_be_given
 from netspec.net.recovered import recover_net
 from netspec.net.weights import load_weights
 from netspec.proto.binary import is_net_binary, split_paths
@@ -133,19 +132,18 @@ def _check_net(
     """Build a net (its ``state`` set) without memory, check weights against it, and collect the errors."""
     faults: list[SpecError] = []
     options = BuildOptions(
-        torch.device("meta" if manner.passes is None else "cpu"),
+        "meta" if manner.passes is None else "cpu",
         seed,
         open_data=manner.open_data,
         given_shapes=manner.shapes,
-        report=faults.append,
         allow_python=manner.allow_python,
         passes=manner.passes or (),
     )
-    built = build_net(net, source, options)
+    built = build_net(net, source.telling(faults.append), options)
     if fault := built.need.fault(most()):
         faults.append(fault)
     if files := [path for paths in weights for path in split_paths(paths)]:
-        load_weights(built, files, manner.strict, report=faults.append)
+        load_weights(built, files, manner.strict)
     advice = [*findings(TEXT, net, source), *findings(PLAN, net, source, built.plan)]
     advice += [] if faults else findings(NET, built)
     return Checked(label, built, faults, not_ignored(advice, source.file, source.layers))
@@ -180,8 +178,8 @@ def _check_solver(
     ]
     nets = [part.net for part in parts if part.net is not None]
     if described and described[0].label == TRAIN_NET:
-        for net, part in zip(nets[1:], parts[1:], strict=True):
-            net.share_weights_with(nets[0], part.faults.append)
+        for net in nets[1:]:
+            net.share_weights_with(nets[0])
     for net, part in zip(nets, parts, strict=True):
         part.faults = [*others(part.faults, unknown), *net.missing_inputs()]
     faults = gathered([*faults, *unknown])

@@ -131,8 +131,8 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
 def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.features.records import extract_records, with_sources
     from netspec.graph.filter import with_state
+    from netspec.graph.options import BuildOptions
     from netspec.net.build import build_net
-    from netspec.net.options import BuildOptions
     from netspec.proto.text import parse_net
 
     images = ("input", "shape", "zooms", "swap", "raw_scale", "mean", "scale")
@@ -141,7 +141,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
     stated = with_sources(stated, source, dict(arguments.source))
     python, exact = arguments.allow_python_layers, arguments.exact
-    options = BuildOptions(device(arguments.gpu), allow_python=python, exact=exact, passes=arguments.passes)
+    options = BuildOptions(str(device(arguments.gpu)), allow_python=python, exact=exact, passes=arguments.passes)
     net = build_net(stated, source, options)
     load_weights(net, arguments.weights, arguments.strict)
     net = run_by(net, arguments, arguments.weights)

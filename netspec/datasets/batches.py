@@ -13,6 +13,7 @@ from typing_extensions import override
 from netspec.datasets.opened import Opened, PerProcess, of_layer
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.filter import filter_net, with_state
+from netspec.graph.options import BuildOptions
 from netspec.layers import layer_class
 from netspec.layers.base import Context
 from netspec.layers.data.files import ReadingLayer
@@ -86,5 +87,5 @@ def _open(model: str, state: _State, name: str, seed: int, rank: int, ranks: int
     param = net.layer[index]
     param.phase = phase
     at = partial(source.at, index, layer=param.name, type=param.type)
-    context = Context(phase=phase, data_seed=seed, at=at, rank=rank, ranks=ranks)
+    context = Context(phase, BuildOptions(data_seed=seed, rank=rank, ranks=ranks), at=at)
     return of_layer(cls(param, [], context))

@@ -15,6 +15,8 @@ from typing_extensions import override
 from netspec.data.hdf5 import Hdf5Source
 from netspec.datasets.opened import Opened, PerProcess, of_layer
 from netspec.errors import SpecError
+from netspec.graph.options import BuildOptions
+from netspec.layers.base import Context
 from netspec.layers.data.files import BACKENDS, ReadingLayer
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import LayerParameter, phase_of
@@ -79,7 +81,7 @@ def _open_database(source: str, transform: str, phase: str, seed: int) -> Opened
     param.data_param.source, param.data_param.batch_size = source, 1
     param.data_param.backend = BACKENDS.index(backend)
     text = f"transform_param {{ {transform} }} {write_text(param)}"
-    layer = make_layer(text, [], phase=phase_of(phase), data_seed=seed)
+    layer = make_layer(text, [], Context(phase_of(phase), BuildOptions(data_seed=seed)))
     assert isinstance(layer, ReadingLayer)
     return of_layer(layer)
 

@@ -152,7 +152,7 @@ class AnnotatedData(Data):
         if p.data_param.force_encoded_color:
             augment.color = True
         skip = self.skip(p.data_param.rand_skip, len(reader), "data_param", "rand_skip")
-        cursor = Cursor(len(reader), self.batch_size, skip, rank=context.rank, ranks=context.ranks)
+        cursor = Cursor(len(reader), self.batch_size, skip, rank=context.options.rank, ranks=context.options.ranks)
         typed = has(value(p, "annotated_data_param"), "anno_type")
         source = AnnotatedSource(reader, cursor, augment, typed, context.data_seed, self.stream, self.place)
         self.log_size(source, "annotated_data_layer.cpp:62")
@@ -176,5 +176,5 @@ class AnnotatedData(Data):
     def shapes_without_data(self) -> list[Shape]:
         """Return the images' shape, and that of a single box."""
         data, *_ = super().shapes_without_data()
-        given = self.context.given_shapes
+        given = self.context.options.given_shapes
         return [data, *(given.get(top, (1, 1, 1, COLUMNS + 1)) for top in self.param.top[1:])]

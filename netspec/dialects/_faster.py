@@ -242,7 +242,7 @@ class RoIData(_Sampling):
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        given = self.context.given_shapes
+        given = self.context.options.given_shapes
         default = [(1, 3, SHORTEST, LONGEST), (1, 3), (1, 5)]
         return [given.get(name, shape) for name, shape in zip(self.param.top, default, strict=True)]
 

@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from netspec.errors import ForkFault, SpecError, Where
 from netspec.exact import NONE
 from netspec.graph.filter import filter_net, with_state
+from netspec.graph.options import BuildOptions
 from netspec.layers.base import Shape
 from netspec.net.build import build_filtered
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.net.weights import copy_weights, load_weights
 from netspec.proto.binary import parse_binary
 from netspec.proto.schema import TEST, NetParameter
@@ -56,7 +55,7 @@ class CaffeFiles:
 
         SSD's layers are OpenCV's (netspec/dnn/opencv_layers.py).
         """
-        options = BuildOptions(torch.device(device), exact=NONE)
+        options = BuildOptions(device, exact=NONE)
         with log.silent():  # of what has no effect; OpenCV says nothing of it
             net = build_filtered(self._reshaped(shapes), self.source, options)
         for i, layer in enumerate(net.layers):

@@ -11,16 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
-
 from netspec.draw.settings import settings_text
 from netspec.errors import SpecError, Where
 from netspec.graph.filter import filter_net, with_state
+from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Node, Plan, make_plan
 from netspec.layers import layer_class
 from netspec.layers.base import Layer, Shape
 from netspec.net.build import build_filtered
-from netspec.net.options import BuildOptions
 from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import write_text
@@ -102,16 +100,16 @@ def diagram_of(
     """Return the diagram of an upgraded net in the given phases."""
     faults: list[SpecError] = []
     options = BuildOptions(
-        torch.device("meta"),
+        "meta",
         0,
         open_data=open_data,
         write_files=False,
         given_shapes=shapes or {},
-        report=faults.append,
         allow_python=allow_python,
         passes=(),
     )
     with log.silent():
+        source = source.telling(faults.append)
         seen = [_look(with_state(net, phase, level, stages), source, PHASE_NAMES[phase], options) for phase in phases]
     return _merged(net, source, seen, tuple({str(fault): fault for fault in faults}.values()))
 
@@ -123,7 +121,7 @@ def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOption
     numbers = [int(place.where.file) for place in numbers.layers]
     placed = source.with_layers(source.layers[k] for k in numbers)
     # A fault of the wiring is reported by the build, which plans again, with splits.
-    plan = make_plan(filtered, placed, report=lambda fault: None)
+    plan = make_plan(filtered, placed.telling(lambda fault: None))
     waiting: dict[str, list[int]] = {}
     for number, layer in zip(numbers, filtered.layer, strict=True):
         waiting.setdefault(layer.name, []).append(number)
@@ -131,7 +129,7 @@ def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOption
     try:
         built: Sequence[Any] = list(build_filtered(filtered, placed, options).layers)
     except SpecError as fault:
-        options.report(fault)
+        source.report(fault)
         built = ()
     for layer in built:
         if waiting.get(layer.param.name):  # the others are Split layers

@@ -17,10 +17,10 @@ from netspec.export.preprocess import Preprocess
 from netspec.export.pt2 import export_pt2
 from netspec.export.torch import export_torch, write_tensors
 from netspec.graph.filter import with_state
+from netspec.graph.options import BuildOptions
 from netspec.graph.prune import prune
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights
 from netspec.proto.schema import PHASES
 from netspec.proto.text import parse_net

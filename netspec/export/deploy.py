@@ -14,12 +14,12 @@ import torch
 from netspec.data import blobs
 from netspec.data.blobs import Shape
 from netspec.files.whole_file import whole_file
-from netspec.graph import raise_fault
 from netspec.graph.filter import filter_net
 from netspec.graph.fold import origins
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
+from netspec.net.given_shapes import not_to_be_given
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions, not_to_be_given
 from netspec.proto.schema import NetParameter, ParamSpec
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import write_text
@@ -40,13 +40,13 @@ def with_inputs(
     and accuracies; the scores that they compared become outputs. The net's own ``state`` says which layers it has.
     Raises SpecError for faults of the net, and where ``shapes`` names a blob that no such layer makes.
     """
-    filtered, source = filter_net(net, source, raise_fault)
+    filtered, source = filter_net(net, source)
     for fault in not_to_be_given(shapes, [filtered], source.file):
         raise fault
     probe = build_net(
         filtered,
         source,
-        BuildOptions(torch.device("meta"), seed=0, open_data=False, given_shapes=shapes, allow_python=allow_python),
+        BuildOptions("meta", seed=0, open_data=False, given_shapes=shapes, allow_python=allow_python),
     )
     built = {layer.param.name: layer for layer in probe.layers}
     result = copy_without(filtered, {"layer"})

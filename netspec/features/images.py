@@ -164,12 +164,11 @@ def _shape_of(blob: str, net: NetParameter, source: SourceMap) -> Shape:
     if len(net.layer) == 1 and net.layer[0].type == "Input" and net.layer[0].input_param.shape:  # no need of torch
         shapes: Any = net.layer[0].input_param.shape
         return tuple(shapes[list(net.layer[0].top).index(blob) if len(shapes) > 1 else 0].dim)
-    import torch
 
+    from netspec.graph.options import BuildOptions
     from netspec.net.build import build_filtered
-    from netspec.net.options import BuildOptions
 
-    built = build_filtered(net, source, BuildOptions(torch.device("meta"), seed=0))
+    built = build_filtered(net, source, BuildOptions("meta", seed=0))
     built.close()
     return built.shapes[blob]
 
@@ -183,13 +182,12 @@ def _build(
     strict: bool,
     passes: Collection[str],
 ) -> Net:
-    import torch
 
+    from netspec.graph.options import BuildOptions
     from netspec.net.build import build_filtered
-    from netspec.net.options import BuildOptions
     from netspec.net.weights import load_weights
 
-    built = build_filtered(net, source, BuildOptions(torch.device(device), seed=0, exact=exact, passes=passes))
+    built = build_filtered(net, source, BuildOptions(str(device), seed=0, exact=exact, passes=passes))
     if weights:
         load_weights(built, weights, strict, some=True)
     return built

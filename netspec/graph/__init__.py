@@ -1,21 +1,14 @@
 """The passes between a parsed net and a runnable net: NetParameter in, NetParameter or Plan out; nothing is mutated.
 
-Each pass takes ``report``, a function that gets every error. The default raises the first one. A caller that passes a
-collecting function gets all errors, and a result in which the wrong parts are unchanged.
+Every error goes to ``source.report``, which raises the first one. With a map that collects them (``SourceMap.telling``)
+a caller gets all errors, and a result in which the wrong parts are unchanged.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from netspec.errors import SpecError, Where, did_you_mean
-
-Report = Callable[[SpecError], None]
-
-
-def raise_fault(fault: SpecError) -> None:
-    """Raise the error: the default of every pass."""
-    raise fault
 
 
 def check_blobs(wanted: Iterable[str], known: Iterable[str], file: str) -> None:

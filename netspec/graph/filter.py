@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from netspec.errors import SpecError
-from netspec.graph import Report, raise_fault
 from netspec.proto.schema import LayerParameter, NetParameter, NetState, NetStateRule, PhaseValue, SolverParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
@@ -37,14 +36,16 @@ def with_train_state(solver: SolverParameter, level: int | None, stages: Iterabl
     return stated
 
 
-def filter_net(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> tuple[NetParameter, SourceMap]:
+def filter_net(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
     """Return the net with only the layers that its ``state`` includes."""
     filtered = copy_without(net, {"layer"})
     kept = []
     for index, layer in enumerate(net.layer):
         if layer.include and layer.exclude:
             where = source.at(index, "exclude", layer=layer.name, type=layer.type)
-            report(SpecError("found both include and exclude rules, expected only one kind; remove the other", where))
+            source.report(
+                SpecError("found both include and exclude rules, expected only one kind; remove the other", where)
+            )
         if _included(net.state, layer):
             filtered.layer.add().CopyFrom(layer)
             kept.append(source.layers[index])

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from netspec.errors import SpecError
-from netspec.graph import Report, raise_fault
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 
@@ -58,18 +57,18 @@ class Plan:
     final: tuple[int, ...]
 
 
-def make_plan(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> Plan:
+def make_plan(net: NetParameter, source: SourceMap) -> Plan:
     """Return the Plan of a filtered net with its splits."""
     blobs: list[str] = []
     current: dict[str, int] = {}
     available: set[str] = set()
     owners: dict[str, tuple[int, int]] = {}
-    multipliers = _shared_multipliers(net, source, report)
+    multipliers = _shared_multipliers(net, source)
     nodes = []
     for i, layer in enumerate(net.layer):
 
         def fault(message: str, *path: str | int, i: int = i, layer: LayerParameter = layer) -> None:
-            report(SpecError(message, source.at(i, *path, layer=layer.name, type=layer.type)))
+            source.report(SpecError(message, source.at(i, *path, layer=layer.name, type=layer.type)))
 
         if layer.propagate_down and len(layer.propagate_down) != len(layer.bottom):
             fault(
@@ -118,7 +117,7 @@ def _final(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
     return tuple(final)
 
 
-def _shared_multipliers(net: NetParameter, source: SourceMap, report: Report) -> dict[str, tuple[float, float]]:
+def _shared_multipliers(net: NetParameter, source: SourceMap) -> dict[str, tuple[float, float]]:
     """Return lr_mult and decay_mult of each parameter name: given once, or several times with the same values."""
     found: dict[str, dict[str, float]] = {}
     for i, layer in enumerate(net.layer):
@@ -133,7 +132,7 @@ def _shared_multipliers(net: NetParameter, source: SourceMap, report: Report) ->
                 if given.setdefault(field, value) != value:
                     where = source.at(i, "param", j, field, layer=layer.name, type=layer.type)
                     message = f'shared param "{spec.name}" has {field} {value:g} here and {given[field]:g} before'
-                    report(SpecError(message, where))
+                    source.report(SpecError(message, where))
     return {name: (given.get("lr_mult", 1.0), given.get("decay_mult", 1.0)) for name, given in found.items()}
 
 

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Mapping
 
 from netspec.errors import SpecError, did_you_mean
-from netspec.graph import Report, raise_fault
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
@@ -20,9 +19,9 @@ MOST_NAMES = 20  # blobs that an error names
 MOST_HINTS = 20  # unknown blobs for which similar names are looked for: that takes time for each blob there is
 
 
-def insert_splits(net: NetParameter, source: SourceMap, report: Report = raise_fault) -> tuple[NetParameter, SourceMap]:
+def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
     """Return the net with Split layers inserted."""
-    producer, uses, weights = _count_uses(net, source, report)
+    producer, uses, weights = _count_uses(net, source)
     split = copy_without(net, {"layer"})
     places = []
     used: Counter[Top] = Counter()
@@ -62,7 +61,7 @@ def _blob_name(layer: str, blob: str, top: int, copy: int) -> str:
 
 
 def _count_uses(
-    net: NetParameter, source: SourceMap, report: Report
+    net: NetParameter, source: SourceMap
 ) -> tuple[dict[tuple[int, int], Top], Counter[Top], dict[Top, float]]:
     """Return which top each bottom reads, how often each top is used, and the tops' explicit loss weights."""
     latest: dict[str, Top] = {}
@@ -76,7 +75,9 @@ def _count_uses(
                 where = source.at(i, "bottom", j, layer=layer.name, type=layer.type)
                 unknown += 1
                 hint = did_you_mean(blob, list(latest)) if unknown <= MOST_HINTS else ""
-                report(SpecError(f'unknown bottom blob "{blob}"{hint or ";"} available: {_names(latest)}', where))
+                source.report(
+                    SpecError(f'unknown bottom blob "{blob}"{hint or ";"} available: {_names(latest)}', where)
+                )
                 continue
             producer[i, j] = latest[blob]
             uses[latest[blob]] += 1

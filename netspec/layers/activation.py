@@ -47,14 +47,14 @@ class Rounded(Activation):
 
     @override
     def finishing(self) -> Finish | None:
-        return None if self.context.exact == ALL else type(self).in_place
+        return None if self.context.options.exact == ALL else type(self).in_place
 
     # Torch's function into ``out``, and its gradient, from the top's and the top, into ``grad_input``.
     kernels: ClassVar[tuple[Callable[..., torch.Tensor], Callable[..., torch.Tensor]] | None] = None
 
     @override
     def prepare_training(self, learning: Learning) -> Kernels:
-        if switch.applies(self.context.exact, torch.empty(1)):
+        if switch.applies(self.context.options.exact, torch.empty(1)):
             return self._prepared_as_caffe()
         if self.kernels is None:
             return recorded(self.run, learning)
@@ -175,12 +175,14 @@ class PReLU(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         slopes = self.blob(0)
         if self.is_exact(x):
-            return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.context.accumulate_in_place).reshape(x.shape)
+            return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.context.options.accumulate_in_place).reshape(
+                x.shape
+            )
         return F.prelu(x, slopes.reshape(-1))
 
     @override
     def prepare(self, how: Preparation) -> Kernel:
-        if self.context.exact == ALL:
+        if self.context.options.exact == ALL:
             return super().prepare(how)
         slopes = values_of(self.blob(0)).clone().reshape(-1)
         return finished(lambda x: torch.prelu(x, slopes), how.finish)

@@ -22,10 +22,10 @@ from typing_extensions import override
 
 from netspec.data.blobs import Shape
 from netspec.data.random_words import derived
-from netspec.errors import SpecError, Where
-from netspec.exact import SMALL, switch
+from netspec.errors import Report, SpecError, Where, raise_fault
+from netspec.exact import switch
 from netspec.files.limits import amount, is_out_of_memory, memory
-from netspec.graph import Report, raise_fault
+from netspec.graph.options import BuildOptions
 from netspec.layers import fillers
 from netspec.layers.learned import Learned, values_of
 from netspec.layers.targets import OnnxGraph, TorchCode
@@ -122,40 +122,38 @@ class Random:
         return self._generators[key]
 
 
-def _nowhere(*path: str | int) -> Where:
+def nowhere(*path: str | int) -> Where:
+    """Return the place of a layer that no file has."""
     return Where("<layer>")
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a layer may know of the net around it.
+    """What a layer may know of the net around it: ``phase``, how it is built, ``random`` draws of its own.
 
+    Where ``options.open_data`` is false, a layer that reads files must not: its tops' shapes are in
+    ``options.given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``.
     ``at(*path)`` is the place in the prototxt of a field of this layer; ``report`` gets the faults after which building
-    can go on (the default raises the first). ``device`` is where blobs are made; on ``meta`` they have shapes and no
-    values. No file is written there, nor where ``write_files`` is false. Where ``open_data`` is false, a layer that
-    reads files must not: its tops' shapes are in ``given_shapes`` (by blob name), or it raises a SpecError that asks
-    for ``--shape``. Of ``ranks`` nets that train side by side the layer's net is number ``rank``. ``random`` is this
-    net's own; from ``data_seed``, which is the same for all ranks, follow the draws of the layers that read records.
-    ``exact`` says which sums are to be Caffe's to the last bit (netspec/exact); with ``accumulate_in_place``, layers
-    that sum up their parameters' gradients themselves add them to ``grad`` as Caffe does (netspec/exact/accumulate.py).
+    can go on (the default raises the first).
     """
 
     phase: int = TEST
+    options: BuildOptions = field(default_factory=BuildOptions)
     random: Random = field(default_factory=lambda: Random(0))
-    data_seed: int = 0
-    at: Callable[..., Where] = _nowhere
+    at: Callable[..., Where] = nowhere
     report: Report = raise_fault
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    open_data: bool = True
-    write_files: bool = True
-    given_shapes: Mapping[str, Shape] = field(default_factory=dict)
-    allow_python: bool = False
-    rank: int = 0
-    ranks: int = 1
-    exact: str = SMALL
-    accumulate_in_place: bool = False
     created: Callable[[], None] = lambda: None  # called when ``construct`` has run: Caffe's log goes by it
     take: Callable[[int], None] = lambda size: None  # called before memory is taken, in bytes: it may refuse
+
+    @property
+    def device(self) -> torch.device:
+        """Where blobs are made."""
+        return torch.device(self.options.device)
+
+    @property
+    def data_seed(self) -> int:
+        """From it follow the draws of layers that read records; it is the same for all ranks."""
+        return self.random.seed if self.options.data_seed is None else self.options.data_seed
 
 
 _PLAIN = frozenset({bool, int, float, str, tuple, list})
@@ -268,7 +266,7 @@ class Layer(torch.nn.Module):
 
     def is_exact(self, bottom: torch.Tensor, small: bool = False) -> bool:
         """Return whether to compute in Caffe's order: :func:`netspec.exact.switch.applies`, for one type of numbers."""
-        applies = switch.applies(self.context.exact, bottom, small)
+        applies = switch.applies(self.context.options.exact, bottom, small)
         return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
 
     def filled_once(self) -> Sequence[torch.Tensor | None]:

@@ -60,7 +60,7 @@ class InnerProduct(Layer):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed = self.param.inner_product_param.transpose
-        exact, in_place = self.is_exact(data, self.small), self.context.accumulate_in_place
+        exact, in_place = self.is_exact(data, self.small), self.context.options.accumulate_in_place
         if exact or (in_place and torch.is_grad_enabled()):
             vectors, products = data.reshape(-1, self.inputs), VectorProducts if exact else SummedProducts
             return products.apply(vectors, weight, bias, transposed, in_place).reshape(self.top_shapes[0])
@@ -271,7 +271,7 @@ class Embed(Layer):
             raise self.error(message, "bottom")
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         if self.is_exact(weight):
-            tops = ChosenRows.apply(index.flatten(), weight, bias, self.context.accumulate_in_place)
+            tops = ChosenRows.apply(index.flatten(), weight, bias, self.context.options.accumulate_in_place)
             return tops.reshape(self.top_shapes[0])
         top = F.embedding(index, weight)
         return top if bias is None else top + bias

@@ -285,7 +285,7 @@ class _Affine(Layer):
         operand = bias if factors is None else factors
         assert operand is not None
         values = data.reshape(math.prod(data.shape[:axis]), operand.numel(), -1)
-        tops = ChannelProducts.apply(values, factors, bias, self.context.accumulate_in_place)
+        tops = ChannelProducts.apply(values, factors, bias, self.context.options.accumulate_in_place)
         return tops.reshape(data.shape)
 
     def onnx_operand(self, graph: OnnxGraph, bottoms: Sequence[str], blob: int, axis: int) -> str:
@@ -523,7 +523,7 @@ class LRN(Layer):
     @override
     def prepare(self, how: Preparation) -> Kernel:
         param, shape = self.param.lrn_param, self.bottom_shapes[0]
-        if param.norm_region != ACROSS_CHANNELS or self.context.exact == ALL:
+        if param.norm_region != ACROSS_CHANNELS or self.context.options.exact == ALL:
             return super().prepare(how)
         size, channels, reach = param.local_size, shape[1], param.local_size // 2
         frames: dict[bool, torch.Tensor] = {}

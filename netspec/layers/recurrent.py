@@ -190,7 +190,7 @@ class Recurrent(Layer):
         """Return the products of vectors (M, K) with a matrix, its blob's index given, and the bias added."""
         matrix, added = self.blob(weight), None if bias is None else self.blob(bias)
         if self.exact:
-            return VectorProducts.apply(vectors, matrix, added, False, self.context.accumulate_in_place)
+            return VectorProducts.apply(vectors, matrix, added, False, self.context.options.accumulate_in_place)
         return F.linear(vectors, matrix, added)
 
     def carry(self, hidden: torch.Tensor, keep: torch.Tensor, inputs: tuple[torch.Tensor, ...]) -> torch.Tensor:

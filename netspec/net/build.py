@@ -13,11 +13,11 @@ import torch
 
 from netspec.exact import SMALL
 from netspec.graph.filter import filter_net, with_state
+from netspec.graph.options import BuildOptions
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
 from netspec.graph.steps import PASSES
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.net.weights import copy_weights, load_weights
 from netspec.process.garbage import no_collection
 from netspec.proto.schema import NetParameter, phase_of
@@ -49,7 +49,7 @@ def load_net(
     """
     net, source = parse_net(path)
     options = BuildOptions(
-        torch.device(device), seed, allow_python=allow_python, exact=exact, write_files=write_files, passes=passes
+        str(device), seed, allow_python=allow_python, exact=exact, write_files=write_files, passes=passes
     )
     built = build_net(with_state(net, phase_of(phase), level, stages), source, options)
     if weights is not None:
@@ -60,7 +60,7 @@ def load_net(
 def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
     """Filter by the net's own ``state``, insert splits, plan, and build."""
     options = options or BuildOptions()
-    return build_filtered(*filter_net(net, source, options.report), options)
+    return build_filtered(*filter_net(net, source), options)
 
 
 @no_collection()
@@ -68,12 +68,12 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
     """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
         log.dump("net.cpp:53", "Initializing net from parameters: ", write_text(filtered).rstrip("\n"))
-    split, source = insert_splits(filtered, source, options.report)
+    split, source = insert_splits(filtered, source)
     for layer in split.layer:
         if not layer.HasField("phase"):
             layer.phase = split.state.phase
-    built = Net(make_plan(split, source, options.report), options)
+    built = Net(make_plan(split, source), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
     if written.layer:  # weights in the prototxt itself
-        copy_weights(built, written, source.file, options.report)
+        copy_weights(built, written, source.file)
     return built

@@ -17,18 +17,18 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from netspec.errors import SpecError, Where
+from netspec.errors import Report, SpecError, Where
 from netspec.exact import ALL
 from netspec.exact.blas import other_kernels
 from netspec.files.limits import amount, is_out_of_memory
 from netspec.files.limits import memory as memory_of_machine
-from netspec.graph import Report, check_blobs, raise_fault
+from netspec.graph import check_blobs
+from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
-from netspec.net.options import BuildOptions
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST, TRAIN
 from netspec.run.eager import Eager, last_uses
@@ -71,7 +71,7 @@ class Net(torch.nn.Module):
         self.param = plan.net
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
-        self.device = options.device
+        self.device = torch.device(options.device)
         self.exact = options.exact
         self.keep: str | Iterable[str] = ()
         self._kept_of: dict[str | tuple[str, ...], frozenset[int]] = {}  # by ``keep``, as it was last
@@ -124,38 +124,29 @@ class Net(torch.nn.Module):
     def _build_layers(self, options: BuildOptions) -> Any:
         layers: dict[int, Layer] = {}  # without those with errors, if errors are collected
         shapes: dict[int, Shape] = {}
-        memory = 0
+        memory, report = 0, self.plan.source.report
         for i, (node, param) in enumerate(zip(self.plan.nodes, self.param.layer, strict=True)):
             tie = _Tie(self.plan, i, partial(self._take, options, i))
             log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
             cls = class_of(param, options.allow_python)
             if cls is None:
-                options.report(SpecError(unknown_type(node.type), tie.at("type")))
+                report(SpecError(unknown_type(node.type), tie.at("type")))
                 continue
             if any(v not in shapes for v in node.bottoms):
                 continue  # an error upstream was reported
             context = Context(
                 phase=self.phase,
+                options=options,
                 random=self.random,
-                data_seed=self.random.seed if options.data_seed is None else options.data_seed,
                 at=tie.at,
-                report=options.report,
-                device=options.device,
-                open_data=options.open_data,
-                write_files=options.write_files,
-                given_shapes=options.given_shapes or {},
-                allow_python=options.allow_python,
-                rank=options.rank,
-                ranks=options.ranks,
-                exact=options.exact,
-                accumulate_in_place=options.accumulate_in_place,
+                report=report,
                 created=tie.created,
                 take=tie.take,
             )
             try:
                 layer = cls(param, [shapes[v] for v in node.bottoms], context)
             except SpecError as fault:
-                options.report(fault)
+                report(fault)
                 continue
             except (MemoryError, RuntimeError) as fault:
                 if not is_out_of_memory(fault):
@@ -165,7 +156,7 @@ class Net(torch.nn.Module):
                     tie.at(),
                 ) from None
             tie.take_from = None
-            weights = _loss_weights(layer, options.report)
+            weights = _loss_weights(layer, report)
             layers[i] = layer
             self.loss_weights.append(weights)
             for v, shape in zip(node.tops, layer.top_shapes, strict=False):
@@ -179,10 +170,10 @@ class Net(torch.nn.Module):
                     log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
             log.info("net.cpp:139", f"Memory required for data: {memory}")
             owned = len(self.learnable)
-            self._adopt_params(layers, i, layer, options.report)
+            self._adopt_params(layers, i, layer)
             self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
         if self.device.type != "meta" and (fault := self.need.fault(limit_on(self.device))):
-            options.report(fault)
+            report(fault)
         if len(layers) == len(self.plan.nodes):
             self._finish(list(layers.values()))
         return torch.nn.ModuleList(layers.values())
@@ -208,20 +199,19 @@ class Net(torch.nn.Module):
         """Return what the net needs, from the shapes that are known so far, without memory, data or Python layers."""
         seen = replace(
             options,
-            device=torch.device("meta"),
+            device="meta",
             open_data=False,
             write_files=False,
-            given_shapes={**(options.given_shapes or {}), **self.shapes},
-            report=lambda fault: None,
+            given_shapes={**options.given_shapes, **self.shapes},
             allow_python=False,
             passes=(),
         )
         with log.silent():
-            return Net(self.plan, seen).need
+            return Net(replace(self.plan, source=self.plan.source.telling(lambda fault: None)), seen).need
 
-    def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer, report: Report) -> None:
+    def _adopt_params(self, layers: dict[int, Layer], i: int, layer: Layer) -> None:
         """Connect the shared parameters of layer ``i`` to their owners; list the others as learnable."""
-        node = self.plan.nodes[i]
+        node, report = self.plan.nodes[i], self.plan.source.report
         if len(node.params) > len(layer.blobs):
             message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one per blob"
             report(layer.error(message, "param", len(layer.blobs)))
@@ -368,10 +358,10 @@ class Net(torch.nn.Module):
         }
         return {name: weights[v] for name, v in self.plan.outputs.items()}
 
-    def share_weights_with(self, other: Net, report: Report = raise_fault) -> None:
+    def share_weights_with(self, other: Net) -> None:
         """Use the learnable blobs of ``other`` in the layers of equal names (Caffe: ShareTrainedLayersWith).
 
-        ``report`` gets a SpecError for each layer whose blobs have different shapes there.
+        A layer whose blobs have different shapes there is a fault of this net.
         """
         mine = {layer.param.name: layer for layer in self.layers}
         for theirs in other.layers:
@@ -381,7 +371,7 @@ class Net(torch.nn.Module):
             shapes = (layer.blob_shapes, theirs.blob_shapes)
             if shapes[0] != shapes[1]:
                 message = f"cannot share weights with the training net: shapes are {shapes[0]} here, {shapes[1]} there"
-                report(layer.error(message))
+                self.plan.source.report(layer.error(message))
                 continue
             for j, blob in enumerate(theirs.blobs):
                 layer.blobs[j] = blob

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 from typing_extensions import override
 
 from netspec.errors import SpecError
-from netspec.exact import SMALL, check_choice
+from netspec.exact import SMALL
+from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, class_of, unknown_type
-from netspec.layers.base import Shape
+from netspec.layers.base import Shape, nowhere
 from netspec.net.net import Array
 from netspec.proto.reader import read_text
 from netspec.proto.schema import LayerParameter, NetParameter, phase_of
@@ -40,9 +41,9 @@ def layer(
     shapes of its bottoms are known: at the first call, or at once if ``shapes`` are given. ``exact`` is as for a net
     (netspec/exact). Raises SpecError, and ValueError for an unknown ``exact``.
     """
-    check_choice(exact)
-    context = {"phase": phase_of(phase), "random": Random(seed), "data_seed": seed, "device": torch.device(device)}
-    return OneLayer(partial(make_layer, text, tops=tops, allow_python=allow_python, exact=exact, **context), shapes)
+    options = BuildOptions(str(device), seed, allow_python=allow_python, exact=exact)
+    context = Context(phase_of(phase), options, Random(seed))
+    return OneLayer(partial(make_layer, text, context=context, tops=tops), shapes)
 
 
 class OneLayer(torch.nn.Module):
@@ -64,8 +65,11 @@ class OneLayer(torch.nn.Module):
         return tops[0] if len(tops) == 1 else tops
 
 
-def make_layer(text: str, shapes: Sequence[Shape], tops: int | None = None, **context: Any) -> Layer:
-    """Build the layer of a text for bottoms of these shapes; ``context`` has fields of :class:`Context`."""
+def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int | None = None) -> Layer:
+    """Build the layer of a text for bottoms of these shapes.
+
+    Places in errors are those of the text, unless ``context`` has others.
+    """
     param = LayerParameter()
     place = read_text(text, FILE, param)
     net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Place(place.where), (place,)))
@@ -79,4 +83,4 @@ def make_layer(text: str, shapes: Sequence[Shape], tops: int | None = None, **co
         fewest = len(shapes) if cls.same_tops else cls.tops[0]
         tops = fewest or int(cls.tops[1] is None)
     param.top.extend(f"top{i}" for i in range(len(param.top), tops))
-    return cls(param, shapes, Context(**{"at": at, **context}))
+    return cls(param, shapes, replace(context, at=at) if context.at is nowhere else context)

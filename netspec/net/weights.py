@@ -17,10 +17,9 @@ import numpy as np
 import torch
 
 from netspec.data import blobs
-from netspec.errors import SpecError, Where
+from netspec.errors import Report, SpecError, Where
 from netspec.files.hdf5 import layer_groups, new_hdf5, open_hdf5
 from netspec.files.whole_file import whole_file
-from netspec.graph import Report, raise_fault
 from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.net.stamp import check_weights
@@ -39,14 +38,13 @@ def load_weights(
     strict: bool = False,
     *,
     some: bool = False,
-    report: Report = raise_fault,
 ) -> None:
     """Copy the weights of a .caffemodel or .caffemodel.h5 into the layers of the same names, all or none.
 
     Of several files each is loaded in turn, the last one winning. Layers that only a file has are ignored, and named
     in the log. One warning names the layers that no file has, which stay as they were filled; with ``strict`` that is a
-    SpecError, and with ``some`` it is one where nothing fits. ``report`` gets the SpecErrors: those, and those for a
-    file that cannot be read, or is not what its snapshot wrote, and for blobs of other number or shape than the net's.
+    SpecError, and with ``some`` it is one where nothing fits. Others are those of a file that cannot be read, or is not
+    what its snapshot wrote, and of blobs of other number or shape than the net's; all go to ``net.plan.source.report``.
     """
     paths = [Path(path)] if isinstance(path, (str, Path)) else [Path(each) for each in path]
     loaded: set[int] = set()
@@ -62,18 +60,18 @@ def load_weights(
         except SpecError as fault:
             faults.append(fault)
         for fault in faults:
-            report(fault)
+            net.plan.source.report(fault)
         whole = whole and not faults
     if whole:
-        _tell_missing(net, loaded, paths, strict, some, report)
+        _tell_missing(net, loaded, paths, strict, some)
 
 
-def copy_weights(net: Net, message: NetParameter, path: str | Path, report: Report = raise_fault) -> None:
+def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
     """Copy the weights in a message, read from ``path``, into the layers of the same names, all or none.
 
-    Layers that only one side has are left alone. ``report`` gets a SpecError as in :func:`load_weights`.
+    Layers that only one side has are left alone. For SpecErrors see :func:`load_weights`.
     """
-    _copy(partial(_from_message, net, message, Path(path)), report)
+    _copy(partial(_from_message, net, message, Path(path)), net.plan.source.report)
 
 
 def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
@@ -95,7 +93,7 @@ def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
     return {id(layer.blobs[j]) for layer, j, _ in copies}
 
 
-def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, some: bool, report: Report) -> None:
+def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, some: bool) -> None:
     """Warn of the layers of which a blob was not loaded, or report them; weights in the prototxt itself count."""
     learning = [layer for layer in net.layers if len(layer.blobs)]
     missing = [
@@ -113,7 +111,7 @@ def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, s
         fault = f"lacks weights for {len(missing)} of the net's {len(learning)} layers that have any: {names}"
     if strict or (some and nothing):
         advice = "is it the file of another net?" if nothing else "leave strict out to keep their fillers' values"
-        report(SpecError(f"{fault}; {advice}", Where(files)))
+        net.plan.source.report(SpecError(f"{fault}; {advice}", Where(files)))
     else:
         log.logger.warning(f"{files}: {fault}; they stay as they were filled")
 

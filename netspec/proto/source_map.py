@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from netspec.errors import Where
+from netspec.errors import Report, Where, raise_fault
 
 _NONE: dict[str, tuple[Place, ...]] = {}  # one for all places without fields
 
@@ -36,11 +36,16 @@ class Place:
 
 @dataclass(frozen=True)
 class SourceMap:
-    """``layers[i]`` is the place of layer ``i`` of the NetParameter."""
+    """``layers[i]`` is the place of layer ``i`` of the NetParameter.
+
+    ``report`` gets each fault that is found in the net, from its first pass until it is built and has its weights. It
+    raises the first one; with another, work goes on where it can.
+    """
 
     file: str
     net: Place
     layers: tuple[Place, ...] = ()
+    report: Report = field(default=raise_fault, compare=False)
 
     @staticmethod
     def of(net: Place) -> SourceMap:
@@ -61,6 +66,10 @@ class SourceMap:
     def at(self, index: int, *path: str | int, layer: str = "", type: str = "") -> Where:
         """Return the place of a field of layer ``index``, labeled with the layer's name and type."""
         return replace(self.layers[index].find(*path), layer=layer, type=type)
+
+    def telling(self, report: Report) -> SourceMap:
+        """Return the map of the same net whose faults go to ``report``."""
+        return replace(self, report=report)
 
     def with_layers(self, layers: Iterable[Place]) -> SourceMap:
         """Return the map of a net whose layers came from ``layers``, in order."""

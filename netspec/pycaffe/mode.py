@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import torch
 
 from netspec.exact import CHOICES, SMALL
+from netspec.graph.options import BuildOptions
 from netspec.layers.base import Random
-from netspec.net.options import BuildOptions
 from netspec.terminal import log
 
 
@@ -101,7 +101,7 @@ def exact() -> str:
 
 def build_options() -> BuildOptions:
     """Return how the next net is built."""
-    return BuildOptions(device(), next_seed(), allow_python=True, exact=_mode.exact, accumulate_in_place=True)
+    return BuildOptions(str(device()), next_seed(), allow_python=True, exact=_mode.exact, accumulate_in_place=True)
 
 
 def set_multiprocess(value: bool) -> None:

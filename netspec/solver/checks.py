@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from netspec.errors import SpecError
+from netspec.errors import Report, SpecError, raise_fault
 from netspec.files.whole_file import whole_file, why_unwritable
-from netspec.graph import Report, raise_fault
 from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Place
 from netspec.solver.lr_policy import policy_faults

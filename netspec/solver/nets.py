@@ -9,8 +9,7 @@ import os
 from dataclasses import dataclass
 
 from netspec.data.random_words import derived
-from netspec.errors import SpecError
-from netspec.graph import Report, raise_fault
+from netspec.errors import Report, SpecError, raise_fault
 from netspec.graph.filter import in_state
 from netspec.proto.schema import TEST, TRAIN, NetParameter, NetState, SolverParameter
 from netspec.proto.source_map import Place, SourceMap

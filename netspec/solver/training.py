@@ -14,9 +14,9 @@ from typing import Any
 import torch
 
 from netspec.errors import SpecError, Where
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
 from netspec.process import waiting
 from netspec.proto.binary import split_paths
@@ -163,7 +163,7 @@ class Training:
         Each ``role`` has its own random numbers, except for the records: nets that train in parallel share their order.
         """
         options = BuildOptions(
-            device,
+            str(device),
             seed=nets.seed_of(self.seed, role),
             data_seed=self.seed if ranks > 1 else None,
             allow_python=self.options.allow_python,

@@ -19,7 +19,6 @@ import h5py
 import lmdb
 import numpy as np
 import scipy.io
-import torch
 
 from faults import recordings, written
 from lmdb_build.pairs.list_file import read_pair_list
@@ -38,13 +37,12 @@ from netspec.data.hdf5 import Hdf5Source
 from netspec.data.images import read_image, read_image_list
 from netspec.data.mean import read_mean, read_mean_option, write_mean
 from netspec.data.windows import read_window_file
-from netspec.errors import SpecError
+from netspec.errors import SpecError, raise_fault
 from netspec.files.image_list import list_images
-from netspec.graph import raise_fault
 from netspec.graph.filter import with_state
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.net.stamp import Stamp, sealed
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
@@ -234,7 +232,7 @@ layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "
 def built(path: Path) -> None:
     """Build a net without memory, data or files, and what it says."""
     message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
-    options = BuildOptions(torch.device("meta"), seed=0, open_data=False, write_files=False)
+    options = BuildOptions("meta", seed=0, open_data=False, write_files=False)
     repr(build_net(with_state(message, TEST, 0, ["x"]), source, options))
 
 

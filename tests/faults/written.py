@@ -24,9 +24,9 @@ from netspec.export.pt2 import torch_module
 from netspec.export.torch import torch_source
 from netspec.files.limits import limited
 from netspec.graph.filter import with_state
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text, write_text
 

@@ -12,10 +12,10 @@ from netspec.export.deploy import with_inputs
 from netspec.export.onnx import onnx_model
 from netspec.export.pt2 import torch_module
 from netspec.graph.filter import with_state
+from netspec.graph.options import BuildOptions
 from netspec.layers import Layer, layer_class
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.proto.text import parse_net_text
 
 NOT_IN_ONNX = {"DummyData": "random", "HDF5Output": "writes a file", "Python": "code"}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from netspec.graph.options import BuildOptions
 from netspec.layers import Context, layer_class
 from netspec.layers.data.files import ReadingLayer
 from netspec.proto.schema import TRAIN
@@ -56,7 +57,7 @@ def reader(name: str, batch: int, seed: int, rank: int, ranks: int) -> ReadingLa
     (param,) = parse_net_text(layer_text(name, batch), "net.prototxt")[0].layer
     cls = layer_class(param.type)
     assert cls is not None
-    layer = cls(param, [], Context(phase=TRAIN, data_seed=seed, rank=rank, ranks=ranks))
+    layer = cls(param, [], Context(TRAIN, BuildOptions(data_seed=seed, rank=rank, ranks=ranks)))
     assert isinstance(layer, ReadingLayer)
     return layer
 

@@ -16,6 +16,7 @@ from google.protobuf import text_format
 from each import each
 from fake_gpu import NAME, POSSIBLE, fake_gpu
 from netspec.errors import SpecError, Where
+from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, layer_class, layer_types
 from netspec.layers.data.memory import MemoryData
 from netspec.proto.schema import TEST, TRAIN, LayerParameter, PhaseValue
@@ -190,15 +191,8 @@ def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu",
     def at(*path: str | int) -> Where:
         return Where(".".join(map(str, path)))
 
-    context = Context(
-        phase=example.phase,
-        random=Random(0),
-        at=at,
-        allow_python=True,
-        device=torch.device(device),
-        exact=exact,
-    )
-    return cls(param, shapes, context)
+    options = BuildOptions(device, allow_python=True, exact=exact)
+    return cls(param, shapes, Context(example.phase, options, Random(0), at))
 
 
 def of_each(names: Iterable[str], exacts: Sequence[str] = ("small",)) -> Callable[..., Any]:

@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 
 from netspec.cli import main
+from netspec.errors import Report, raise_fault
 from netspec.exact.blas import CAFFES, kernels
 from netspec.graph.filter import with_state
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.proto.schema import TEST, PhaseValue
 from netspec.proto.text import parse_net_text
 from paths import GOLDEN
@@ -49,11 +50,11 @@ def work_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Pa
 
 @pytest.fixture
 def net_of() -> Callable[..., Net]:
-    """``net_of(text, phase=TEST, **options)``: the net of a prototxt's text; faults are in ``net.prototxt``."""
+    """``net_of(text, phase=TEST, report=raise_fault, **options)``: the net of a prototxt's text, ``net.prototxt``."""
 
-    def build(text: str, phase: PhaseValue = TEST, **options: Any) -> Net:
+    def build(text: str, phase: PhaseValue = TEST, report: Report = raise_fault, **options: Any) -> Net:
         net, source = parse_net_text(text, "net.prototxt")
-        return build_net(with_state(net, phase), source, BuildOptions(**{"seed": 0, **options}))
+        return build_net(with_state(net, phase), source.telling(report), BuildOptions(**{"seed": 0, **options}))
 
     return build
 

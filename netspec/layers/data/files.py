@@ -74,8 +74,8 @@ class ReadingLayer(Layer):
         """Look at the settings; faults are gathered, so that all are reported. Files are opened if there are none."""
         self.faults = list(self.wrong_settings())
         self._sound = not self.faults
-        given = any(top in self.context.given_shapes for top in self.param.top[:1])
-        self.opens_data = self.context.open_data and not given
+        given = any(top in self.context.options.given_shapes for top in self.param.top[:1])
+        self.opens_data = self.context.options.open_data and not given
 
     def attempt(self, function: Callable[..., T], *arguments: Any) -> T | None:
         """Return what a function returns, None where it raises a SpecError, which is kept."""
@@ -111,7 +111,7 @@ class ReadingLayer(Layer):
 
     def shapes_without_data(self) -> list[Shape]:
         """Return the tops' shapes as given by the caller or fixed by the prototxt; a label goes with each image."""
-        given = self.context.given_shapes
+        given = self.context.options.given_shapes
         data = given.get(self.param.top[0]) or self.known_shape()
         if data is None:
             raise self.shape_wanted(self.param.top[0], f"{self.batch_size},C,H,W")
@@ -260,7 +260,9 @@ class Data(ReadingLayer):
         if p.force_encoded_color:
             transformer.color = True
         skip = self.skip(p.rand_skip, len(reader), "data_param", "rand_skip")
-        cursor = Cursor(len(reader), self.batch_size, skip, rank=self.context.rank, ranks=self.context.ranks)
+        cursor = Cursor(
+            len(reader), self.batch_size, skip, rank=self.context.options.rank, ranks=self.context.options.ranks
+        )
         source = DatabaseSource(reader, cursor, transformer, self.place)
         self.log_size(source, "data_layer.cpp:45")
         return source
@@ -311,7 +313,7 @@ class ImageData(ReadingLayer):
             log.info("image_data_layer.cpp:53", "Shuffling data")
         log.info("image_data_layer.cpp:63", f"A total of {len(images)} images.")
         skip = self.skip(p.rand_skip, len(images), "image_data_param", "rand_skip")
-        seed, rank, ranks = self.context.data_seed, self.context.rank, self.context.ranks
+        seed, rank, ranks = self.context.data_seed, self.context.options.rank, self.context.options.ranks
         cursor = Cursor(len(images), self.batch_size, skip, p.shuffle, seed, self.stream, rank, ranks)
         size = (p.new_height, p.new_width) if p.new_height else None
         self.possible((3, *(size or ())))
@@ -350,7 +352,7 @@ class HDF5Data(ReadingLayer):
         from netspec.data.hdf5 import Hdf5Source
 
         p, context = self.param.hdf5_data_param, self.context
-        seed, rank, ranks = context.data_seed, context.rank, context.ranks
+        seed, rank, ranks = context.data_seed, context.options.rank, context.options.ranks
         tops = self.param.top
         return Hdf5Source(p.source, tops, p.batch_size, p.shuffle, seed, self.stream, self.place, rank, ranks)
 
@@ -358,9 +360,9 @@ class HDF5Data(ReadingLayer):
     def shapes_without_data(self) -> list[Shape]:
         """Return the shapes given by the caller; the prototxt says nothing of them."""
         for top in self.param.top:
-            if top not in self.context.given_shapes:
+            if top not in self.context.options.given_shapes:
                 raise self.shape_wanted(top, f"{self.batch_size},...")
-        return [self.context.given_shapes[top] for top in self.param.top]
+        return [self.context.options.given_shapes[top] for top in self.param.top]
 
 
 @register("WindowData", "window_data_param", "transform_param", "data_param.prefetch")
@@ -403,7 +405,7 @@ class WindowData(ReadingLayer):
         mean = self.attempt(window_mean, transform, context.at)
         if file is None or mean is None:
             return None
-        seed, rank, ranks = context.data_seed, context.rank, context.ranks
+        seed, rank, ranks = context.data_seed, context.options.rank, context.options.ranks
         return WindowSource(p, transform, file, mean, context.at, seed, self.stream, rank, ranks)
 
     @override
@@ -435,7 +437,7 @@ class HDF5Output(Layer):
         if reason := why_unwritable(name):
             raise self.error(f'HDF5 file "{name}" cannot be written: {reason}', *place)
         self._sink = None
-        if self.context.write_files and self.context.device.type != "meta":
+        if self.context.options.write_files and self.context.device.type != "meta":
             from netspec.data.hdf5 import Hdf5Sink
 
             self._sink = Hdf5Sink(name, self.context.at(*place))

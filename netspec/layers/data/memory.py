@@ -36,7 +36,7 @@ class Input(Layer):
     @override
     def setup(self) -> None:
         shapes: list[Shape] = [tuple(shape.dim) for shape in self.param.input_param.shape]
-        given = self.context.given_shapes
+        given = self.context.options.given_shapes
         if not shapes and all(top in given for top in self.param.top):
             shapes = [given[top] for top in self.param.top]
         if len(shapes) not in (1, self.num_tops):

@@ -210,7 +210,7 @@ class InfogainLoss(SoftmaxLoss):
         if not source:
             message = "found neither a third bottom nor a source, expected the infogain matrix from one of them"
             raise self.error(message, "infogain_loss_param")
-        if self.context.open_data:
+        if self.context.options.open_data:
             self.matrix = self._read_matrix(source)
 
     def _read_matrix(self, source: str) -> torch.Tensor:

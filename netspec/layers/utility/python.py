@@ -60,11 +60,11 @@ class Python(Layer):
 
     @override
     def setup(self) -> None:
-        given = self.context.given_shapes
+        given = self.context.options.given_shapes
         self.code: Any = None
-        if not self.context.open_data and all(name in given for name in self.param.top):
+        if not self.context.options.open_data and all(name in given for name in self.param.top):
             return
-        if not self.context.allow_python:
+        if not self.context.options.allow_python:
             raise self.error(self.not_allowed, "type")
         names = list(self.param.bottom)
         self.bottom = [Blob(shape) for shape in self.bottom_shapes]
@@ -78,7 +78,7 @@ class Python(Layer):
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if self.code is None:
-            return [self.context.given_shapes[name] for name in self.param.top]
+            return [self.context.options.given_shapes[name] for name in self.param.top]
         for blob, shape in zip(self.bottom, bottom_shapes, strict=True):
             blob.reshape(*shape)
         self._call("reshape", self.bottom, self.top)

@@ -270,7 +270,7 @@ class Split(Layer):
     @override
     def prepare_training(self, learning: Learning) -> Kernels:
         """Return the kernels; gradients are added in Caffe's order, or in the order of autograd: the last one first."""
-        order = 1 if self.num_tops > 2 and switch.applies(self.context.exact, torch.empty(1)) else -1
+        order = 1 if self.num_tops > 2 and switch.applies(self.context.options.exact, torch.empty(1)) else -1
         tops = self.num_tops
 
         def backward(*diffs: torch.Tensor | None) -> torch.Tensor:

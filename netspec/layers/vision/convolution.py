@@ -228,7 +228,9 @@ class Convolution(_SlidingFilter):
         if any(overhang):
             maps = F.pad(maps, overhang)
         if self.is_exact(maps, self.small):
-            return ColumnProducts.apply(maps, weight, bias, sliding, self.group, self.context.accumulate_in_place)
+            return ColumnProducts.apply(
+                maps, weight, bias, sliding, self.group, self.context.options.accumulate_in_place
+            )
         if not torch.is_grad_enabled():  # weights would be laid out anew for each product
             return convolution(maps, weight, bias, sliding, self.group)
         lay_out = channels_side_by_side if maps.numel() > 2 * weight.numel() else torch.Tensor.contiguous
@@ -244,7 +246,7 @@ class Convolution(_SlidingFilter):
         transposed: bool = False,
     ) -> torch.Tensor:
         """Return what torch's kernel computes of maps that ``lay_out`` puts into its order, with gradients."""
-        if self.context.accumulate_in_place and not is_recorded():
+        if self.context.options.accumulate_in_place and not is_recorded():
             return SummedConvolutions.apply(maps, weight, bias, sliding, self.group, transposed, lay_out)
         return convolution(lay_out(maps), weight, bias, sliding, self.group, transposed)
 
@@ -423,7 +425,10 @@ class Deconvolution(Convolution):
     ) -> torch.Tensor:
         """Return the maps (N, C, spatial axes), at least one, spread by the filters."""
         if self.is_exact(maps):
-            in_place, size = self.context.accumulate_in_place, self.top_shapes[0][self.channel_axis + 1 :] or (1,)
+            in_place, size = (
+                self.context.options.accumulate_in_place,
+                self.top_shapes[0][self.channel_axis + 1 :] or (1,),
+            )
             return SpreadProducts.apply(maps, weight, bias, sliding, self.group, in_place, size)
         if not torch.is_grad_enabled():
             return convolution(maps, weight, bias, sliding, self.group, transposed=True)

@@ -7,7 +7,7 @@ import torch
 
 from fake_gpu import NAME, POSSIBLE, fake_gpu
 from netspec.dialects import use_dialect
-from netspec.layers import Layer
+from netspec.layers import Context, Layer
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST
 
@@ -26,7 +26,7 @@ def build() -> Callable[..., Layer]:
 
     def build_layer(name: str, text: str, *shapes: tuple[int, ...], phase: int = TEST, tops: int = 1) -> Layer:
         use_dialect(name)
-        return make_layer(text, shapes, tops, phase=phase)
+        return make_layer(text, shapes, Context(phase), tops)
 
     return build_layer
 

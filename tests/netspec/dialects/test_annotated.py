@@ -12,6 +12,7 @@ from annotated_records import annotated, write
 from netspec.data.datum import array_to_datum
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
+from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, layer_class
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
@@ -32,7 +33,7 @@ def reading(
     cls = layer_class("AnnotatedData")
     assert cls is not None
     at = lambda *path: places.at(0, *path, layer="data", type="AnnotatedData")  # noqa: E731
-    return cls(net.layer[0], [], Context(phase=phase, data_seed=seed, at=at))
+    return cls(net.layer[0], [], Context(phase, BuildOptions(data_seed=seed), at=at))
 
 
 def batch_of(layer: Layer) -> tuple[np.ndarray, np.ndarray]:
@@ -281,5 +282,5 @@ def test_shapes_are_known_without_data() -> None:
         net, _ = parse_net_text(f"layer {{ {text} transform_param {{ {transform} }} }}", "net.prototxt")
         cls = layer_class("AnnotatedData")
         assert cls is not None
-        layer = cls(net.layer[0], [], Context(open_data=False))
+        layer = cls(net.layer[0], [], Context(options=BuildOptions(open_data=False)))
         assert layer.top_shapes == [shape, (1, 1, 1, 8)]

@@ -8,9 +8,9 @@ import torch
 
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
+from netspec.graph.options import BuildOptions
 from netspec.layers import Layer, layer_class, layer_types
 from netspec.net.build import build_net
-from netspec.net.options import BuildOptions
 from netspec.proto.schema import TRAIN
 from netspec.proto.text import parse_net_text
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
-from netspec.layers import Layer
+from netspec.layers import Context, Layer
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TRAIN
 
@@ -48,7 +48,9 @@ def test_numbers_are_rounded(build: Build, kind: str, precision: str) -> None:
     data = torch.randn(2, 2, 4, 5) * 3
     how = FIXED if precision == "fixed" else "precision: INTEGER_POWER_OF_2_WEIGHTS exp_min: -5 exp_max: -2"
     layer = build("ristretto", f"type: '{kind}' {KINDS[kind]} quantization_param {{ {how} }}", data.shape)
-    plain = make_layer(f"type: '{PLAIN.get(kind, kind.removesuffix('Ristretto'))}' {KINDS[kind]}", [data.shape], 1)
+    plain = make_layer(
+        f"type: '{PLAIN.get(kind, kind.removesuffix('Ristretto'))}' {KINDS[kind]}", [data.shape], Context(), 1
+    )
     weights, bias = (blob.detach() for blob in layer.blobs)
     with torch.no_grad():
         plain.blobs[0].copy_(fixed(weights, 5, 4) if precision == "fixed" else powers(weights, -5, -2))

@@ -10,9 +10,9 @@ import torch
 
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
+from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
 from netspec.net.build import build_net
-from netspec.net.options import BuildOptions
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
 from netspec.solver.solver import load_solver

@@ -14,9 +14,9 @@ import pytest
 import netspec
 from exported import assert_same, here, random_inputs, trained
 from netspec.export.deploy import fold, write_caffe
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.net.weights import save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text

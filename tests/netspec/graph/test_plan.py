@@ -79,7 +79,7 @@ def test_faults_can_all_be_collected() -> None:
         'layer { name: "b" type: "ReLU" bottom: "nor" top: "x" }',
         "net",
     )
-    make_plan(*insert_splits(net, source, faults.append), faults.append)
+    make_plan(*insert_splits(net, source.telling(faults.append)))
     assert len(faults) == 3
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 
+from contexts import context
 from netspec.errors import Where
 from netspec.layers import Layer, Random
 from netspec.net.one_layer import make_layer
@@ -37,10 +38,10 @@ def build(exact: str) -> Callable[..., Layer]:
     """
 
     def build_layer(
-        text: str, *shapes: tuple[int, ...], tops: int = 1, phase: int = TEST, seed: int = 0, **context: Any
+        text: str, *shapes: tuple[int, ...], tops: int = 1, phase: int = TEST, seed: int = 0, **facts: Any
     ) -> Layer:
-        options = {"phase": phase, "random": Random(seed), "at": _at, "exact": exact, **context}
-        return make_layer(text, shapes, tops, **options)
+        known = {"phase": phase, "random": Random(seed), "at": _at, "exact": exact}
+        return make_layer(text, shapes, context(**{**known, **facts}), tops)
 
     return build_layer
 

@@ -12,10 +12,11 @@ import pytest
 import torch
 from google.protobuf import text_format
 
+from contexts import context
 from netspec.data.database import Writer, open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
 from netspec.errors import SpecError, Where
-from netspec.layers import Context, Layer, layer_class
+from netspec.layers import Layer, layer_class
 from netspec.layers.data.files import ReadingLayer
 from netspec.layers.data.memory import MemoryData
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
@@ -25,12 +26,12 @@ PAIRS = GOLDEN / "pairs" / "train_lmdb"
 IMAGES = GOLDEN / "images"
 
 
-def data_layer(text: str, phase: int = TEST, seed: int = 0, device: str = "cpu", **context: Any) -> Layer:
+def data_layer(text: str, phase: int = TEST, seed: int = 0, device: str = "cpu", **facts: Any) -> Layer:
     param = text_format.Merge(text, LayerParameter())
     cls = layer_class(param.type)
     assert cls is not None
     at = lambda *path: Where("net.prototxt", 1, 2, ".".join(map(str, path)))  # noqa: E731
-    return cls(param, [], Context(phase=phase, data_seed=seed, at=at, device=torch.device(device), **context))
+    return cls(param, [], context(phase=phase, data_seed=seed, at=at, device=device, **facts))
 
 
 def reading(text: str, **context: Any) -> ReadingLayer:

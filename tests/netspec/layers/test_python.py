@@ -10,8 +10,9 @@ import pytest
 import torch
 
 import netspec
+from contexts import context
 from netspec.errors import SpecError, Where
-from netspec.layers import Context, Layer, layer_class
+from netspec.layers import Layer, layer_class
 from netspec.proto.schema import TRAIN, LayerParameter
 
 CODE = '''
@@ -154,14 +155,14 @@ def python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
         bottoms: tuple[str, ...] = ("a", "b", "c"),
         tops: tuple[str, ...] = ("top",),
         allow_python: bool = True,
-        **context,
+        **facts,
     ) -> Layer:
         param = LayerParameter(name="mine", type="Python", bottom=bottoms[: len(shapes)], top=tops)
         param.python_param.module, param.python_param.layer, param.python_param.param_str = module, name, param_str
         at = lambda *path: Where("net.prototxt", 7, 3, "mine", "Python")  # noqa: E731
         python_layer = layer_class("Python")
         assert python_layer is not None
-        return python_layer(param, shapes, Context(allow_python=allow_python, at=at, **context))
+        return python_layer(param, shapes, context(allow_python=allow_python, at=at, **facts))
 
     yield build
     sys.modules.pop("layers_of_mine", None)

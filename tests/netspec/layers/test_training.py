@@ -9,7 +9,8 @@ from google.protobuf import text_format
 from each import each
 from netspec.exact import CHOICES
 from netspec.exact.blas import one_thread
-from netspec.layers import Context, Layer, Random, layer_class
+from netspec.graph.options import BuildOptions
+from netspec.layers import Context, Layer, layer_class
 from netspec.layers.training import Learning, recorded
 from netspec.proto.schema import TRAIN, LayerParameter
 
@@ -68,7 +69,7 @@ def build(name: str, text: str, shapes: list[tuple[int, ...]], exact: str) -> La
     tops = len(shapes) if cls.same_tops else 1
     if not param.top:
         param.top.extend(f"top{i}" for i in range(tops))
-    return cls(param, shapes, Context(phase=TRAIN, random=Random(0), exact=exact, accumulate_in_place=True))
+    return cls(param, shapes, Context(TRAIN, BuildOptions(exact=exact, accumulate_in_place=True)))
 
 
 @each("name, text, shapes, exact, sideways", [(*case, *how) for case in ALL for how in product(CHOICES, (False, True))])

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.options import BuildOptions
 from netspec.net.weights import load_weights, net_to_proto, save_weights
 from netspec.proto.schema import TRAIN, BlobProto, NetParameter, V1LayerParameter
 from netspec.proto.text import parse_net_text
