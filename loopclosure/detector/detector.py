@@ -6,29 +6,31 @@
         if result.accepted is not None:
             ...  # this frame shows the same place as frame result.accepted
 
-The search is exact: a product of all earlier descriptors with the new one. Its cost grows with the number of frames;
-all other costs are constant: see :meth:`LoopDetector.add`.
+The search is that of an index (:mod:`loopclosure.index`), by default exact: a product of all earlier descriptors with
+the new one. Its cost grows with the number of frames; all other costs are constant: see :meth:`LoopDetector.add`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from loopclosure.descriptors.similarity import check_metric, squared_distances
+from loopclosure.descriptors.similarity import check_metric
+from loopclosure.detector.frames import Frames
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
+from loopclosure.index.index import Index, open_index
 from netspec.errors import SpecError
-from netspec.files.arrays import check_array, from_json, read_npz
+from netspec.files.arrays import from_json, read_npz
 from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
-FIRST_CAPACITY = 256  # frames; doubled when full
+Runs = list[tuple[int, int]]  # of a frame: its candidates, and how many consecutive frames led to each
 LEAST_STEPS = 20  # from one frame to the next, before they give a threshold
 FORMAT = 1  # of the file that save writes
 SAVED = "a file that LoopDetector.save wrote"
@@ -103,35 +105,6 @@ class DetectorSettings:
             raise InputError(f"consistency_window is {self.consistency_window}; expected 0 or more")
 
 
-@dataclass
-class _Frames:
-    """All frames so far, in arrays that double when full: ``count`` of the rows (views, D) are in use."""
-
-    count: int = 0
-    rows: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0), np.float32))
-    squares: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    stamps: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
-    local: list[LocalFeatures] = field(default_factory=list)
-
-    def append(self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None) -> None:
-        if self.count == 0:
-            self.rows = np.zeros((0, *row.shape), np.float32)
-            self.squares = np.zeros((0, len(row)), np.float32)
-        if self.count == len(self.rows):
-            capacity = max(FIRST_CAPACITY, 2 * len(self.rows))
-            for name in ("rows", "squares", "stamps", "poses"):
-                old = getattr(self, name)
-                new = np.empty((capacity, *old.shape[1:]), old.dtype)
-                new[: self.count] = old[: self.count]
-                setattr(self, name, new)
-        self.rows[self.count] = row
-        self.squares[self.count] = np.square(row).sum(1)
-        self.stamps[self.count] = np.nan if stamp is None else stamp
-        self.poses[self.count] = np.nan if pose is None else pose
-        self.count += 1
-
-
 class LoopDetector:
     """Finds loops frame by frame; ``loops`` holds the results that were accepted, in order."""
 
@@ -141,6 +114,7 @@ class LoopDetector:
         settings: DetectorSettings | None = None,
         *,
         check: GeometricCheck | None = None,
+        index: Index | str = "exact",
         **changes: Any,
     ) -> None:
         """Make an empty detector.
@@ -149,6 +123,8 @@ class LoopDetector:
                   ``add_descriptor``
         settings  or its fields by name: ``LoopDetector(describe, exclude_recent=50, top_k=5)``
         check     verifies candidates by their geometry, best first; None: no verification
+        index     where descriptors are kept and searched, empty; or its name, for
+                  :func:`loopclosure.index.index.open_index`
         """
         given = asdict(settings or DetectorSettings())
         unknown = set(changes) - set(given)
@@ -158,9 +134,12 @@ class LoopDetector:
         self.settings = DetectorSettings(**{**given, **changes})
         self.check = check
         self.loops: list[LoopResult] = []
-        self._frames = _Frames()
+        metric = self.settings.metric
+        self._frames = Frames(open_index(index, metric) if isinstance(index, str) else index, self.settings.views)
+        self._sessions = [0]  # the first frame of each
         self._steps: list[float] = []  # the score of each frame with the one before it
-        self._runs: list[tuple[int, int]] = []  # of the last frame: candidate, consecutive frames that led to it
+        self._runs: Runs = []  # of the last frame
+        self._last = np.zeros((0, 0), np.float32)  # its descriptor
 
     def __len__(self) -> int:
         return self._frames.count
@@ -200,28 +179,46 @@ class LoopDetector:
         image: np.ndarray | None = None,
     ) -> LoopResult:
         """Add a frame whose descriptor (D,) is known already; ``image`` is needed only for a geometric check."""
-        row = self._checked(descriptor, stamp)
         position = _checked_pose(pose)
-        candidates = self._search(row, stamp)
-        local = None
-        if self.check is not None:
-            if image is None:
-                raise InputError("a geometric check needs the images")
-            local = self.check.describe(image)
-        result = self._decide(candidates, stamp, local)
-        if len(self):
-            self._steps.append(float(self._score(self._frames.rows[len(self) - 1 : len(self)], row)[0]))
-        self._frames.append(row, stamp, position)
+        row = self._row(descriptor)
+        self._check_stamp(stamp)
+        frames = self._frames
+        frames.settle(self._end(stamp))
+        candidates = self._candidates(row, False)
+        local = self._local(image)
+        result, self._runs = self._decide(len(self), candidates, stamp, local, self._runs)
+        if len(self) > self._sessions[-1]:
+            self._steps.append(float(self._score(self._last, row)))
+        self._last = row
+        frames.append(row, stamp, position)
         if local is not None:
-            self._frames.local.append(local)
+            frames.local.append(local)
         if result.accepted is not None:
             self.loops.append(result)
         return result
 
+    def looked_up(
+        self,
+        query: int,
+        descriptor: Sequence[float] | np.ndarray,
+        stamp: float | None,
+        image: np.ndarray | None,
+        before: Runs,
+    ) -> tuple[LoopResult, Runs]:
+        """Look up frame ``query`` of another session, after one with the runs ``before``; nothing is kept of it."""
+        candidates = self._candidates(self._row(descriptor), True)
+        return self._decide(query, candidates, stamp, self._local(image), before)
+
+    def begin_session(self) -> None:
+        """Go on with the frames of another drive: all earlier ones are its candidates, however recent."""
+        self._frames.settle(len(self))
+        self._sessions.append(len(self))
+        self._runs = []
+
     @property
     def descriptors(self) -> np.ndarray:
         """The descriptors of all frames (N, views D), of unit length for cosine."""
-        return self._frames.rows[: len(self)].reshape(len(self), -1).copy()
+        return self._frames.rows().copy()
 
     def decided(self, loops: Sequence[LoopResult], threshold: float | None) -> None:
         """Take loops that were found with all frames in view, and a threshold for frames to come."""
@@ -230,29 +227,20 @@ class LoopDetector:
 
     def save(self, path: str | Path) -> None:
         """Write everything except ``describe`` to an .npz file, from which ``load`` continues."""
-        count = len(self)
-        frames = self._frames
-        arrays = {name: getattr(frames, name)[:count] for name in ("stamps", "poses")}
-        arrays["rows"] = frames.rows[:count].reshape(count, -1) if count else np.zeros((0, 0), np.float32)
         about = {
             "format": FORMAT,
             "settings": asdict(self.settings),
             "check": None if self.check is None else asdict(self.check),
             "runs": self._runs,
             "loops": [asdict(loop) for loop in self.loops],
+            "sessions": self._sessions,
         }
-        if self.check is not None:
-            arrays["sizes"] = np.array([local.size for local in frames.local], np.int64).reshape(-1, 2)
-            arrays["points_of_frame"] = np.array([len(local.points) for local in frames.local], np.int64)
-            arrays["points"] = np.concatenate([np.zeros((0, 2), np.float32), *(f.points for f in frames.local)])
-            arrays["descriptors"] = np.concatenate(
-                [np.zeros((0, 128), np.uint8), *(f.descriptors for f in frames.local)]
-            )
+        arrays = self._frames.arrays(self.check is not None)
         with whole_file(path) as unfinished, unfinished.open("wb") as stream:
             np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
     @classmethod
-    def load(cls, path: str | Path, describe: Describe | None = None) -> LoopDetector:
+    def load(cls, path: str | Path, describe: Describe | None = None, index: Index | str = "exact") -> LoopDetector:
         """Read what ``save`` wrote; ``describe`` must be the one that the detector was made with.
 
         Raises InputError for any other file.
@@ -265,10 +253,10 @@ class LoopDetector:
             check = None
             if about["check"] is not None:  # files from before a setting was added do not have it
                 check = from_json(GeometricCheck, {**asdict(GeometricCheck()), **about["check"]})
-            detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check)
-            detector._frames = _frames(arrays, detector.settings.views, check is not None)
-            rows = detector._frames.rows
-            detector._steps = [float(detector._score(rows[i : i + 1], rows[i + 1])[0]) for i in range(len(rows) - 1)]
+            detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check, index=index)
+            detector._frames.take(arrays, check is not None)
+            detector._sessions = _starts(about.get("sessions", [0]), len(detector))
+            detector._steps = detector._all_steps()
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
             detector.loops = [_loop(found, len(detector)) for found in about["loops"]]
         except SpecError as fault:
@@ -278,35 +266,35 @@ class LoopDetector:
             raise InputError(f"cannot be read ({reason}); expected {SAVED}", path) from None
         return detector
 
-    def _checked(self, descriptor: Sequence[float] | np.ndarray, stamp: float | None) -> np.ndarray:
+    def _row(self, descriptor: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the row that is kept, (views, D): of unit length for cosine."""
         row = np.asarray(descriptor, np.float32).reshape(-1)
         frames, views = self._frames, self.settings.views
-        if frames.count and len(row) != frames.rows[0].size:
-            raise InputError(
-                f"frame {frames.count} has a descriptor of {len(row)} dimensions, those before {frames.rows[0].size}"
-            )
+        before = self._last.size if frames.count else len(row)
+        if len(row) != before:
+            raise InputError(f"frame {frames.count} has a descriptor of {len(row)} dimensions, those before {before}")
         if len(row) % views:
             raise InputError(f"frame {frames.count} has a descriptor of {len(row)} dimensions, not of {views} views")
         row = row.reshape(views, -1)
         if not row.size or not np.all(np.isfinite(row)):
             raise InputError(f"the descriptor of frame {frames.count} is empty or not finite")
-        if self.settings.exclude_seconds and stamp is None:
-            raise InputError(
-                f"{self.settings.exclude_seconds:g} s are to be excluded, but frame {frames.count} has no stamp"
-            )
-        if stamp is not None and frames.count and stamp < frames.stamps[frames.count - 1]:
-            raise InputError(f"frame {frames.count} has stamp {stamp:.6f}, earlier than the one before it")
         if self.settings.metric == "cosine":
             lengths = np.linalg.norm(row, axis=1, keepdims=True)
             row = row / np.where(lengths > 0, lengths, 1)
         return row
 
-    def _score(self, rows: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Return the scores (k,) of frames (k, views, D) with one (views, D), computed directly."""
+    def _check_stamp(self, stamp: float | None) -> None:
+        frames, seconds = self._frames, self.settings.exclude_seconds
+        if seconds and stamp is None:
+            raise InputError(f"{seconds:g} s are to be excluded, but frame {frames.count} has no stamp")
+        if stamp is not None and frames.count > self._sessions[-1] and stamp < frames.stamps[frames.count - 1]:
+            raise InputError(f"frame {frames.count} has stamp {stamp:.6f}, earlier than the one before it")
+
+    def _score(self, other: np.ndarray, row: np.ndarray) -> np.floating[Any]:
+        """Return the score of two frames (views, D), computed directly."""
         if self.settings.metric == "cosine":
-            return (rows @ row.T).reshape(len(rows), -1).max(axis=1)
-        return -np.linalg.norm(rows[:, :, None] - row, axis=-1).reshape(len(rows), -1).min(axis=1)
+            return (other @ row.T).max()
+        return -np.linalg.norm(other[:, None] - row, axis=-1).min()
 
     def _threshold(self) -> float | None:
         """Return the least score of a loop now; None if there are too few frames to tell."""
@@ -316,40 +304,56 @@ class LoopDetector:
             return -np.inf
         return float(np.median(self._steps)) if len(self._steps) >= LEAST_STEPS else None
 
-    def _search(self, row: np.ndarray, stamp: float | None) -> list[tuple[int, float]]:
-        frames, settings = self._frames, self.settings
-        end = max(0, frames.count - settings.exclude_recent)
+    def _end(self, stamp: float | None) -> int:
+        """Return how many frames are candidates of the next one: all of earlier sessions, and this one's early ones."""
+        frames, settings, begin = self._frames, self.settings, self._sessions[-1]
+        end = max(begin, frames.count - settings.exclude_recent)
         if settings.exclude_seconds and stamp is not None:
-            end = min(end, int(np.searchsorted(frames.stamps[:end], stamp - settings.exclude_seconds, side="right")))
-        if end == 0:
-            return []
-        rows = frames.rows[:end].reshape(-1, row.shape[1])
-        if settings.metric == "euclidean":  # as the distances are ordered, so are their squares
-            scores = -squared_distances(rows, row, frames.squares[:end].reshape(-1, 1), np.square(row).sum(1))
-        else:
-            scores = rows @ row.T
-        scores = scores.reshape(end, -1).max(axis=1)
-        k = min(settings.top_k, end)
-        best = np.argpartition(scores, end - k)[end - k :]
-        # The product is fast but rounds small distances badly: the few that are reported are computed directly.
-        values = self._score(frames.rows[best], row) if settings.metric == "euclidean" else scores[best]
-        order = np.lexsort((best, -values))
-        return [(int(best[i]), float(values[i])) for i in order]
+            latest = stamp - settings.exclude_seconds
+            end = min(end, begin + int(np.searchsorted(frames.stamps[begin:end], latest, side="right")))
+        return end
+
+    def _candidates(self, row: np.ndarray, waiting: bool) -> list[tuple[int, float]]:
+        """Return the most similar frames, best first; ``waiting``: also of those that the index does not have yet."""
+        frames, views, k = self._frames, self.settings.views, self.settings.top_k
+        best: dict[int, float] = {}  # several views of a frame may be found, and by several of this one
+        for view in row if frames.settled else ():
+            for number, value in zip(*(found.tolist() for found in frames.index.search(view, k * views)), strict=True):
+                best[number // views] = max(value, best.get(number // views, value))
+        if waiting:
+            best |= {frames.settled + i: float(self._score(each, row)) for i, each in enumerate(frames.waiting)}
+        return sorted(best.items(), key=lambda pair: (-pair[1], pair[0]))[:k]
+
+    def _local(self, image: np.ndarray | None) -> LocalFeatures | None:
+        if self.check is None:
+            return None
+        if image is None:
+            raise InputError("a geometric check needs the images")
+        return self.check.describe(image)
+
+    def _all_steps(self) -> list[float]:
+        rows = list(self._frames.rows().reshape(len(self), self.settings.views, -1)) if len(self) else []
+        if rows:
+            self._last = rows[-1]
+        return [float(self._score(rows[i - 1], rows[i])) for i in range(len(rows)) if i not in self._sessions]
 
     def _decide(
-        self, candidates: list[tuple[int, float]], stamp: float | None, local: LocalFeatures | None
-    ) -> LoopResult:
-        """Threshold, then consistency, then geometry; remember what can lead to the next frame."""
+        self,
+        query: int,
+        candidates: list[tuple[int, float]],
+        stamp: float | None,
+        local: LocalFeatures | None,
+        before: Runs,
+    ) -> tuple[LoopResult, Runs]:
+        """Threshold, then consistency, then geometry; return the result, and what can lead to the next frame."""
         settings = self.settings
-        query = len(self)
-        before = self._runs
-        self._runs = []
+        runs: Runs = []
         score = candidates[0][1] if candidates else float("-inf")
 
         def result(
             verdict: str, accepted: int | None = None, value: float = score, inliers: int | None = None
-        ) -> LoopResult:
-            return LoopResult(query, candidates, accepted, verdict, value, inliers, stamp)
+        ) -> tuple[LoopResult, Runs]:
+            return LoopResult(query, candidates, accepted, verdict, value, inliers, stamp), runs
 
         if not candidates:
             return result("no candidate")
@@ -361,8 +365,8 @@ class LoopDetector:
             return result("below threshold")
         for number, _ in likely:
             led = [run for other, run in before if abs(other - number) <= settings.consistency_window]
-            self._runs.append((number, 1 + max(led, default=0)))
-        steady = [pair for pair, (_, run) in zip(likely, self._runs, strict=True) if run > settings.consistency]
+            runs.append((number, 1 + max(led, default=0)))
+        steady = [pair for pair, (_, run) in zip(likely, runs, strict=True) if run > settings.consistency]
         if not steady:
             return result("not consistent")
         if self.check is None:
@@ -389,30 +393,12 @@ def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | Non
     return values
 
 
-def _frames(arrays: dict[str, np.ndarray], views: int, checked: bool) -> _Frames:
-    """Return the frames of a saved detector. Raises ValueError where the arrays do not fit together."""
-    count = len(arrays["rows"])
-    check_array(arrays, "rows", "f", (count, arrays["rows"].size // count if count else 0))
-    check_array(arrays, "stamps", "f", (count,), finite=False)
-    check_array(arrays, "poses", "f", (count, 7), finite=False)
-    rows = arrays["rows"].reshape(count, views, -1) if count else np.zeros((0, 0, 0), np.float32)
-    frames = _Frames(count, rows, np.square(rows).sum(-1), arrays["stamps"], arrays["poses"])
-    if checked:
-        check_array(arrays, "points_of_frame", "i", (count,))
-        ends = np.cumsum(arrays["points_of_frame"])
-        points = int(ends[-1]) if count else 0
-        if min(arrays["points_of_frame"], default=0) < 0:
-            raise ValueError('"points_of_frame" has a negative number')
-        check_array(arrays, "points", "f", (points, 2))
-        check_array(arrays, "descriptors", "u", (points, 128))
-        sizes = arrays.get("sizes", np.tile(LocalFeatures.size, (count, 1)))  # files from before it do not have it
-        check_array({"sizes": sizes}, "sizes", "i", (count, 2))
-        pieces = zip(np.split(arrays["points"], ends), np.split(arrays["descriptors"], ends), strict=True)
-        frames.local = [
-            LocalFeatures(*parts, (int(width), int(height)))
-            for parts, (width, height) in zip(list(pieces)[:count], sizes, strict=True)
-        ]
-    return frames
+def _starts(found: Any, count: int) -> list[int]:
+    """Return where the sessions of ``count`` frames begin. Raises ValueError or TypeError for what is no such list."""
+    starts = [int(start) for start in found]
+    if starts[:1] != [0] or sorted(starts) != starts or starts[-1] > count:
+        raise ValueError(f"sessions that begin at {starts} of {count} frames")
+    return starts
 
 
 def _loop(found: Any, count: int) -> LoopResult:

@@ -167,7 +167,7 @@ def detector(path: Path, check: GeometricCheck | None = None) -> None:
 
 
 def go_on(path: Path) -> None:
-    made = LoopDetector.load(path, lambda image: image.ravel()[: made._frames.rows[0].size if len(made) else 8])
+    made = LoopDetector.load(path, lambda image: image.ravel()[: made.descriptors[0].size if len(made) else 8])
     made.add(np.zeros((40, 40, 3), np.uint8), 1e9, [0, 0, 0, 0, 0, 0, 1])
     made.save(path)
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from loopclosure.descriptors.similarity import similarity_matrix, top_k
-from loopclosure.detector.detector import FIRST_CAPACITY, DetectorSettings, LoopDetector
+from loopclosure.detector.detector import DetectorSettings, LoopDetector
+from loopclosure.detector.frames import FIRST_CAPACITY
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
@@ -153,8 +154,8 @@ def test_memory_grows_by_doubling():
     arrays = set()
     for row in np.random.default_rng(0).normal(size=(4 * FIRST_CAPACITY, 3)):
         detector.add_descriptor(row)
-        arrays.add(id(detector._frames.rows))
-    assert len(detector._frames.rows) == 4 * FIRST_CAPACITY
+        arrays.add(id(detector._frames.stamps))
+    assert len(detector._frames.stamps) == 4 * FIRST_CAPACITY
     assert len(arrays) <= 3
 
 

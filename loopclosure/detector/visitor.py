@@ -1,0 +1,49 @@
+"""Another session that asks where it is: its frames are looked up among those of a detector, which stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from loopclosure.detector.detector import LoopDetector, LoopResult, Runs
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.errors import InputError
+
+
+class Visitor:
+    """Looks up the frames of one session, in order; all frames of the detector are candidates.
+
+    Its results have numbers of their own for ``query_id``, from 0. Several visitors may ask one detector, in threads of
+    their own too, as long as nothing is added to it.
+    """
+
+    def __init__(self, detector: LoopDetector) -> None:
+        self.detector = detector
+        self._count = 0
+        self._runs: Runs = []
+
+    @property
+    def check(self) -> GeometricCheck | None:
+        """The detector's."""
+        return self.detector.check
+
+    def add(
+        self, image: np.ndarray, stamp: float | None = None, pose: Sequence[float] | np.ndarray | None = None
+    ) -> LoopResult:
+        """Look up this session's next frame, (H, W, 3) uint8 BGR; ``accepted`` is a frame of the detector."""
+        if self.detector.describe is None:
+            raise InputError("this detector has no describe function; give one, or use add_descriptor")
+        return self.add_descriptor(self.detector.describe(image), stamp, pose, image)
+
+    def add_descriptor(
+        self,
+        descriptor: Sequence[float] | np.ndarray,
+        stamp: float | None = None,
+        pose: Sequence[float] | np.ndarray | None = None,
+        image: np.ndarray | None = None,
+    ) -> LoopResult:
+        """Look up a frame whose descriptor (D,) is known already; ``pose`` is not used."""
+        result, self._runs = self.detector.looked_up(self._count, descriptor, stamp, image, self._runs)
+        self._count += 1
+        return result

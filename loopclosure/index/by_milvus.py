@@ -1,0 +1,72 @@
+"""Milvus: descriptors in a database, in a file (``MilvusClient("places.db")``) or of a cluster, for a fleet's maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, TypeVar
+
+import numpy as np
+
+from loopclosure.errors import InputError
+
+T = TypeVar("T")
+COLLECTION = "places"
+AT_ONCE = 1000  # rows of an insertion or of an answer
+
+
+class MilvusIndex:
+    """See :class:`loopclosure.index.index.Index`; it may hold descriptors of earlier sessions already."""
+
+    def __init__(self, uri: str, metric: str) -> None:
+        self._uri, self._metric = uri, metric
+        client = import_module("pymilvus").MilvusClient  # optional
+        self._client: Any = self._asked(lambda: client(uri))
+        self._count = 0
+        if self._asked(lambda: self._client.has_collection(COLLECTION)):
+            self._asked(lambda: self._client.load_collection(COLLECTION))
+            found = self._asked(lambda: self._query("", ["count(*)"]))
+            self._count = int(found[0]["count(*)"])
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(self, rows: np.ndarray) -> None:
+        """See :class:`~loopclosure.index.index.Index`."""
+        if not self._count and not self._asked(lambda: self._client.has_collection(COLLECTION)):
+            kind = "IP" if self._metric == "cosine" else "L2"
+            self._asked(lambda: self._client.create_collection(COLLECTION, rows.shape[1], metric_type=kind))
+        for start in range(0, len(rows), AT_ONCE):
+            first = self._count
+            data = [{"id": first + i, "vector": row.tolist()} for i, row in enumerate(rows[start : start + AT_ONCE])]
+            self._asked(lambda data=data: self._client.insert(COLLECTION, data))
+            self._count += len(data)
+
+    def search(self, row: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """See :class:`~loopclosure.index.index.Index`."""
+        k = min(k, self._count)
+        found = self._asked(
+            lambda: self._client.search(COLLECTION, [row.tolist()], limit=k, consistency_level="Strong")
+        )[0]
+        values = np.array([hit["distance"] for hit in found])
+        scores = values if self._metric == "cosine" else -np.sqrt(np.maximum(values, 0))
+        return np.array([hit["id"] for hit in found], np.int64), scores
+
+    def rows(self, start: int, stop: int) -> np.ndarray:
+        """See :class:`~loopclosure.index.index.Index`."""
+        parts = []
+        for first in range(start, stop, AT_ONCE):
+            asked = f"id >= {first} and id < {min(stop, first + AT_ONCE)}"
+            found = self._asked(lambda asked=asked: self._query(asked, ["id", "vector"]))
+            parts += [hit["vector"] for hit in sorted(found, key=lambda hit: hit["id"])]
+        return np.array(parts, np.float32)
+
+    def _query(self, which: str, fields: list[str]) -> Any:
+        return self._client.query(COLLECTION, filter=which, output_fields=fields, consistency_level="Strong")
+
+    def _asked(self, ask: Callable[[], T]) -> T:
+        try:
+            return ask()
+        except Exception as error:  # of pymilvus, of gRPC, of the file system
+            reason = " ".join(str(error).split())
+            raise InputError(f"Milvus: {reason:.200}", self._uri) from None

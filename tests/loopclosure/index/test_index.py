@@ -1,0 +1,105 @@
+"""Each index finds what comparing with everything finds."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.errors import InputError
+from loopclosure.index.index import open_index
+
+NEEDED = {"exact": "numpy", "faiss": "faiss", "places.db": "milvus_lite"}
+NAMES = [
+    pytest.param(name, marks=pytest.mark.skipif(find_spec(module) is None, reason=f"not installed: {module}"))
+    for name, module in NEEDED.items()
+]
+ROUNDED = {"exact": 1e-6, "faiss": 1e-3, "places.db": 1e-6}  # FAISS keeps half precision
+
+
+def directions(count: int, size: int = 32, seed: int = 0) -> np.ndarray:
+    rows = np.random.default_rng(seed).standard_normal((count, size), np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def each_index(metrics: tuple[str, ...]) -> list:
+    return [pytest.param((*one.values, metric), marks=one.marks) for one in NAMES for metric in metrics]
+
+
+@pytest.mark.parametrize("kind", each_index(("cosine", "euclidean")), ids=str)
+def test_the_most_similar_are_found(kind: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    name, metric = kind
+    rows, index = directions(700), open_index(name, metric)
+    assert len(index) == 0
+    for part in np.split(rows, [1, 256, 300, 699]):
+        index.add(part)
+    assert len(index) == 700
+    for query in directions(10, seed=1):
+        expected = rows @ query if metric == "cosine" else -np.linalg.norm(rows - query, axis=1)
+        best = np.argsort(-expected)[:6]
+        numbers, scores = index.search(query, 6)
+        assert numbers.tolist() == best.tolist()
+        np.testing.assert_allclose(scores, expected[best], atol=ROUNDED[name])
+    numbers, scores = index.search(rows[5], 1000)
+    assert sorted(numbers.tolist()) == list(range(700))
+    assert numbers[0] == 5
+    assert scores[0] == pytest.approx(1 if metric == "cosine" else 0, abs=3e-3)
+    np.testing.assert_allclose(index.rows(250, 310), rows[250:310], atol=ROUNDED[name])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_detector_finds_the_same_loops(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    lap = directions(60)
+    rows = np.concatenate([lap, lap + 0.01 * directions(60, seed=1)])
+    detector = LoopDetector(exclude_recent=10, threshold=-0.5, index=name)
+    assert [detector.add_descriptor(row).accepted for row in rows] == [None] * 60 + list(range(60))
+    np.testing.assert_allclose(detector.descriptors, rows, atol=ROUNDED[name])
+
+
+@pytest.mark.skipif(find_spec("faiss") is None, reason="not installed: faiss")
+@pytest.mark.parametrize("metric", ["cosine", "euclidean"])
+def test_signs_leave_out_no_match(metric: str) -> None:
+    """Of 20,000 rows that vary in 20 directions of 300, seen again with some noise, 1,000 are examined."""
+    rng = np.random.default_rng(0)
+    ways = rng.standard_normal((20, 300))
+    rows = (rng.standard_normal((20_000, 20)) @ ways).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    index = open_index("faiss", metric)
+    for part in np.split(rows, 20):
+        index.add(part)
+    numbers = rng.integers(0, len(rows), 100)
+    again = rows[numbers] + 0.1 * directions(100, 300)
+    found = np.array([index.search(row, 5)[0] for row in again])
+    exact = open_index("exact", metric)
+    exact.add(rows)
+    expected = np.array([exact.search(row, 5)[0] for row in again])
+    assert np.mean(found[:, 0] == expected[:, 0]) >= 0.99
+    assert np.mean([len({*a} & {*b}) / 5 for a, b in zip(found.tolist(), expected.tolist(), strict=True)]) >= 0.99
+
+
+@pytest.mark.skipif(find_spec("milvus_lite") is None, reason="not installed: milvus_lite")
+def test_a_database_stays(tmp_path: Path) -> None:
+    name = str(tmp_path / "places.db")
+    open_index(name, "cosine").add(directions(20))
+    again = open_index(name, "cosine")
+    assert len(again) == 20
+    assert again.search(directions(20)[7], 1)[0].tolist() == [7]
+
+
+@pytest.mark.skipif(find_spec("pymilvus") is None, reason="not installed: pymilvus")
+def test_a_server_that_is_not_there_is_one_line() -> None:
+    with pytest.raises(InputError, match=r"^http://127.0.0.1:9: Milvus: .*server unavailable"):
+        open_index("http://127.0.0.1:9", "cosine")
+
+
+def test_what_is_not_known_or_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r'no index "hnsw"; expected exact, faiss, or Milvus: FILE.db'):
+        open_index("hnsw", "cosine")
+    monkeypatch.setattr("loopclosure.index.index.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"faiss is not installed; pip install netspec-caffe\[faiss\]"):
+        open_index("faiss", "cosine")
+    with pytest.raises(InputError, match=r"pymilvus is not installed; pip install netspec-caffe\[milvus\]"):
+        open_index("places.db", "cosine")
