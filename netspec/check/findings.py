@@ -76,6 +76,20 @@ def findings(looks_at: str, *subject: object) -> list[Finding]:
     ]
 
 
+def said_once(found: Iterable[Finding]) -> list[str]:
+    """Return a line for each finding; of equal ones in other places of a file the first has the lines of all."""
+    places: dict[tuple[str, str, str], list[Finding]] = {}
+    for each in found:
+        alike = places.setdefault((each.where.file, each.rule, each.message), [])
+        if each not in alike:
+            alike.append(each)
+    lines = []
+    for first, *others in places.values():
+        also = ", ".join(str(each.where.line) for each in others)
+        lines.append(f"{first}{f' (also in {len(others)} more places, lines {also})' if others else ''}")
+    return lines
+
+
 def said_as_json(faults: Iterable[SpecError], found: Iterable[Finding]) -> dict[str, list[dict[str, Any]]]:
     """Return ``faults`` and ``warnings``, each a list of file, line, column, layer, type, message; and the rule.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 
 from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, stages
@@ -43,7 +44,7 @@ def add_to(commands: Commands) -> None:
 @no_collection()  # of the whole command: of the text and the table too
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.check.check import as_json, check_file
-    from netspec.check.findings import said_as_json
+    from netspec.check.findings import said_as_json, said_once
     from netspec.check.plan import plan_text
     from netspec.net.table import table
 
@@ -70,7 +71,7 @@ def _check(arguments: argparse.Namespace) -> int:
     elif checked[0].net is not None and not arguments.weights:
         refuse(arguments, ("strict",), "needs --weights")
     advice = {str(found): found for part in checked for found in part.advice}
-    for line in advice:
+    for line in said_once(advice.values()):
         print(f"warning: {line}", file=sys.stderr)
     faults = {str(fault): fault for part in checked for fault in part.faults}
     if faults:
@@ -83,8 +84,9 @@ def _check(arguments: argparse.Namespace) -> int:
         found = {label: as_json(net) for label, net in nets}
         print(json.dumps(next(iter(found.values())) if len(found) == 1 else found))
         return 0
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None  # a file gets all columns
     for label, net in nets:
-        print(f"{label}: {printable(net.name) or 'a net without a name'}\n{table(net.plan, list(net.layers))}")
+        print(f"{label}: {printable(net.name) or 'a net without a name'}\n{table(net.plan, list(net.layers), width)}")
         print(f"memory: at least {net.need}\n")
         if arguments.plan:
             print(plan_text(net) + "\n")

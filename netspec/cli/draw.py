@@ -8,6 +8,7 @@ from pathlib import Path
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import READ, Commands
+from netspec.errors import printable
 from netspec.proto.schema import PHASES, TEST, TRAIN
 from netspec.terminal.commands import WrongUsage, refuse
 
@@ -19,7 +20,7 @@ def add_to(commands: Commands) -> None:
     p = commands.add(
         "draw", _draw, "draw a net: layers, shapes, shared parameters, multiply-adds", quiet=True, net=READ
     )
-    p.add_argument("file", metavar="FILE", help="a net's prototxt, or a solver's, whose training net is drawn")
+    p.add_argument("file", metavar="FILE", help="a net, a .caffemodel, or a solver, whose training net is drawn")
     p.add_argument("--out", required=True, type=Path, metavar="F.svg|F.png|F.html", help="the file to write")
     p.add_argument("--phase", choices=tuple(PHASES), type=str.upper, help="only this phase (default: both in one)")
     add_state(p, phase=None)
@@ -36,7 +37,7 @@ def _draw(arguments: argparse.Namespace) -> None:
         refuse(arguments, ("unfold",), "is for .svg and .png; a page shows both")
     from netspec.draw.files import write_picture
 
-    faults = write_picture(
+    drawn = write_picture(
         arguments.file,
         arguments.out,
         phases=[PHASES[arguments.phase]] if arguments.phase else [TRAIN, TEST],
@@ -47,5 +48,7 @@ def _draw(arguments: argparse.Namespace) -> None:
         unfolded=arguments.unfold,
         allow_python=arguments.allow_python_layers,
     )
-    for fault in faults:
+    for fault in drawn.faults:
         print(f"warning: {fault}; shapes are missing from there on", file=sys.stderr)
+    layers = sum(1 + len(box.attached) for box in drawn.boxes)
+    print(f"{arguments.out}: {layers} layers of {printable(drawn.name) or 'a net without a name'}")

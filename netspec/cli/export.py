@@ -9,6 +9,7 @@ from typing import Any
 
 from netspec.cli.arguments import add_python, add_shapes, add_state, stages
 from netspec.cli.run import BUILT, Commands
+from netspec.files.limits import amount
 from netspec.proto.binary import split_paths
 from netspec.terminal import log
 from netspec.terminal.commands import refuse
@@ -22,6 +23,12 @@ EXPORT = """Write a net in another form, with its weights.
 --to safetensors  the weights alone: LAYER.INDEX, in Caffe's order
 
 Layers that read data become inputs; --shape says what they read, where the prototxt does not."""
+WRITTEN = {
+    "onnx": "an ONNX model",
+    "torch": "the source of a PyTorch module",
+    "pt2": "a torch.export archive",
+    "safetensors": "weights",
+}
 
 
 def add_to(commands: Commands) -> None:
@@ -103,10 +110,11 @@ def _export(arguments: argparse.Namespace) -> None:
     source = _source(arguments, not arguments.no_labels)
     for line in export_net(source, arguments.to, arguments.out, steps if steps.changes_images else None):
         print(f"note: {line}", file=sys.stderr)
+    print(f"{arguments.out}: {WRITTEN[arguments.to]}, {amount(arguments.out.stat().st_size)}")
 
 
 def _fold(arguments: argparse.Namespace) -> None:
     from netspec.export.convert import fold_files
 
     before, after = fold_files(_source(arguments, labels=False), arguments.out)
-    print(f"{arguments.out}.prototxt and {arguments.out}.caffemodel: {after} layers of {before}", file=sys.stderr)
+    print(f"{arguments.out}.prototxt and {arguments.out}.caffemodel: {after} layers of {before}")

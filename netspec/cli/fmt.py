@@ -36,7 +36,9 @@ def _fmt(arguments: argparse.Namespace) -> int:
             status = max(status, _differs(path, text, formatted))
         elif path == STDIN:
             print(formatted, end="")
-        elif formatted != text:
+        elif formatted == text:
+            print(f"{path}: was in this form already")
+        else:
             _write(path, formatted)
     return status
 
@@ -56,4 +58,4 @@ def _write(path: str, text: str) -> None:
 
     with whole_file(path) as unfinished:
         unfinished.write_bytes(text.encode(errors="surrogateescape"))
-    print(path)
+    print(f"{path}: formatted")

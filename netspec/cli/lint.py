@@ -32,7 +32,7 @@ def _lint(arguments: argparse.Namespace) -> int:
         refuse(
             arguments, ("json", "level", "stage", "shape", "data", "allow_python_layers"), "is for files, not --rules"
         )
-    from netspec.check.findings import RULES, said_as_json
+    from netspec.check.findings import RULES, said_as_json, said_once
     from netspec.check.lint import lint_file
 
     for rule in sorted(RULES.values(), key=lambda rule: rule.name) if arguments.rules else ():
@@ -47,7 +47,7 @@ def _lint(arguments: argparse.Namespace) -> int:
             print(f"warning: {fault}; rules that need shapes are not applied", file=sys.stderr)
         if arguments.json:
             print(json.dumps({"file": path, **said_as_json(linted.faults, linted.found)}))
-        for line in [*linted.faults, *linted.found] if not arguments.json else ():
+        for line in [*linted.faults, *said_once(linted.found)] if not arguments.json else ():
             print(line, file=sys.stdout if linted.readable else sys.stderr)
         found = SOMETHING if linted.faults or linted.found else DONE
         status = max(status, found if linted.readable else UNREADABLE)

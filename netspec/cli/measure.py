@@ -19,6 +19,7 @@ from netspec.cli.arguments import (
     run_by,
 )
 from netspec.cli.run import BUILT, Commands
+from netspec.proto.binary import check_readable, split_paths
 from netspec.runs.scores import Score, Scores
 
 
@@ -51,6 +52,7 @@ def add_to(commands: Commands) -> None:
 def _test(arguments: argparse.Namespace) -> None:
     from netspec.check.measure import test_net
 
+    check_readable(split_paths(arguments.weights))
     net = load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
     load_weights(net, arguments.weights, arguments.strict)
     net = run_by(net, arguments, arguments.weights)

@@ -73,12 +73,20 @@ def _install(arguments: argparse.Namespace) -> None:
 
     if arguments.build:
         refuse(arguments, ("replace",), "is for this Python environment, not for --build")
-    for path in make_build_folder(arguments.build) if arguments.build else install_caffe(arguments.replace):
-        print(path)
+    written = make_build_folder(arguments.build) if arguments.build else install_caffe(arguments.replace)
+    for path in written:
+        print(f"{path}: written")
+    if arguments.build:
+        print(f"scripts find Caffe's commands in {arguments.build}; netspec remove-caffe --build undoes this")
+    else:
+        print("import caffe and Caffe's commands are netspec's now; netspec remove-caffe undoes this")
 
 
 def _remove(arguments: argparse.Namespace) -> None:
     from netspec.scripts.environment import remove_build_folder, remove_caffe
 
-    for path in remove_build_folder(arguments.build) if arguments.build else remove_caffe():
-        print(path)
+    removed = remove_build_folder(arguments.build) if arguments.build else remove_caffe()
+    for path in removed:
+        print(f"{path}: removed")
+    if not removed:
+        print(f"nothing to remove: install-caffe wrote nothing into {arguments.build or 'this Python environment'}")

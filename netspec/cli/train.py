@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 NAN = ("stop", "warn")
 EFFECTS = ("stop", "snapshot", "none")
+BAR = "{n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left{postfix}"
 
 
 def add_to(commands: Commands) -> None:
@@ -93,7 +94,11 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
     """Train, and return the exit status."""
     from tqdm import tqdm
 
+    from netspec.solver.board import writer_class
     from netspec.solver.processes import Lost
+
+    if arguments.tensorboard and processes.is_root:
+        writer_class()  # a missing package is told before the log of the nets
 
     effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: "stop"}
     if hasattr(signal, "SIGHUP"):  # Windows has none
@@ -103,7 +108,7 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
         log.info("caffe.cpp:239", "Starting Optimization")
         total, first = solver.param.max_iter, solver.iteration
         hidden = not sys.stderr.isatty() or not processes.is_root
-        bar = tqdm(total=total, initial=first, unit="it", disable=hidden, leave=False)
+        bar = tqdm(total=total, initial=first, bar_format=BAR, disable=hidden, leave=False)
         with _sole_writer(solver) if processes.is_root else nullcontext(), bar:
             solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
             board = _board(solver, arguments.tensorboard) if processes.is_root else nullcontext()

@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from netspec.data.blobs import Shape
-from netspec.draw.diagram import diagram_of
+from netspec.draw.diagram import Diagram, diagram_of
 from netspec.draw.html import html_of
 from netspec.draw.picture import picture_of
 from netspec.draw.svg import svg_of
 from netspec.errors import SpecError
 from netspec.files.whole_file import whole_file
+from netspec.net.recovered import recover_net
+from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, parse_solver
@@ -28,13 +30,13 @@ def write_picture(
     open_data: bool = False,
     unfolded: bool = False,
     allow_python: bool = False,
-) -> tuple[SpecError, ...]:
+) -> Diagram:
     """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
 
-    Returns the faults that keep parts of the net from being built: the picture has no shapes there. Raises SpecError
-    for a file that cannot be read.
+    Of a .caffemodel the net inside it is drawn. Returns what was drawn; its faults keep parts of the net from being
+    built: the picture has no shapes there. Raises SpecError for a file that cannot be read.
     """
-    diagram = diagram_of(*_net_of(path), phases, level, stages, shapes, open_data, allow_python)
+    diagram = diagram_of(*_net_of(path, shapes or {}), phases, level, stages, shapes, open_data, allow_python)
     picture = picture_of(diagram)
     if out.suffix == ".png":
         from netspec.draw.png import png_of
@@ -46,10 +48,12 @@ def write_picture(
         content = svg_of(picture, unfolded).encode()
     with whole_file(out) as unfinished:
         unfinished.write_bytes(content)
-    return diagram.faults
+    return diagram
 
 
-def _net_of(path: str | Path) -> tuple[NetParameter, SourceMap]:
+def _net_of(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParameter, SourceMap]:
+    if is_net_binary(path):
+        return recover_net(path, shapes)
     try:
         return parse_net(path)
     except SpecError:

@@ -112,7 +112,8 @@ def find_shapes(net: Net) -> NetShapes:
         if fault is None:
             free.append(FreeSize(name, size, axes, tried))
         else:
-            fixed.append(_line(name, size, str(fault)))
+            culprit = fault.where and fault.where.layer
+            fixed.append(_line(name, size, f"{fault.where} takes no other" if culprit else str(fault)))
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
         if layer.counted_axis is not None:
             axes = tuple((v, layer.counted_axis) for v in node.tops)

@@ -50,6 +50,11 @@ def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
     return split, source.with_layers(places)
 
 
+def is_split(name: str, kind: str) -> bool:
+    """Say whether a layer of this name and type is one of those that :func:`insert_splits` inserts."""
+    return kind == "Split" and name.endswith("_split")
+
+
 def _names(blobs: Mapping[str, object]) -> str:
     """Return the names of the blobs so far, in a large net those of the last."""
     more = f"{len(blobs) - MOST_NAMES} more, " if len(blobs) > MOST_NAMES else ""

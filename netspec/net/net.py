@@ -269,9 +269,16 @@ class Net(torch.nn.Module):
     # Running
 
     @override
-    def forward(self, **inputs: Array) -> dict[str, torch.Tensor]:
-        """Run the net and return its output blobs; ``inputs`` are the values of the blobs in ``self.inputs``."""
-        return self.forward_loss(**inputs)[1]
+    def forward(self, *values: Array, **inputs: Array) -> dict[str, torch.Tensor]:
+        """Run the net and return its output blobs; ``inputs`` are the values of the blobs in ``self.inputs``.
+
+        The value of a net's only input needs no name: ``net(images)``.
+        """
+        if values and (len(values) > 1 or len(self.inputs) != 1 or inputs):
+            known = ", ".join(f"{name}=..." for name in self.inputs) or "none (it reads its own data)"
+            found = f"{len(values)} values" if len(values) > 1 else "a value"
+            raise SpecError(f"found {found} without a name; give inputs by name: {known}", Where(self.plan.source.file))
+        return self.forward_loss(**dict(zip(self.inputs, values, strict=False)), **inputs)[1]
 
     def forward_loss(self, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -83,6 +83,15 @@ def parse_net_binary(path: str | Path, upgrade: bool = True) -> tuple[NetParamet
 def split_paths(paths: str | Path) -> list[str]:
     """Return the files of weights that commas separate, as in Caffe's ``--weights``."""
     return [path.strip() for path in str(paths).split(",")]
+
+
+def check_readable(paths: Iterable[str]) -> None:
+    """Raise SpecError for the first path that cannot be opened: sooner than the net is built that would read it."""
+    for path in paths:
+        try:
+            open(path, "rb").close()
+        except OSError as fault:
+            raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(path)) from None
 
 
 def is_net_binary(path: str | Path) -> bool:

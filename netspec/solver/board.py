@@ -6,9 +6,19 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from netspec.errors import SpecError, Where
 from netspec.solver.solver import Solver
+
+
+def writer_class() -> Any:
+    """Return torch's writer for TensorBoard. Raises SpecError where the package is missing."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise SpecError("--tensorboard needs an extra package: pip install 'netspec-caffe[tensorboard]'") from None
+    return SummaryWriter
 
 
 @contextmanager
@@ -19,12 +29,8 @@ def board(solver: Solver, folder: str | Path) -> Iterator[None]:
     SpecError if the package is missing, or the folder cannot be written.
     """
     try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise SpecError("--tensorboard needs an extra package: pip install 'netspec-caffe[tensorboard]'") from None
-    try:
         os.makedirs(folder, exist_ok=True)
-        writer = SummaryWriter(str(folder), purge_step=solver.iteration or None)
+        writer = writer_class()(str(folder), purge_step=solver.iteration or None)
     except OSError as fault:
         raise SpecError(f"cannot be written: {fault.strerror}", Where(str(folder))) from None
     start, after, tested = solver.on_start, solver.on_iteration, solver.on_test

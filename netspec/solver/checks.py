@@ -58,6 +58,7 @@ def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_i
         except SpecError as fault:
             reason = fault.message.removeprefix("cannot be written: ")
     if reason:
-        advice = "make sure that the directory exists and is writeable"
+        begins = "" if probe.is_absolute() else f"; relative paths begin at {Path.cwd()}"
+        advice = f"make sure that the directory exists and is writeable{begins}"
         message = f'cannot write to snapshot prefix "{param.snapshot_prefix}": {reason}; {advice}'
         report(SpecError(message, node.find("snapshot_prefix")))

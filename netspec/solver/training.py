@@ -19,7 +19,7 @@ from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
 from netspec.process import waiting
-from netspec.proto.binary import split_paths
+from netspec.proto.binary import check_readable, split_paths
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import write_text
@@ -102,6 +102,7 @@ class Training:
         options = self.options
         if param.snapshot and options.processes.is_root:
             check_prefix(param, self.node)
+        check_readable(self._weights())
         self.device = options.device or choose_device(param, self.node)
         if options.compiled and (lack := missing_tool(self.device)):
             raise SpecError(f"--compile: {lack}", self.node.where)
@@ -175,12 +176,16 @@ class Training:
             compiled=self.options.compiled,
         )
         net = build_net(described.net, described.source, options)
-        files = [path for paths in self.param.weights for path in split_paths(paths)]
+        files = self._weights()
         for path in files:
             log.info("solver.cpp:72", f"Finetuning from {path}")
         if files:
             load_weights(net, files, self.options.strict)
         return net
+
+    def _weights(self) -> list[str]:
+        """Return the paths of the weights to start from."""
+        return [path for paths in self.param.weights for path in split_paths(paths)]
 
     def _check_size(self) -> None:
         """Raise SpecError now, not after days, where a snapshot could not be written."""

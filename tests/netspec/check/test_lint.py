@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from netspec.check.check import check_file
+from netspec.cli import main
 from netspec.proto.schema import TRAIN, PhaseValue
 from paths import GOLDEN
 
@@ -194,3 +195,17 @@ def test_a_test_that_reads_far_more_or_less_than_there_is(
     expected = [f'solver.prototxt:4:1: {read}, but layer "d" has 200 records; set test_iter: 20'] if far else []
     assert advice(in_phases(siamese(source=source)), solver, open_data=True) == expected
     assert advice(in_phases(siamese(source=source)), solver) == []
+
+
+def test_equal_findings_are_one_line(advice: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:
+    text = 'layer { name: "x" type: "Input" top: "t0" input_param { shape { dim: 1 dim: 4 } } }\n' + "".join(
+        f'layer {{ name: "ip{k}" type: "InnerProduct" bottom: "t{k}" top: "t{k + 1}" '
+        "inner_product_param { num_output: 4 } }\n"
+        for k in range(16)
+    )
+    text += 'layer { name: "loss" type: "EuclideanLoss" bottom: "t16" bottom: "t0" top: "loss" }'
+    Path("many.prototxt").write_text(text)
+    for words, stream in ((["check", "--phase", "TRAIN"], "err"), (["lint"], "out")):
+        main([*words, "many.prototxt"])
+        (line,) = [line for line in getattr(capsys.readouterr(), stream).splitlines() if "zero-weights" in line]
+        assert "(also in 15 more places, lines 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17)" in line

@@ -85,6 +85,13 @@ def test_train_takes_its_arguments_in_each_spelling(run: Run, edited: Edit, word
     assert Path("sgd_step/ref_iter_1.caffemodel").is_file()
 
 
+@pytest.mark.parametrize("words", [["train", SOLVER], ["test", "--model", NET]], ids=["train", "test"])
+def test_missing_weights_are_told_before_a_net_is_built(run: Run, words: list[str]) -> None:
+    result = run(*words, "--weights", "nope.caffemodel")
+    assert result.fault == "nope.caffemodel: cannot be read: No such file or directory"
+    assert "layer_factory" not in result.err
+
+
 @pytest.mark.slow
 def test_the_door_tools_train(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 2")

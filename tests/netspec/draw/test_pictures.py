@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+import netspec
 from drawn_coordinates import SCREEN, faults, texts_of
 from each import each, last_parts
 from netspec.cli import main
@@ -166,7 +167,9 @@ def test_files_of_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     net.write_text('name: "a <b> & \\"c\\""\n' + residual(3).replace('"a0"', '"</script>"'))
     for suffix in ("svg", "html", "png"):
         assert main(["draw", str(net), "--out", str(tmp_path / f"net.{suffix}")]) == 0
-    assert capsys.readouterr().err == ""
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert said.out.splitlines()[-1] == f'{tmp_path / "net.png"}: 14 layers of a <b> & "c"'
     svg = ElementTree.parse(tmp_path / "net.svg").getroot()
     picture = cv2.imread(str(tmp_path / "net.png"))
     assert picture is not None
@@ -185,6 +188,16 @@ def test_a_solver_is_drawn_by_its_training_net(tmp_path: Path, monkeypatch: pyte
     Path("solver.prototxt").write_text('net: "net.prototxt" base_lr: 1 lr_policy: "fixed"')
     assert main(["draw", "solver.prototxt", "--out", "net.svg"]) == 0
     assert "trained" in Path("net.svg").read_text()
+
+
+def test_the_net_in_a_file_of_weights_is_drawn(tmp_path: Path) -> None:
+    net = tmp_path / "net.prototxt"
+    net.write_text('name: "kept"\n' + INPUT + conv("conv", "data"))
+    netspec.save_weights(netspec.load_net(net), tmp_path / "net.caffemodel")
+    assert main(["draw", str(tmp_path / "net.caffemodel"), "--out", str(tmp_path / "net.svg")]) == 0
+    picture = (tmp_path / "net.svg").read_text()
+    assert "kept" in picture
+    assert "conv" in picture
 
 
 def test_names_of_strangers_write_no_markup() -> None:

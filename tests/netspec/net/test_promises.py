@@ -99,3 +99,19 @@ def test_a_class_that_computes_nothing_is_refused(made: Callable[..., Net]) -> N
     for gradients in (False, True):
         with torch.set_grad_enabled(gradients), pytest.raises(SpecError, match="Idle does not define forward"):
             net(data=torch.ones(2, 3))
+
+
+TWO = """
+layer { name: "in" type: "Input" top: "a" top: "b" input_param { shape { dim: 2 dim: 3 } } }
+layer { name: "sum" type: "Eltwise" bottom: "a" bottom: "b" top: "sum" }
+"""
+
+
+def test_the_value_of_the_only_input_needs_no_name(net_of: Callable[..., Net]) -> None:
+    net = net_of(TEXT.replace("Odd", "ReLU"))
+    values = torch.randn(2, 3)
+    assert torch.equal(net(values)["odd"], net(data=values)["odd"])
+    with pytest.raises(SpecError, match=r"^net.prototxt: found 2 values without a name; give inputs by name: data=..."):
+        net(values, values)
+    with pytest.raises(SpecError, match=r"found a value without a name; give inputs by name: a=..., b=..."):
+        net_of(TWO)(values)

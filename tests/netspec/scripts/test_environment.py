@@ -49,7 +49,8 @@ def test_it_is_put_in_and_taken_away(environment: Path) -> None:
     before = files(environment)
     run(environment, "python", "-c", IMPORT, rc=1)
     said = run(environment, "python", "-m", "netspec", "install-caffe").stdout.splitlines()
-    assert {Path(line) for line in said} == files(environment) - before
+    assert {Path(line.removesuffix(": written")) for line in said[:-1]} == files(environment) - before
+    assert said[-1] == "import caffe and Caffe's commands are netspec's now; netspec remove-caffe undoes this"
     assert run(environment, "python", "-c", IMPORT).stdout == "netspec.pycaffe 1\n"
     for name in COMMANDS:
         assert "usage" in run(environment, name, "--help").stdout
@@ -58,8 +59,11 @@ def test_it_is_put_in_and_taken_away(environment: Path) -> None:
     ran = run(environment, "python", "-m", "netspec", "run", "s.py")
     assert (ran.stdout, "installed" in ran.stderr) == ("netspec.pycaffe 1\n", False)  # it is no other Caffe
     (environment / "s.py").unlink()
-    run(environment, "python", "-m", "netspec", "remove-caffe")
+    removed = run(environment, "python", "-m", "netspec", "remove-caffe").stdout.splitlines()
+    assert removed == [line.replace(": written", ": removed") for line in said[:-1]]
     assert files(environment) == before
+    again = run(environment, "python", "-m", "netspec", "remove-caffe").stdout
+    assert again == "nothing to remove: install-caffe wrote nothing into this Python environment\n"
     run(environment, "python", "-c", IMPORT, rc=1)
 
 
@@ -149,7 +153,7 @@ def test_shell_scripts_find_the_commands_where_caffe_is_built(environment: Path)
     (environment / "create.sh").chmod(0o755)
     before = files(environment)
     said = run(environment, "python", "-m", "netspec", "install-caffe", "--build", "build").stdout.splitlines()
-    assert {environment / line for line in said} == files(environment) - before
+    assert {environment / line.removesuffix(": written") for line in said[:-1]} == files(environment) - before
     run(environment, "python", "-c", IMPORT, rc=1)  # the environment stays as it was
     done = run(environment, "../create.sh")
     assert "Loss: " in done.stderr

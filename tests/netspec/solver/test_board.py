@@ -55,5 +55,6 @@ def test_faults(run: Run, solver: Callable[[int], str], monkeypatch: pytest.Monk
     Path("file").write_text("")
     assert run("train", solver(1), "--tensorboard", "file").fault == "file: cannot be written: File exists"
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    fault = run("train", solver(1), "--tensorboard", "board").fault
-    assert fault == "--tensorboard needs an extra package: pip install 'netspec-caffe[tensorboard]'"
+    result = run("train", solver(1), "--tensorboard", "board")
+    assert result.fault == "--tensorboard needs an extra package: pip install 'netspec-caffe[tensorboard]'"
+    assert result.err.count("\n") == 1, "it is told before the net's log"
