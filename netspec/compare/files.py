@@ -6,14 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
-
 from netspec.compare.difference import Difference, Differences
 from netspec.compare.messages import differences
 from netspec.compare.nets import compare_in_state, compare_nets
-from netspec.compare.weights import compare_weights
 from netspec.errors import SpecError, Where
-from netspec.proto.binary import is_net_binary
+from netspec.proto.binary import is_hdf5, is_net_binary
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import SolverNet, solver_nets
@@ -31,6 +28,8 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
     if old[0] != new[0]:
         raise SpecError(f"is {new[0]}, and {first} is {old[0]}; expected two files of one kind", Where(str(second)))
     if old[0] == WEIGHTS:
+        from netspec.compare.weights import compare_weights  # NumPy is not loaded for two prototxts
+
         return compare_weights(first, second, tolerance)
     return compare_nets(old[1:], new[1:]) if old[0] == NET else _compare_solvers(old[1:], new[1:])
 
@@ -38,7 +37,7 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
 def _read(path: str | Path) -> tuple[Any, ...]:
     """Return the kind of a file; of a net and a solver also the message and its places."""
     named = Path(path).suffix in (".caffemodel", ".h5")  # a damaged one too: its own reader says what is wrong
-    if Path(path).is_file() and (named or is_net_binary(path) or h5py.is_hdf5(path)):
+    if Path(path).is_file() and (named or is_net_binary(path) or is_hdf5(path)):
         return (WEIGHTS,)
     try:
         return (NET, *parse_net(path))

@@ -94,6 +94,9 @@ def check_readable(paths: Iterable[str]) -> None:
             raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(path)) from None
 
 
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
 def is_net_binary(path: str | Path) -> bool:
     """Say whether a file is a .caffemodel, by what it holds: the layers of a net in protobuf's binary form."""
     try:
@@ -106,9 +109,15 @@ def is_net_binary(path: str | Path) -> bool:
     return bool(net.layer or net.layers)
 
 
+def is_hdf5(path: str | Path) -> bool:
+    """Say whether a file begins as HDF5's do, without loading the library."""
+    with open(path, "rb") as file:
+        return file.read(len(_HDF5)) == _HDF5
+
+
 def _guess(data: bytes) -> str:
     """Return a guess at what a file is."""
-    if data.startswith(b"\x89HDF\r\n\x1a\n"):
+    if data.startswith(_HDF5):
         return "an HDF5 file; its name should end in .h5"
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:1000]):
         return "text"

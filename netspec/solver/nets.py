@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from netspec.data.random_words import derived
 from netspec.errors import Report, SpecError, raise_fault
 from netspec.graph.filter import in_state
 from netspec.proto.schema import TEST, TRAIN, NetParameter, NetState, SolverParameter
@@ -33,6 +32,8 @@ class SolverNet:
 
 def seed_of(seed: int, label: str) -> int:
     """Return the seed of one of a solver's nets: all differ, and the training net has the solver's own."""
+    from netspec.data.random_words import derived  # NumPy is not loaded to read a solver
+
     return seed if label == TRAIN_NET else derived(seed, label)
 
 

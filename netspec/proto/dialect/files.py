@@ -11,7 +11,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -35,6 +34,8 @@ class DialectFile:
 @cache
 def known_files() -> dict[str, DialectFile]:
     """Return the dialects found by name: those in FOLDERS, and those of installed packages' entry points."""
+    from importlib.metadata import entry_points  # it takes longer to import than a command takes to start
+
     found = {}
     for point in entry_points(group=GROUP):
         module = point.value.partition(":")[0].strip()
