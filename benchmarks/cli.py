@@ -33,9 +33,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
     p.add_argument("--twin", help="the net of the catalogue whose PyTorch twin the prototxt has")
     _add_common(p, FORWARD, (*ENGINES, "pytorch", "opencv4"))
+    p.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
     p = commands.add("train", _train, "time training iterations: forward, backward, update")
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
     _add_common(p, TRAINING, ("netspec", "pytorch"))
+    p.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
     p.add_argument("--device", default="cpu", help="torch's name of it, for netspec and pytorch (default: cpu)")
     p = commands.add("small", _small, "time small nets and batches: training iterations, then forward passes")
     p.add_argument("nets", nargs="*", metavar="NET", default=SMALL, help=f"default: {' '.join(SMALL)}")
@@ -129,9 +131,9 @@ def _small(arguments: argparse.Namespace) -> None:
     from benchmarks.case import forward_case, training_case
 
     print("training")
-    _compare(arguments, training_case, "_training")
+    trained = _compare(arguments, training_case, "_training")
     print("\nforward")
-    _compare(arguments, partial(forward_case, onnx=False), "")
+    _compare(arguments, partial(forward_case, onnx=False), "", before=trained)
 
 
 def _waiting(arguments: argparse.Namespace) -> None:
@@ -173,8 +175,12 @@ def _start(arguments: argparse.Namespace) -> None:
 
 
 def _compare(
-    arguments: argparse.Namespace, case_of: Callable[[str, int], Any], suffix: str, device: str = "cpu"
-) -> None:
+    arguments: argparse.Namespace,
+    case_of: Callable[[str, int], Any],
+    suffix: str,
+    device: str = "cpu",
+    before: Sequence[Row] = (),
+) -> list[Row]:
     from benchmarks.compare import rows_of
 
     def rows(yardsticks: str | None) -> Iterator[list[Row]]:
@@ -186,16 +192,21 @@ def _compare(
                         rounds, limit = arguments.rounds, arguments.seconds
                         yield rows_of(case, threads, ways, suffix, yardsticks, caffe, rounds, limit, device)
 
-    _report(arguments, rows)
+    return _report(arguments, rows, before)
 
 
-def _report(arguments: argparse.Namespace, rows_of: Callable[[str | None], Iterator[list[Row]]]) -> None:
-    """Print a table for each list of rows, and what could not run; write all that there is so far."""
+def _report(
+    arguments: argparse.Namespace, rows_of: Callable[[str | None], Iterator[list[Row]]], before: Sequence[Row] = ()
+) -> list[Row]:
+    """Print a table for each list of rows, and what could not run; write all that there is so far, and return it.
+
+    ``before`` was measured before, for the same files.
+    """
     from benchmarks import environment, report
     from benchmarks.compare import YARDSTICKS
 
     yardsticks = environment.python() if set(arguments.ways) & set(YARDSTICKS) else None
-    described, rows = report.machine(yardsticks), []
+    described, rows = report.machine(yardsticks), list(before)
     for found in rows_of(yardsticks):
         rows += found
         print(report.table(found), flush=True)
@@ -204,3 +215,6 @@ def _report(arguments: argparse.Namespace, rows_of: Callable[[str | None], Itera
                 print(f"{row.name}: {row.fault}", file=sys.stderr)
         if arguments.json:
             report.write_json(arguments.json, rows, described)
+    if getattr(arguments, "plot", None):
+        report.draw(arguments.plot, rows)
+    return rows

@@ -71,6 +71,37 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def draw(path: str | Path, rows: Sequence[Row], way: str = "netspec") -> None:
+    """Draw the CPU time of one way of running, divided by that of each reference: a row for each net and batch.
+
+    The picture is a PNG or an SVG, as its name ends. Rows of which no ratio is known are left out.
+    """
+    from matplotlib.figure import Figure
+
+    from netspec.pictures.style import COLORS, GRID, PALE, write_figure
+
+    shown = [row for row in rows if row.name == way and row.spent]
+    figure = Figure(figsize=(7.2, 1.0 + 0.21 * max(1, len(shown))), layout="constrained")
+    axis = figure.add_subplot()
+    for name, color, mark in zip(REFERENCES, COLORS, "oD^", strict=False):
+        found = [(row.spent[name], k) for k, row in enumerate(shown) if name in row.spent]
+        if found:
+            axis.plot(*zip(*found, strict=True), mark, color=color, label=f"CPU time / {name}'s", clip_on=False)
+    axis.axvline(1, color=PALE, linewidth=1)
+    several = len({row.threads for row in shown}) > 1
+    labels = [f"{row.net}, batch {row.batch}{f', {row.threads} threads' if several else ''}" for row in shown]
+    axis.set_yticks(range(len(shown)), labels, fontsize=8)
+    axis.set(xscale="log", ylim=(len(shown) - 0.5, -0.5))
+    ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if axis.get_xlim()[0] <= tick <= axis.get_xlim()[1]]
+    axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axis.minorticks_off()
+    axis.grid(axis="y", color=GRID)
+    axis.set_axisbelow(True)
+    axis.set_title(f"{way}: left of 1 is faster", fontsize=9, loc="left")
+    figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=3)
+    write_figure(figure, path)
+
+
 def machine(python: str | None = None) -> dict[str, Any]:
     """Describe the machine; ``python`` is that of the yardsticks, whose versions are added."""
     cpu = _cpu()

@@ -87,7 +87,9 @@ def test_a_table_has_the_ratios_of_what_ran_and_a_line_for_what_did_not() -> Non
 def test_forward_passes_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "lenet.json"
     ways = ["--with", "netspec", "pytorch", "pycaffe"]
-    assert main(["forward", "lenet", *ways, "--rounds", "2", "--json", str(out)]) == 0
+    plot = tmp_path / "lenet.svg"
+    assert main(["forward", "lenet", *ways, "--rounds", "2", "--json", str(out), "--plot", str(plot)]) == 0
+    assert "lenet, batch 1" in plot.read_text()
     assert "| lenet | 1 | 1 | pytorch |" in capsys.readouterr().out
     told = json.loads(out.read_text())
     assert [row["name"] for row in told["rows"]] == ["netspec", "pytorch", "pycaffe"]
