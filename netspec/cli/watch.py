@@ -109,8 +109,8 @@ def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] 
 
 
 def _lines(follower: Follower) -> list[str]:
-    from netspec.watch.process import is_alive, memory_of
-    from netspec.watch.screen import screen
+    from netspec.runs.process import is_alive, memory_of
+    from netspec.runs.screen import screen
 
     run, now = follower.run, time.time()
     alive = is_alive(run.process) if run.process is not None else None

@@ -1,1 +1,1 @@
-"""Trainings, as their logs tell them: curves of loss, outputs, rate and speed. Caffe's logs and netspec's alike."""
+"""Trainings, as their logs tell them (Caffe's logs too): loss, outputs, rate and speed; the screen of watch."""

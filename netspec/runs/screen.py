@@ -8,11 +8,11 @@ import numpy as np
 
 from netspec.errors import printable
 from netspec.files.limits import amount
+from netspec.runs.canvas import bar, plot_lines
 from netspec.runs.curve import Curve, smoothed
 from netspec.runs.run import FAILED, RUNNING, Run
 from netspec.runs.summary import iterations_per_second
 from netspec.terminal.log import number
-from netspec.watch.canvas import bar, plot_lines
 
 LOST = "not running"
 _RECENT = 10  # displays by which the speed is told

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from netspec.runs.canvas import bar, plot_lines
 from netspec.runs.curve import Curve
+from netspec.runs.process import is_alive, memory_of
 from netspec.runs.run import Run, read_log
-from netspec.watch.canvas import bar, plot_lines
-from netspec.watch.process import is_alive, memory_of
-from netspec.watch.screen import duration, screen, seconds_left
+from netspec.runs.screen import duration, screen, seconds_left
 from paths import GOLDEN
 
 CAFFES = GOLDEN / "log" / "caffe_train.log"

@@ -1,1 +1,0 @@
-"""A training in the terminal, drawn again as its log grows."""
