@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.case import CATALOGUE, record, training_net
 from netspec.errors import SpecError
+from netspec.layers.reading import waited
 
 FILE_SIZE = (480, 640)  # height, width of the files that ImageData reads
 SECONDS = 5.0
@@ -59,7 +60,7 @@ def _run(solver: Any) -> tuple[float, float]:
 
 
 def _waited(solver: Any) -> float:
-    return sum(layer.waited for layer in solver.net.layers)
+    return waited(solver.net.layers)
 
 
 def _solver(folder: str) -> str:

@@ -43,7 +43,6 @@ class DetectionEvaluate(Layer):
     label_bottoms = frozenset({0, 1})
     counted_axis = 2
     not_exported = "it compares with true boxes"
-    gathers = True
     remembers = True  # which image comes next
     solver_reads = frozenset({"eval_type", "ap_version", "show_per_class_result"})
 
@@ -81,7 +80,6 @@ class DetectionEvaluate(Layer):
                 raise self.error(f"found a bottom of shape {shape}, expected (1, 1, n, {columns})", "bottom", i)
         return [(1, 1, len(self.classes) + bottom_shapes[0][2], 5)]
 
-    @override
     def restart(self) -> None:
         self._image = 0
 
@@ -127,7 +125,6 @@ class DetectionEvaluate(Layer):
         pixel = np.array([0, 0, 1, 1], np.float32)  # a box of pixels includes its last row and column
         return overlaps(found.clip(0, 1)[:, None] * scale + pixel, true[None] * scale + pixel)
 
-    @override
     def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
         """Return the mean average precision over all batches; ``ap_version`` of the solver says which."""
         rows = np.concatenate([as_array(top).reshape(-1, 5) for top in tops])

@@ -236,7 +236,6 @@ class RoIData(_Sampling):
                 raise self.error(f"entry {i} has no {' and no '.join(sorted(missing))}")
         self.entries, self.waiting = list(entries), []
 
-    @override
     def restart(self) -> None:
         self.waiting = []
 

@@ -15,7 +15,8 @@ from typing_extensions import override
 
 from netspec.layers import Layer, register
 from netspec.layers.activation import Activation
-from netspec.layers.base import Affine, Shape, rounded
+from netspec.layers.base import Shape, rounded
+from netspec.layers.folding import Affine, blob_in_double
 from netspec.layers.normalization import onnx_centered, torch_batch_norm
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.convolution import Convolution
@@ -98,7 +99,6 @@ class Axpy(Layer):
     def forward(self, a: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         return torch.addcmul(y, a.reshape(*a.shape[:2], *(1,) * (x.dim() - 2)), x)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         a, x, y = bottoms
         missing = list(range(len(self.bottom_shapes[0]), len(self.bottom_shapes[1])))
@@ -106,7 +106,6 @@ class Axpy(Layer):
             a = graph.node("Unsqueeze", a, graph.constant(missing))
         return graph.node("Add", graph.node("Mul", a, x), y)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         a, x, y = bottoms
         missing = len(self.bottom_shapes[1]) - len(self.bottom_shapes[0])
@@ -134,18 +133,15 @@ class ReLU6(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return torch.where(x >= 6, 6, F.leaky_relu(x, self.slope) if self.slope else F.relu(x))
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope).where(bottom < 6, 0)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.slope == 0:
             return graph.node("Clip", *bottoms, graph.constant(0.0), graph.constant(6.0))
         leaky = graph.node("LeakyRelu", *bottoms, alpha=self.slope)
         return graph.node("Min", leaky, graph.constant(6.0))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.slope == 0:
             return code.call("F.relu6({x})", x=bottoms[0])
@@ -222,13 +218,11 @@ class ShuffleChannel(Layer):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.unflatten(1, (self.group, -1)).transpose(1, 2).flatten(1, 2)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         channels = self.bottom_shapes[0][1]
         dealt = graph.reshape(bottoms[0], [0, self.group, channels // self.group, -1])
         return graph.reshape_to_top(graph.node("Transpose", dealt, perm=[0, 2, 1, 3]))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("F.channel_shuffle({x}, {groups})", x=bottoms[0], groups=self.group)
 
@@ -291,7 +285,6 @@ class Interp(Layer):
         inner = F.pad(data, cut) if any(cut) else data
         return F.interpolate(inner, self.top_shapes[0][2:], mode="bilinear", align_corners=True)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param, (data, *like) = value(self.param, "interp_param"), bottoms
         if param.pad_beg or param.pad_end:
@@ -310,7 +303,6 @@ class Interp(Layer):
         grid = {"mode": "linear", "coordinate_transformation_mode": "align_corners"}
         return graph.node("Resize", data, "", "", sizes, **grid)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         param, (x, *like) = value(self.param, "interp_param"), bottoms
         cut = (param.pad_beg, param.pad_end) * 2
@@ -403,7 +395,6 @@ class Upsample(Layer):
         top: torch.Tensor = _Unpool.apply(data.flatten(2), index.flatten(2), height * width)
         return top.reshape(self.top_shapes[0])
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if len(bottoms) == 1:
             scales = graph.constant([1.0, 1.0, float(self.scale_h), float(self.scale_w)])
@@ -418,7 +409,6 @@ class Upsample(Layer):
         empty = graph.node("Expand", graph.constant(0.0), shape)
         return graph.reshape_to_top(graph.node("ScatterElements", empty, mask, values, axis=2))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         scale = (self.scale_h, self.scale_w)
         if len(bottoms) == 1:
@@ -505,7 +495,6 @@ class BN(Layer):
             for i, batch in ((2, mean), (3, variance)):
                 self.blob(i).mul_(momentum).add_(batch.reshape(self.blob_shapes[i]), alpha=1 - momentum)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
         slope, bias = graph.blob(0, shape), graph.blob(1, shape)
@@ -518,18 +507,16 @@ class BN(Layer):
         length = graph.node("Sqrt", graph.node("Add", variance, graph.constant(self.eps)))
         return graph.node("Add", graph.node("Mul", graph.node("Div", centered, length), slope), bias)
 
-    @override
     def as_affine(self) -> Affine | None:
         if self.by_batch:
             return None
-        slope, bias = (self.blob_in_double(i).reshape(-1) for i in (0, 1))
+        slope, bias = (blob_in_double(self, i).reshape(-1) for i in (0, 1))
         if not self.moving:
             return slope, bias
-        mean, variance = (self.blob_in_double(i).reshape(-1) for i in (2, 3))
+        mean, variance = (blob_in_double(self, i).reshape(-1) for i in (2, 3))
         scale = slope * (variance + self.eps).rsqrt()
         return scale, bias - mean * scale
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         axes = len(self.bottom_shapes[0])
         weight, bias = (self.blob(i).reshape(-1) for i in (0, 1))

@@ -10,7 +10,9 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.layers import register
-from netspec.layers.base import Kernel, Layer, Preparation, Shape
+from netspec.layers.base import Shape
+from netspec.layers.exporting import refusal
+from netspec.layers.preparing import Kernel, Preparation
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision import convolution
 from netspec.proto.schema import has, value
@@ -89,12 +91,12 @@ class Convolution(convolution.Convolution):
         return super().forward(*bottoms)
 
     absorbs = convolution.Convolution.absorbs
+    absorb = convolution.Convolution.absorb
     fresh = True
     any_layout = True
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
-        return Layer.prepare(self, how) if any(self.sides) else super().prepare(how)
+    def prepare(self, how: Preparation) -> Kernel | None:
+        return None if any(self.sides) else super().prepare(how)
 
     @override
     def onnx_geometry(self) -> dict[str, Any]:
@@ -102,13 +104,11 @@ class Convolution(convolution.Convolution):
         left, right, top, bottom = self.sides
         return geometry | {"pads": [top, left, bottom, right]} if any(self.sides) else geometry
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         if any(self.sides) and any(self.overhang(self.bottom_shapes[0])):
-            raise self.refusal("ONNX", "its filter is longer than the map")
+            raise refusal(self, "ONNX", "its filter is longer than the map")
         return super().to_onnx(graph, *bottoms)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         if any(self.sides):
             sides = tuple(self.sides)

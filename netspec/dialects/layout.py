@@ -67,11 +67,9 @@ class Transpose(Layer):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.permute(self.order).contiguous()
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Transpose", bottoms[0], perm=self.order)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("{x}.permute({order})", x=bottoms[0], order=tuple(self.order))
 
@@ -187,7 +185,6 @@ class CropCenter(Layer):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data[self.window].clone()
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         cuts = [part.start for part in self.window]
         axes = [axis for axis, cut in enumerate(cuts) if cut]
@@ -196,7 +193,6 @@ class CropCenter(Layer):
         starts, ends = (graph.constant([sign * cuts[axis] for axis in axes]) for sign in (1, -1))
         return graph.node("Slice", bottoms[0], starts, ends, graph.constant(axes))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         parts = [f"{part.start}:-{part.start}" if part.start else ":" for part in self.window]
         return code.call(f"{{x}}[{', '.join(parts)}]", x=bottoms[0])

@@ -6,7 +6,7 @@ import torch
 from typing_extensions import override
 
 from netspec.layers import normalization, register
-from netspec.layers.base import Affine
+from netspec.layers.folding import Affine, blob_in_double
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import has, value
 
@@ -60,15 +60,13 @@ class BatchNorm(normalization.BatchNorm):
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (SLOPES, BIASES))
         return top * slope + bias
 
-    @override
     def as_affine(self) -> Affine | None:
         affine = super().as_affine()
         if affine is None or not self.scales:
             return affine
-        slope, bias = (self.blob_in_double(i) for i in (SLOPES, BIASES))
+        slope, bias = (blob_in_double(self, i) for i in (SLOPES, BIASES))
         return affine[0] * slope, affine[1] * slope + bias
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         top = super().to_onnx(graph, *bottoms)
         if not self.scales:
@@ -76,7 +74,6 @@ class BatchNorm(normalization.BatchNorm):
         shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
         return graph.node("Add", graph.node("Mul", top, graph.blob(SLOPES, shape)), graph.blob(BIASES, shape))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         top = super().to_torch(code, *bottoms)
         if not self.scales:

@@ -21,6 +21,7 @@ from netspec.dialects._faster import RATIOS, SCALES, AnchorTarget, ProposalTarge
 from netspec.dialects._proposals import all_anchors, base_anchors, moved, suppress
 from netspec.layers import Layer, common, register
 from netspec.layers.base import Shape, rounded
+from netspec.layers.exporting import refusal
 from netspec.layers.loss.base import BATCH_SIZE, Loss, onnx_normalized_sum
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TRAIN, value
@@ -75,7 +76,6 @@ class Dropout(common.Dropout):
         top = super().forward(data)
         return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         top = super().to_onnx(graph, *bottoms)
         if value(self.param.dropout_param, "scale_train"):
@@ -83,16 +83,14 @@ class Dropout(common.Dropout):
         return graph.node("Mul", *bottoms, graph.constant(1 - self.ratio))
 
     @property
-    @override
     def passes_on(self) -> bool:
         return super().passes_on and bool(value(self.param.dropout_param, "scale_train"))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if value(self.param.dropout_param, "scale_train"):
             return super().to_torch(code, *bottoms)
         if self.phase == TRAIN:
-            raise self.refusal("PyTorch", "torch's dropout scales in training, this one in testing")
+            raise refusal(self, "PyTorch", "torch's dropout scales in training, this one in testing")
         return code.call("{x} * {kept}", x=bottoms[0], kept=1 - self.ratio)
 
 
@@ -178,14 +176,12 @@ class ROIPooling(_RegionPooling):
         ends = torch.stack([steps[:, :-1].floor(), steps[:, 1:].ceil()], dim=2) + first[:, None, None]
         return ends.clamp(0, size).long()
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         regions = graph.reshape(bottoms[1], [-1, 5])
         return graph.node("MaxRoiPool", bottoms[0], regions, pooled_shape=self.bins, spatial_scale=self.scale)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        raise self.refusal("PyTorch", "PyTorch has no pooling of regions; torchvision's roi_pool is near to it")
+        raise refusal(self, "PyTorch", "PyTorch has no pooling of regions; torchvision's roi_pool is near to it")
 
 
 Table = tuple[torch.Tensor, torch.Tensor]  # values and the pixels that they come from
@@ -433,7 +429,6 @@ class SmoothL1Loss(Loss):
         losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=self.knee)
         return (losses if outside is None else losses * outside).sum() / len(predictions)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         predictions, *others = bottoms
         shape = graph.shape_of(predictions)
@@ -453,10 +448,9 @@ class SmoothL1Loss(Loss):
             losses = graph.node("Mul", losses, aligned[2])
         return onnx_normalized_sum(graph, losses, "", BATCH_SIZE)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if len(set(self.bottom_shapes)) > 1:
-            raise self.refusal("PyTorch", "it is exported for bottoms of one shape")
+            raise refusal(self, "PyTorch", "it is exported for bottoms of one shape")
         knee = rounded(self.knee)
         if len(bottoms) == 2:
             template = 'F.smooth_l1_loss({x}, {y}, beta={knee}, reduction="sum") / {x}.shape[0]'

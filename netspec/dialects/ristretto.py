@@ -13,6 +13,7 @@ from typing_extensions import override
 
 from netspec.layers import Layer, register
 from netspec.layers.common import InnerProduct
+from netspec.layers.exporting import refusal
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.convolution import Convolution, Deconvolution
 from netspec.proto.schema import TEST, value
@@ -66,7 +67,6 @@ class _Quantized(Layer):
     """What the layers have in common: bottoms, blobs and tops are rounded as quantization_param says."""
 
     @property
-    @override
     def absorbs(self) -> bool:
         return False
 
@@ -98,13 +98,11 @@ class _Quantized(Layer):
         rounded = [fixed_point(top, param.bw_layer_out, param.fl_layer_out) for top in _as_tuple(tops)]
         return tuple(rounded) if isinstance(tops, tuple) else rounded[0]
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        raise self.refusal("ONNX", "its numbers are rounded to few bits")
+        raise refusal(self, "ONNX", "its numbers are rounded to few bits")
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        raise self.refusal("PyTorch", "its numbers are rounded to few bits")
+        raise refusal(self, "PyTorch", "its numbers are rounded to few bits")
 
 
 def _as_tuple(tops: Any) -> tuple[torch.Tensor, ...]:

@@ -28,6 +28,7 @@ from netspec.dialects._evaluate import DetectionEvaluate
 from netspec.dialects._multibox import MultiBoxLoss
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape, rounded
+from netspec.layers.exporting import refusal
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import value
 from netspec.terminal import log
@@ -287,11 +288,9 @@ class Permute(Layer):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.permute(self.order).contiguous()
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Transpose", *bottoms, perm=self.order)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call(f"{{x}}.permute({', '.join(map(str, self.order))})", x=bottoms[0])
 
@@ -358,7 +357,6 @@ class Normalize(Layer):
         scale = scale if scale.dim() == 0 else scale.reshape(-1, *(1,) * (data.dim() - 2))
         return _Normalized.apply(data, scale, axes, param.eps)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param, axes = value(self.param, "norm_param"), len(self.bottom_shapes[0])
         over = graph.constant(list(range(1, axes)) if param.across_spatial else [1])
@@ -367,7 +365,6 @@ class Normalize(Layer):
         shape = (*self.blob_shapes[0], *(1,) * (axes - 2)) if self.blob_shapes[0] else ()
         return graph.node("Mul", graph.node("Div", *bottoms, length), graph.blob(0, shape))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         param, axes = value(self.param, "norm_param"), len(self.bottom_shapes[0])
         over = tuple(range(1, axes)) if param.across_spatial else 1
@@ -480,7 +477,6 @@ class PriorBox(Layer):
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return torch.from_numpy(self.boxes).to(bottoms[0])
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         image_is_free = self.image is None and None in graph.sizes(1)[2:]
         if None not in graph.sizes(0)[2:] and not image_is_free:
@@ -516,7 +512,6 @@ class PriorBox(Layer):
         variances = graph.node("Expand", graph.constant(self.variances), graph.shape_of(boxes))
         return graph.node("Concat", *(graph.reshape(part, [1, 1, -1]) for part in (boxes, variances)), axis=1)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         param = value(self.param, "prior_box_param")
         image = code.call("{image}", image=self.image) if self.image else code.call("{y}.shape[2:]", y=bottoms[1])
@@ -626,14 +621,13 @@ class DetectionOutput(Layer):
             found = found[np.argsort(found[:, 1], kind="stable")]
         return found
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param = value(self.param, "detection_output_param")
         nms = param.nms_param
         if nms.eta < 1:
-            raise self.refusal("ONNX", "its non-maximum suppression has a fixed threshold: eta must be 1")
+            raise refusal(self, "ONNX", "its non-maximum suppression has a fixed threshold: eta must be 1")
         if len(bottoms) == 5:
-            raise self.refusal("ONNX", "its priors are refined")
+            raise refusal(self, "ONNX", "its priors are refined")
         classes = [label for label in range(param.num_classes) if label != param.background_label_id]
         boxes, scores = self._onnx_boxes_and_scores(graph, bottoms, classes)
         lowest = graph.constant(float(np.finfo(np.float32).min))
@@ -728,16 +722,15 @@ class DetectionOutput(Layer):
         rows = graph.node("Slice", rows, start, end, graph.constant([0]))
         return graph.node("Unsqueeze", rows, graph.constant([0, 1]))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         param = value(self.param, "detection_output_param")
         nms = param.nms_param
         if nms.eta < 1:
-            raise self.refusal("PyTorch", "its non-maximum suppression has a fixed threshold: eta must be 1")
+            raise refusal(self, "PyTorch", "its non-maximum suppression has a fixed threshold: eta must be 1")
         if len(bottoms) == 5:
-            raise self.refusal("PyTorch", "its priors are refined")
+            raise refusal(self, "PyTorch", "its priors are refined")
         if param.code_type != CENTER_SIZE or not param.share_location:
-            raise self.refusal("PyTorch", "it is exported for code_type: CENTER_SIZE and share_location: true")
+            raise refusal(self, "PyTorch", "it is exported for code_type: CENTER_SIZE and share_location: true")
         code.function(decode_boxes)
         code.function(suppressed)
         options = {

@@ -21,6 +21,7 @@ from netspec.export.convert import Source
 from netspec.graph.plan import Node
 from netspec.graph.steps import PASSES
 from netspec.layers.learned import Stamp, is_lent, stamp
+from netspec.layers.reading import reads_data
 from netspec.net import build
 from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -98,9 +99,9 @@ class Engine:
         self._plan, self._layers, self._exact = net.plan, list(net.layers), net.exact
         self._choice, self._from, self._write = choice, origin, write
         self._losses = [tuple((j, w) for j, w in enumerate(row) if w) for row in net.loss_weights]
-        self._readers = [step for step in net.eager.one_by_one() if self._layers[step.node].reads_data]
+        self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
         layers = zip(net.plan.nodes, net.layers, strict=True)
-        ends = [node for node, layer in layers if layer.is_input or layer.reads_data]
+        ends = [node for node, layer in layers if layer.is_input or reads_data(layer)]
         self._ends = {v: net.plan.blobs[v] for node in ends for v in node.tops}  # what no layer computes
         self._built = {blob: net.shapes[blob] for blob in self._ends.values()}
         self._model: Model | None = None
@@ -183,7 +184,7 @@ class Engine:
 def _writer(net: Net, path: Path, level: int, stages: Iterable[str]) -> Write:
     """Return what exports a net as it is, read from ``path``; it does not keep the net alive."""
     held, stages = weakref.ref(net), tuple(stages)
-    readers = [blob for layer in net.layers if layer.reads_data for blob in layer.param.top]
+    readers = [blob for layer in net.layers if reads_data(layer) for blob in layer.param.top]
 
     def write(to: Path, blobs: Sequence[str]) -> None:
         original = held()

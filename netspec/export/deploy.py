@@ -17,6 +17,8 @@ from netspec.files.whole_file import whole_file
 from netspec.graph.filter import filter_net
 from netspec.graph.fold import origins
 from netspec.graph.options import BuildOptions
+from netspec.layers.folding import passes_on
+from netspec.layers.reading import reads_data
 from netspec.net.build import build_net
 from netspec.net.given_shapes import not_to_be_given
 from netspec.net.net import Net
@@ -56,7 +58,7 @@ def with_inputs(
             missing.update(layer.top)
             continue
         missing.difference_update(layer.top)
-        if not built[layer.name].reads_data:
+        if not reads_data(built[layer.name]):
             result.layer.add().CopyFrom(layer)
             places.append(source.layers[i])
             continue
@@ -77,8 +79,8 @@ def fold(net: Net) -> NetParameter:
     """
     folds = find_folds(net.plan, list(net.layers))
     plan = net.plan
-    passes_on = [layer.passes_on for layer in net.layers]
-    origin = origins(plan, passes_on)
+    passes = [passes_on(layer) for layer in net.layers]
+    origin = origins(plan, passes)
     names = _names(net, origin)
     gone = {i for each in folds for i in each.chain.folded}
     absorbed = {each.chain.keeper: each for each in folds}
@@ -88,8 +90,8 @@ def fold(net: Net) -> NetParameter:
     for i, layer in enumerate(net.layers):
         if i in gone:
             continue
-        tops = [v for v in plan.nodes[last.get(i, i)].tops if not (passes_on[i] and v not in names)]
-        if passes_on[i] and not tops:
+        tops = [v for v in plan.nodes[last.get(i, i)].tops if not (passes[i] and v not in names)]
+        if passes[i] and not tops:
             continue
         written = result.layer.add()
         written.CopyFrom(absorbed[i].absorbed.param if i in absorbed else layer.param)
@@ -116,7 +118,7 @@ def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
     taken.update(
         origin[v]
         for node, layer in zip(plan.nodes, net.layers, strict=True)
-        if not layer.passes_on
+        if not passes_on(layer)
         for v in node.bottoms
     )
     taken.update(v for node, layer in zip(plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops)

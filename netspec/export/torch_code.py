@@ -12,6 +12,8 @@ from netspec.export.shapes import Fixed, NetShapes
 from netspec.export.source import MARK, Module, Program, Statement, mark
 from netspec.graph.fold import origins
 from netspec.layers.base import Layer
+from netspec.layers.exporting import write_torch
+from netspec.layers.folding import passes_on
 from netspec.layers.targets import Sizes
 from netspec.net.net import Net
 
@@ -26,7 +28,7 @@ def write_program(net: Net, shapes: NetShapes) -> Program:
     for i, node in enumerate(plan.nodes):
         bottoms = [mark("v", collector.value[v]) for v in node.bottoms]
         layer_code = _LayerCode(collector, i)
-        tops = net.layers[i].to_torch(layer_code, *bottoms)
+        tops = write_torch(net.layers[i], layer_code, *bottoms)
         collector.add(i, node.tops, tops)
     collector.program.outputs = {name: collector.value[v] for name, v in plan.outputs.items()}
     return collector.program
@@ -39,7 +41,7 @@ class _Collector:
         self.net, self.shapes = net, shapes
         self.program = Program(names=dict(enumerate(net.plan.blobs)))
         self.value = list(range(len(net.plan.blobs)))  # value of the Plan -> value of the program
-        passes = [layer.passes_on for layer in net.layers]
+        passes = [passes_on(layer) for layer in net.layers]
         origin = origins(net.plan, passes)
         self.readers = [0] * len(self.value)
         for node, passed in zip(net.plan.nodes, passes, strict=True):

@@ -17,11 +17,12 @@ from typing_extensions import override
 from netspec.exact import ALL, libm, switch
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
-from netspec.layers.base import Finish, Kernel, Layer, Preparation, Shape, finished
+from netspec.layers.base import Layer, Shape
 from netspec.layers.learned import values_of
+from netspec.layers.preparing import RELU, Finish, Kernel, Preparation, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, Room, recorded
+from netspec.layers.training import Kernels, Learning, Room
 
 
 class Activation(Layer):
@@ -43,21 +44,19 @@ class Rounded(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
 
-    in_place: ClassVar[Finish | None] = None  # torch's function that overwrites its argument, where there is one
+    in_place: ClassVar[Finish | None] = None  # where torch has a function that overwrites its argument
 
-    @override
     def finishing(self) -> Finish | None:
         return None if self.context.options.exact == ALL else type(self).in_place
 
     # Torch's function into ``out``, and its gradient, from the top's and the top, into ``grad_input``.
     kernels: ClassVar[tuple[Callable[..., torch.Tensor], Callable[..., torch.Tensor]] | None] = None
 
-    @override
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def prepare_training(self, learning: Learning) -> Kernels | None:
         if switch.applies(self.context.options.exact, torch.empty(1)):
             return self._prepared_as_caffe()
         if self.kernels is None:
-            return recorded(self.run, learning)
+            return None
         rooms, (compute, gradient) = (Room(), Room()), self.kernels
 
         def forward(x: torch.Tensor) -> torch.Tensor:
@@ -84,6 +83,9 @@ class Rounded(Activation):
 
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom, each step rounded as Caffe's."""
+        raise NotImplementedError
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         raise NotImplementedError
 
 
@@ -120,14 +122,14 @@ class ReLU(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
-    @override
     def finishing(self) -> Finish:
-        return partial(F.leaky_relu_, negative_slope=self.slope) if self.slope else F.relu_
+        if not self.slope:
+            return RELU
+        return Finish(f"leaky_relu {self.slope}", partial(F.leaky_relu_, negative_slope=self.slope))
 
-    @override
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def prepare_training(self, learning: Learning) -> Kernels | None:
         if self.slope:
-            return recorded(self.run, learning)
+            return None
         rooms, gradient = (Room(), Room()), torch.ops.aten.threshold_backward.grad_input
 
         def forward(x: torch.Tensor) -> torch.Tensor:
@@ -138,15 +140,12 @@ class ReLU(Activation):
 
         return forward, backward
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("LeakyRelu", *bottoms, alpha=self.slope) if self.slope else graph.node("Relu", *bottoms)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.slope:
             return code.call("F.leaky_relu({x}, {slope})", x=bottoms[0], slope=self.slope)
@@ -180,20 +179,17 @@ class PReLU(Activation):
             )
         return F.prelu(x, slopes.reshape(-1))
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
+    def prepare(self, how: Preparation) -> Kernel | None:
         if self.context.options.exact == ALL:
-            return super().prepare(how)
+            return None
         slopes = values_of(self.blob(0)).clone().reshape(-1)
         return finished(lambda x: torch.prelu(x, slopes), how.finish)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         slopes = math.prod(self.blob_shapes[0])
         spatial = len(self.bottom_shapes[0]) - 2
         return graph.node("PRelu", *bottoms, graph.blob(0, (slopes, *(1,) * (spatial if self.blob_shapes[0] else 0))))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         slopes = self.blob(0).reshape(-1)
         slope = code.module("nn.PReLU({channels})", {"weight": slopes}, channels=len(slopes))
@@ -223,15 +219,12 @@ class ELU(Rounded):
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
         return torch.where(x > 0, x, self.alpha * (libm.exp(x.clamp(max=0)) - 1))
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Elu", *bottoms, alpha=self.alpha)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.alpha == 1:
             return code.call("F.elu({x})", x=bottoms[0])
@@ -248,7 +241,7 @@ class Sigmoid(Rounded):
     """
 
     gradient_reads = frozenset({"top"})
-    in_place = torch.sigmoid_
+    in_place = Finish("sigmoid", torch.sigmoid_)
     kernels = torch.sigmoid, torch.ops.aten.sigmoid_backward.grad_input
 
     @override
@@ -259,15 +252,12 @@ class Sigmoid(Rounded):
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
         return libm.sigmoid(x)
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return (diff * top * (1 - top.double())).to(diff.dtype)  # 1. is a double to C, and so are its results
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Sigmoid", *bottoms)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("torch.sigmoid({x})", x=bottoms[0])
 
@@ -282,7 +272,7 @@ class TanH(Rounded):
     """
 
     gradient_reads = frozenset({"top"})
-    in_place = torch.tanh_
+    in_place = Finish("tanh", torch.tanh_)
     kernels = torch.tanh, torch.ops.aten.tanh_backward.grad_input
 
     @override
@@ -293,15 +283,12 @@ class TanH(Rounded):
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
         return libm.tanh(x)
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return tanh_gradient(bottom, top, diff)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Tanh", *bottoms)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("torch.tanh({x})", x=bottoms[0])
 
@@ -319,11 +306,9 @@ class AbsVal(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.abs()
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Abs", *bottoms)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("torch.abs({x})", x=bottoms[0])
 
@@ -366,7 +351,6 @@ class Power(Rounded):
             x = x * self.scale
         return x + self.shift if self.shift != 0 else x
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         slope = self.power * self.scale
         if slope == 0 or self.power == 1:
@@ -379,14 +363,12 @@ class Power(Rounded):
         at_zero = slope * bottom.pow(self.power - 1)
         return diff * torch.where(bottom == 0, at_zero, top / bottom * self.power)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.power * self.scale == 0:
             return graph.node("Expand", graph.constant(self.shift**self.power), graph.shape_of(bottoms[0]))
         value = scaled_and_shifted(graph, bottoms[0], self.scale, self.shift)
         return value if self.power == 1 else graph.node("Pow", value, graph.constant(self.power))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.power * self.scale == 0:
             return code.call("torch.full_like({x}, {value})", x=bottoms[0], value=self.shift**self.power)
@@ -433,15 +415,12 @@ class Exp(Rounded):
         # Caffe makes 0 * infinity of what a large shift would bring back to a number.
         return libm.exp(x * self.scale) * factor if factor.isfinite() else self.as_torch(x)
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * top * self.scale
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Exp", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("torch.exp({x})", x=torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift))
 
@@ -479,16 +458,13 @@ class Log(Rounded):
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
         return libm.log(x * self.scale + self.shift) * self.base_scale
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * (libm.power(bottom * self.scale + self.shift, -1) * self.slope)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         logarithm = graph.node("Log", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
         return scaled_and_shifted(graph, logarithm, self.base_scale, 0)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
         return torch_scaled_and_shifted(code, code.call("torch.log({x})", x=value), self.base_scale, 0)
@@ -513,16 +489,13 @@ class BNLL(Rounded):
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
         return (x.clamp(min=0) + libm.log(1 + libm.exp(-x.abs()).double())).to(x.dtype)
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         growth = libm.exp(bottom.clamp(max=50))
         return (diff * growth / (growth.double() + 1)).to(diff.dtype)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Softplus", *bottoms)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("F.softplus({x})", x=bottoms[0])
 
@@ -544,11 +517,9 @@ class Threshold(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return (x > self.threshold).to(x.dtype)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.cast(graph.node("Greater", *bottoms, graph.constant(self.threshold)), "float32")
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("torch.gt({x}, {threshold}).to({x}.dtype)", x=bottoms[0], threshold=self.threshold)
 
@@ -577,15 +548,12 @@ class Clip(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.clamp(max=self.high).clamp(min=self.low)
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * ((bottom >= self.low) & (bottom <= self.high))
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Clip", *bottoms, graph.constant(self.low), graph.constant(max(self.low, self.high)))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         high = max(self.low, self.high)
         return code.call("torch.clamp({x}, {low}, {high})", x=bottoms[0], low=self.low, high=high)
@@ -614,17 +582,14 @@ class Swish(Rounded):
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
         return x * libm.sigmoid(self.beta * x)
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         inner, gate = self.beta * top, libm.sigmoid(self.beta * bottom)
         return (diff * (inner + gate * (1 - inner.double()))).to(diff.dtype)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         gate = graph.node("Sigmoid", scaled_and_shifted(graph, bottoms[0], self.beta, 0))
         return graph.node("Mul", *bottoms, gate)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.beta == 1:
             return code.call("F.silu({x})", x=bottoms[0])

@@ -10,9 +10,8 @@ database in a layer's constructor, before it logs the layer's bottoms and tops, 
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -28,8 +27,6 @@ from netspec.files.limits import amount, is_out_of_memory, memory
 from netspec.graph.options import BuildOptions
 from netspec.layers import fillers
 from netspec.layers.learned import Learned, values_of
-from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, recorded
 from netspec.proto.schema import TEST
 
 MOST_AXES = 32  # of a blob of Caffe's (kMaxBlobAxes)
@@ -41,49 +38,9 @@ def shape_string(shape: Sequence[int]) -> str:
     return "".join(f"{d} " for d in shape) + f"({math.prod(shape)})"
 
 
-Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (C,) in double: y = scale x + shift
-
-
-@dataclass(frozen=True)
-class Absorbed:
-    """A layer that also does what another did: its LayerParameter and its learned blobs."""
-
-    param: Any
-    blobs: tuple[torch.Tensor, ...]
-
-
-Kernel = Callable[..., Any]  # bottoms to a top, or to a tuple of tops
-Finish = Callable[[torch.Tensor], torch.Tensor]  # returns its argument, changed in place
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """What a layer may know when it prepares for many passes at its present shapes, without gradients.
-
-    ``finish`` is to be done in place to its top; its first bottom may be overwritten where ``reuse``. What it makes of
-    its blobs for all shapes it gets by ``memo(name, make)``, which makes it once; weights may be laid out for a kernel
-    where ``pack``.
-    """
-
-    finish: Finish | None = None
-    reuse: bool = False
-    memo: Callable[[str, Callable[[], Any]], Any] = lambda _, make: make()
-    pack: bool = True
-
-
 def rounded(value: float) -> float:
     """Return a number of a float32 field as it was written: the shortest that float32 rounds to it."""
     return float(str(np.float32(value)))
-
-
-def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
-    """Return a kernel of one top followed by what changes it in place."""
-
-    def both(*bottoms: torch.Tensor) -> torch.Tensor:
-        top = kernel(*bottoms)
-        return finish(top[0] if isinstance(top, tuple) else top)  # pyright: ignore[reportOptionalCall]
-
-    return kernel if finish is None else both
 
 
 def copy_of(param: Any) -> Any:
@@ -180,20 +137,10 @@ class Layer(torch.nn.Module):
     reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
     ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
     shares: frozenset[str] = frozenset()  # of "data", "diff": its tops lie where its bottom lies, in Caffe's memory
-    gradient_reads: frozenset[str] = frozenset()  # of "bottom", "sign" (of it), "top": see run/in_place.py
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
-    reads_data: ClassVar[bool] = False  # its tops are records; exported nets take them as inputs
     counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
     promises: ClassVar[bool] = True  # its tops have the shapes that ``reshape`` returned, but for ``counted_axis``
-    fresh: ClassVar[bool] = False  # its one top is memory of its own, not a bottom's
-    any_layout: ClassVar[bool] = False  # its kernel takes bottoms whose channels lie side by side (channels_last)
-    remembers: ClassVar[bool] = False  # a pass changes more than its tops: it cannot be prepared
-    gathers: ClassVar[bool] = False  # in a test its top is not averaged over the batches: see ``score``
-    solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
-    ahead: int = 0  # bytes of batches that it reads before they are asked for
-    traceable: ClassVar[bool] = False  # torch.compile can follow its forward pass: see netspec/run/segments.py
-    not_exported: ClassVar[str] = "its class does not define it"  # the reason, where it cannot be exported
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
         super().__init__()
@@ -219,25 +166,6 @@ class Layer(torch.nn.Module):
         else:
             super().__setattr__(name, value)
 
-    def __init_subclass__(cls, **named: Any) -> None:
-        """Where a class replaces ``forward``, do not let it inherit what was said of the forward pass it replaces."""
-        super().__init_subclass__(**named)
-        for name in (
-            "prepare",
-            "prepare_training",
-            "finishing",
-            "fresh",
-            "any_layout",
-            "absorbs",
-            "absorbs_before",
-            "as_affine",
-            "traceable",
-        ):
-            owner = next(each for each in cls.__mro__ if name in vars(each))
-            told_of = getattr(owner, "forward", Layer.forward)
-            if owner is not Layer and told_of is not Layer.forward and cls.forward is not told_of:
-                setattr(cls, name, vars(Layer)[name])
-
     def construct(self) -> None:
         """Do what Caffe does in the layer's constructor, where that shows in the log."""
 
@@ -252,13 +180,6 @@ class Layer(torch.nn.Module):
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         raise self.error(f"class {type(self).__name__} does not define forward(*bottoms); write it", "type")
 
-    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """Return the bottom's gradient as Caffe computes it, step by step, from the data in memory at backward.
-
-        Only for layers of one bottom and top whose ``gradient_reads`` is not empty: see netspec/run/in_place.py.
-        """
-        raise NotImplementedError
-
     @property
     def small(self) -> bool:
         """Whether the layer is so small, at its present shapes, that Caffe's order of sums costs next to nothing."""
@@ -269,119 +190,12 @@ class Layer(torch.nn.Module):
         applies = switch.applies(self.context.options.exact, bottom, small)
         return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
 
-    def filled_once(self) -> Sequence[torch.Tensor | None]:
-        """Return, by top, what is written when the layer is made and never again; empty where there is no such top."""
-        return ()
-
-    @property
-    def waited(self) -> float:
-        """How many seconds forward passes have waited for records."""
-        return 0.0
-
-    def restart(self) -> None:
-        """Return to the first record, where the layer reads any."""
-
-    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
-        """Return what the layer remembers from one pass to the next, besides its blobs."""
-        return {}
-
-    def resume(self, state: Mapping[str, Any]) -> None:
-        """Remember what :meth:`running_state` returned. Raises SpecError if that does not fit."""
-        found, mine = (
-            ", ".join(f"{name} ({type(value).__name__})" for name, value in sorted(each.items()))
-            for each in (state, self.running_state())
-        )
-        if found != mine:
-            raise self.error(f"found {found} to remember, expected {mine or 'nothing'}")
-
-    def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
-        """Return what the tops of all batches of a test say together; for layers that gather.
-
-        ``solver`` is the SolverParameter, None where there is no solver.
-        """
-        raise NotImplementedError
-
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one forward pass at the present shapes (0 where they are not counted)."""
         return 0
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
-        """Write the layer into an ONNX graph, given the values of its bottoms; return those of its tops.
-
-        What the nodes compute must be what ``forward`` computes, at every size that ``graph`` leaves free.
-        """
-        raise self.refusal("ONNX")
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
-        """Write the layer as source for PyTorch, given the expressions of its bottoms; return those of its tops."""
-        raise self.refusal("PyTorch")
-
-    @property
-    def passes_on(self) -> bool:
-        """Whether every top is the bottom, unchanged."""
-        return False
-
-    def as_affine(self) -> Affine | None:
-        """Return the map that the layer is, if it only scales and shifts the channels, axis 1, of its bottom."""
-        return None
-
-    @property
-    def absorbs(self) -> bool:
-        """Whether :meth:`absorb` is possible."""
-        return False
-
-    @property
-    def absorbs_before(self) -> bool:
-        """Whether :meth:`absorb_before` is possible."""
-        return False
-
-    def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        """Return the layer that scales and shifts the channels of its top, axis 1, as well; in their precision."""
-        raise NotImplementedError
-
-    def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        """Return the layer that scales and shifts the channels of its bottom, axis 1, before its own work."""
-        raise NotImplementedError
-
-    def blob_in_double(self, index: int) -> torch.Tensor:
-        """Return a copy of a learned blob in double precision, on the CPU."""
-        return values_of(self.blob(index)).cpu().double()
-
-    def blob_like(self, index: int, other: torch.Tensor) -> torch.Tensor:
-        """Return a learned blob with the precision of another tensor, on its device."""
-        return values_of(self.blob(index)).to(other)
-
-    def absorbing(self, absorbed: Absorbed) -> Layer:
-        """Return a copy of the layer with this LayerParameter and these blobs, at its present shapes."""
-        made = copy.copy(self)
-        made.param = absorbed.param
-        blobs = torch.nn.ParameterList([torch.nn.Parameter(blob, False) for blob in absorbed.blobs])
-        made._modules = {**self._modules, "blobs": blobs}
-        made.blob_shapes = [tuple(blob.shape) for blob in absorbed.blobs]
-        return made
-
-    def prepare(self, how: Preparation) -> Kernel:
-        """Return what computes ``forward`` for bottoms of the present shapes, without gradients, again and again.
-
-        Only this kernel uses the layer from now on, at these shapes. A layer that overrides this may keep its blobs in
-        another form, copied: whoever writes to them has it prepared anew. No kernel may keep an alias of them.
-        """
-        return finished(self.forward, how.finish)
-
-    def prepare_training(self, learning: Learning) -> Kernels:
-        """Return what computes ``forward``, and its gradients, for bottoms of the present shapes, again and again."""
-        return recorded(self.run, learning)
-
-    def finishing(self) -> Finish | None:
-        """Return what computes the layer in place, where it maps number to number and there is such a function."""
-        return None
-
-    def refusal(self, target: str, reason: str = "") -> SpecError:
-        """Return the error of a layer that cannot be exported, with the reason."""
-        return self.error(f"cannot be exported to {target}: {reason or self.not_exported}")
 
     def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Reshape if the bottoms' shapes changed, run ``forward``, return a tuple."""
@@ -410,14 +224,6 @@ class Layer(torch.nn.Module):
         """Return a shape without the size that only a pass finds out."""
         axis = self.counted_axis
         return shape if shape is None or axis is None else (*shape[:axis], *shape[axis + 1 :])
-
-    def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
-        """Run this layer and, where one kernel does their work too, some of those that follow.
-
-        Each of ``following`` has one bottom, the top of the layer before it, which nobody else reads. Returns how many
-        of them were run, and the tops of the last.
-        """
-        return 0, self.run(*bottoms)
 
     def fit(self, bottom_shapes: list[Shape]) -> None:
         """Reshape for bottoms of these shapes, if they are others than before."""
@@ -456,14 +262,6 @@ class Layer(torch.nn.Module):
         """Return the values of all learnable blobs, in this layer's shapes, without gradients, for reading."""
         return [values_of(self.blob(j)) for j in range(len(self.blobs))]
 
-    def weight_and_bias(
-        self, learning: Learning
-    ) -> tuple[tuple[torch.Tensor, torch.Tensor | None], tuple[torch.Tensor | None, torch.Tensor | None]]:
-        """Return the values of blobs 0 and 1, and where their gradients are added up; blob 1 may be missing."""
-        values = self.values()
-        has_bias = len(values) > 1
-        return (values[0], values[1] if has_bias else None), (learning.sums[0], learning.sums[1] if has_bias else None)
-
     def possible(self, shape: Sequence[int]) -> Shape:
         """Return a shape as a tuple; refuse one with a negative size, or of more axes or numbers than Caffe's."""
         if min(shape, default=0) < 0:
@@ -500,10 +298,6 @@ class Layer(torch.nn.Module):
         if not -len(shape) <= axis < len(shape):
             raise self.error(f"axis {axis} is out of range for a blob of {len(shape)} axes, shape {shape}", *path)
         return axis % len(shape)
-
-    def missing_input(self) -> SpecError | None:
-        """Return an error if a solver cannot run the layer, because a program must first give it data."""
-        return None
 
     def _path_to(self, message: Any) -> tuple[str, ...]:
         """Return where one of the layer's fields has this message: ``("convolution_param", "weight_filler")``."""

@@ -13,10 +13,13 @@ from netspec.exact import SMALL_PRODUCT
 from netspec.exact.bound import BoundVectors
 from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts, prepared_vectors
 from netspec.layers import fused
-from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
+from netspec.layers.base import Layer, Shape, copy_of
+from netspec.layers.exporting import refusal
+from netspec.layers.folding import Absorbed, blob_like
+from netspec.layers.preparing import Kernel, Preparation, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, Room, recorded
+from netspec.layers.training import Kernels, Learning, Room, weight_and_bias
 from netspec.proto.schema import TRAIN
 
 
@@ -74,7 +77,6 @@ class InnerProduct(Layer):
     fresh = True
     any_layout = True
 
-    @override
     def prepare(self, how: Preparation) -> Kernel:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed, top_shape = self.param.inner_product_param.transpose, self.top_shapes[0]
@@ -93,13 +95,12 @@ class InnerProduct(Layer):
             return lambda data: multiply(data.reshape(one_by_one))
         return lambda data: multiply(data.reshape(one_by_one)).view(top_shape)
 
-    @override
-    def prepare_training(self, learning: Learning) -> Kernels:
-        (weight, bias), sums = self.weight_and_bias(learning)
+    def prepare_training(self, learning: Learning) -> Kernels | None:
+        (weight, bias), sums = weight_and_bias(self, learning)
         transposed = self.param.inner_product_param.transpose
         top_shape, inputs, wanted = self.top_shapes[0], self.inputs, learning.wanted[0]
         if math.prod(top_shape) == 0 or inputs == 0:
-            return recorded(self.run, learning)
+            return None
         if self.is_exact(weight, self.small):
             bound = BoundVectors(self.bottom_shapes[0], top_shape, transposed, weight, bias, *sums, wanted)
             return bound.forward, bound.backward
@@ -134,7 +135,6 @@ class InnerProduct(Layer):
     def multiply_adds(self) -> int:
         return math.prod(self.top_shapes[0]) * self.inputs
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         vectors = bottoms[0]
         if (self.axis, len(self.bottom_shapes[0])) != (1, 2):
@@ -145,21 +145,18 @@ class InnerProduct(Layer):
         return top if self.axis == 1 else graph.reshape_to_top(top)
 
     @property
-    @override
     def absorbs(self) -> bool:
         return self.axis == 1
 
-    @override
     def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         param = copy_of(self.param)
         param.inner_product_param.bias_term = True
         outputs = param.inner_product_param.num_output
-        bias = self.blob_like(1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
+        bias = blob_like(self, 1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
         factors = scale.expand(outputs)
         factors = factors if param.inner_product_param.transpose else factors[:, None]
-        return Absorbed(param, (self.blob_like(0, scale) * factors, scale * bias + shift))
+        return Absorbed(param, (blob_like(self, 0, scale) * factors, scale * bias + shift))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         weight = self.blob(0).t() if self.param.inner_product_param.transpose else self.blob(0)
         state = {"weight": weight, **({"bias": self.blob(1)} if len(self.blobs) > 1 else {})}
@@ -199,7 +196,6 @@ class Dropout(Layer):
         kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
         return data * kept.mul_(1 / (1 - self.ratio))
 
-    @override
     def prepare_training(self, learning: Learning) -> Kernels:
         """Return the kernels; the numbers drawn are kept, and scale the gradients too."""
         if self.phase != TRAIN:
@@ -216,18 +212,15 @@ class Dropout(Layer):
 
         return forward, backward
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.phase == TRAIN:
-            raise self.refusal("ONNX", "it draws random numbers in the training phase")
+            raise refusal(self, "ONNX", "it draws random numbers in the training phase")
         return graph.node("Identity", *bottoms)
 
     @property
-    @override
     def passes_on(self) -> bool:
         return self.phase != TRAIN
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.phase != TRAIN:
             return bottoms[0]
@@ -276,12 +269,10 @@ class Embed(Layer):
         top = F.embedding(index, weight)
         return top if bias is None else top + bias
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         top = graph.node("Gather", graph.blob(0), graph.cast(bottoms[0], "int64"), axis=0)
         return graph.node("Add", top, graph.blob(1)) if len(self.blobs) > 1 else top
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         rows, width = self.blob_shapes[0]
         template = "nn.Embedding({rows}, {out_channels})"

@@ -12,11 +12,11 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch.nn import functional as F
 
 from netspec.exact.products import Filter
-from netspec.layers.base import Kernel, Preparation, Shape, finished
+from netspec.layers.base import Shape
 from netspec.layers.learned import values_of
+from netspec.layers.preparing import RELU, Kernel, Preparation, finished
 
 _NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
 
@@ -49,7 +49,7 @@ def convolution(
     geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]
     weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
     bias = _kept(bias, how)
-    call, relu = _ops()._convolution_pointwise.default, how.finish is F.relu_
+    call, relu = _ops()._convolution_pointwise.default, how.finish == RELU
     arguments = (*geometry, "relu" if relu else "none", [], "")
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
@@ -126,6 +126,6 @@ def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -
     name = f"rows {tuple(weight.shape)} {weight.stride()}"  # of a shared matrix one layer may take the transpose
     weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
     bias = _kept(bias, how)
-    call, relu = _ops()._linear_pointwise.default, how.finish is F.relu_
+    call, relu = _ops()._linear_pointwise.default, how.finish == RELU
     arguments = ("relu" if relu else "none", [], "")
     return finished(lambda vectors: call(vectors, weight, bias, *arguments), None if relu else how.finish)

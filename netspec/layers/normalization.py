@@ -13,8 +13,10 @@ from typing_extensions import override
 from netspec.exact import ALL, SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization, ChannelProducts, RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.base import MOST, Absorbed, Affine, Kernel, Layer, Preparation, Shape, copy_of, finished, rounded
+from netspec.layers.base import MOST, Layer, Shape, copy_of, rounded
+from netspec.layers.folding import Absorbed, Affine, blob_in_double
 from netspec.layers.learned import values_of
+from netspec.layers.preparing import RELU, Kernel, Preparation, finished, finishing
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TEST
@@ -88,16 +90,15 @@ class BatchNorm(Layer):
             data, mean = data - _along(mean, 1, data), torch.zeros_like(mean)
         return torch.batch_norm(data, None, None, mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
 
-    @override
     def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
         """Normalize a batch; torch's kernel also scales by channel, and its top may be overwritten by an activation."""
         data, scale = bottoms[0], following[0] if following else None
         self.fit([tuple(data.shape)])
         exact = self.is_exact(data, self.small)
         if exact or self.use_global_stats or not isinstance(scale, Scale) or not scale.by_channel:
-            return super().run_with(following, *bottoms)
+            return 0, self.run(*bottoms)
         top = self._by_batch(data, scale.blob(0), scale.blob(1) if len(scale.blobs) > 1 else None)
-        if len(following) > 1 and following[1].finishing() is F.relu_:  # its gradient does not read what it overwrites
+        if len(following) > 1 and finishing(following[1]) == RELU:
             return 2, (F.relu_(top),)
         return 1, (top,)
 
@@ -132,10 +133,9 @@ class BatchNorm(Layer):
     fresh = True
     any_layout = True
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
+    def prepare(self, how: Preparation) -> Kernel | None:
         if not self.use_global_stats:
-            return super().prepare(how)
+            return None
         eps, axes = self.param.batch_norm_param.eps, (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
         mean, variance = self.past()
         if self.is_exact(mean, self.small):
@@ -150,7 +150,6 @@ class BatchNorm(Layer):
 
         return finished(kernel, how.finish)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         eps = self.param.batch_norm_param.eps
         if self.use_global_stats:
@@ -160,16 +159,14 @@ class BatchNorm(Layer):
         centered, variance = onnx_centered(graph, bottoms[0], len(self.bottom_shapes[0]))
         return graph.node("Div", centered, graph.node("Sqrt", graph.node("Add", variance, graph.constant(eps))))
 
-    @override
     def as_affine(self) -> Affine | None:
         if not self.use_global_stats:
             return None
-        weight = self.blob_in_double(2)
+        weight = blob_in_double(self, 2)
         factor = torch.where(weight == 0, 0, 1 / weight)
-        scale = (self.blob_in_double(1) * factor + self.param.batch_norm_param.eps).rsqrt()
-        return scale, -self.blob_in_double(0) * factor * scale
+        scale = (blob_in_double(self, 1) * factor + self.param.batch_norm_param.eps).rsqrt()
+        return scale, -blob_in_double(self, 0) * factor * scale
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         eps = rounded(self.param.batch_norm_param.eps)
         if not self.use_global_stats:
@@ -350,7 +347,6 @@ class Scale(_Affine):
         top = data * _along(scale, self.axis, data)
         return top if bias is None else top + _along(bias, self.axis, data)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         top = graph.node("Mul", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
         if not self.param.scale_param.bias_term:
@@ -366,10 +362,9 @@ class Scale(_Affine):
     fresh = True
     any_layout = True
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
+    def prepare(self, how: Preparation) -> Kernel | None:
         if not self.by_channel:
-            return super().prepare(how)
+            return None
         scale, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         axes = (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
         if self.is_exact(scale, self.small):
@@ -389,19 +384,16 @@ class Scale(_Affine):
         """Whether it multiplies each channel by a learned factor."""
         return len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
 
-    @override
     def as_affine(self) -> Affine | None:
         if not self.by_channel:
             return None
-        scale = self.blob_in_double(0)
-        return scale, self.blob_in_double(1) if len(self.blobs) > 1 else torch.zeros_like(scale)
+        scale = blob_in_double(self, 0)
+        return scale, blob_in_double(self, 1) if len(self.blobs) > 1 else torch.zeros_like(scale)
 
     @property
-    @override
     def absorbs_before(self) -> bool:
         return self.by_channel
 
-    @override
     def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         own = self.as_affine()
         assert own is not None
@@ -410,7 +402,6 @@ class Scale(_Affine):
         factor, offset = (values.to(scale) for values in own)
         return Absorbed(param, (factor * scale, factor * shift + offset))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.by_channel:
             scale = self.blob(0)
@@ -451,18 +442,15 @@ class Bias(_Affine):
             return self.apply_exactly(data, None, operand, self.axis)
         return data + _along(operand, self.axis, data)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Add", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
 
-    @override
     def as_affine(self) -> Affine | None:
         if len(self.bottom_shapes) > 1 or self.axis != 1 or len(self.blob_shapes[0]) != 1:
             return None
-        shift = self.blob_in_double(0)
+        shift = blob_in_double(self, 0)
         return torch.ones_like(shift), shift
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("{x} + {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))
 
@@ -520,11 +508,10 @@ class LRN(Layer):
     fresh = True
     any_layout = True
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
+    def prepare(self, how: Preparation) -> Kernel | None:
         param, shape = self.param.lrn_param, self.bottom_shapes[0]
         if param.norm_region != ACROSS_CHANNELS or self.context.options.exact == ALL:
-            return super().prepare(how)
+            return None
         size, channels, reach = param.local_size, shape[1], param.local_size // 2
         frames: dict[bool, torch.Tensor] = {}
 
@@ -548,7 +535,6 @@ class LRN(Layer):
 
         return finished(kernel, how.finish)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param = self.param.lrn_param
         size, reach = param.local_size, param.local_size // 2
@@ -560,7 +546,6 @@ class LRN(Layer):
         base = graph.node("Add", mean, graph.constant(1.0))
         return graph.node("Mul", *bottoms, graph.node("Pow", base, graph.constant(-param.beta)))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         param, (x,) = self.param.lrn_param, bottoms
         alpha, beta = rounded(param.alpha), rounded(param.beta)
@@ -605,7 +590,6 @@ class MVN(Layer):
             top = maps - maps.mean(dim=1, keepdim=True)
         return top.reshape(shape)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param, (data,) = self.param.mvn_param, bottoms
         missing = list(range(len(self.bottom_shapes[0]), 4))
@@ -618,7 +602,6 @@ class MVN(Layer):
         variance = graph.node("ReduceMean", graph.node("Mul", top, top), axes, keepdims=1)
         return graph.node("Div", top, graph.node("Add", graph.node("Sqrt", variance), graph.constant(param.eps)))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         param, x = self.param.mvn_param, bottoms[0]
         missing = 4 - len(self.bottom_shapes[0])

@@ -155,13 +155,10 @@ class Recurrent(Layer):
         self.state = last
         return (torch.stack(outputs),)
 
-    @override
     def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
         return {"state": self.state}
 
-    @override
     def resume(self, state: Mapping[str, Any]) -> None:
-        super().resume(state)
         found: tuple[torch.Tensor, ...] = state["state"]
         shape = (self.bottom_shapes[0][1], self.hidden)
         if found and [s.shape for s in found] != [shape] * len(self.state_names):
@@ -208,7 +205,6 @@ class Recurrent(Layer):
             return tuple(s.to(x) for s in self.state)
         return (x.new_zeros(shape),) * len(self.state_names)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         steps = graph.size(0, 0, "its time steps are unrolled")
         streams = graph.size(0, 1, "its state has a row for each stream")
@@ -244,7 +240,6 @@ class Recurrent(Layer):
         """Return the product with a learned matrix."""
         return graph.node("MatMul", value, graph.node("Transpose", graph.blob(blob), perm=[1, 0]))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
         x, cont, *others = bottoms
         names = [name for name in self.blob_names if self.has_static or name != "w_static"]
@@ -398,12 +393,10 @@ class LSTMUnit(Layer):
     def forward(self, cell: torch.Tensor, gates: torch.Tensor, cont: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return _lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2), self.is_exact(gates))
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         cell, gates, cont = bottoms
         keep = graph.node("Unsqueeze", cont, graph.constant([2]))
         return _onnx_unit(graph, cell, gates, keep, self.bottom_shapes[0][2])
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return f"{code.function(lstm_unit)}({', '.join(bottoms)}[..., None])"

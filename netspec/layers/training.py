@@ -1,8 +1,8 @@
 """How a layer is made ready to be trained at fixed shapes: a kernel forward and one backward, called again and again.
 
-A layer that has kernels of its own overrides ``Layer.prepare_training``; of the others autograd records each pass. Both
-compute the same numbers: kernels are a way to call the same functions with less work around them, and with memory that
-is kept from pass to pass, as Caffe's blobs are.
+A layer may have kernels of its own; of the others autograd records each pass. Both compute the same numbers: kernels
+are a way to call the same functions with less work around them, and with memory that is kept from pass to pass, as
+Caffe's blobs are.
 """
 
 # pyright: reportPrivateImportUsage=false
@@ -10,9 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import torch
+
+from netspec.layers.base import Layer
+from netspec.layers.offers import offered
 
 Diff = torch.Tensor | None
 Forward = Callable[..., Any]  # bottoms to a top, or to a tuple of tops
@@ -34,6 +37,37 @@ class Learning:
     wanted: tuple[bool, ...]
     sums: tuple[Diff, ...] = ()
     steady: bool = True
+
+
+class PreparesTraining(Protocol):
+    """A layer that has kernels of its own."""
+
+    def prepare_training(self, learning: Learning) -> Kernels | None:
+        """Return what computes ``forward``, and its gradients, for bottoms of the present shapes, again and again.
+
+        None: there is nothing better at these shapes than what autograd records.
+        """
+        ...
+
+
+def has_kernels(layer: Layer) -> bool:
+    """Return whether a layer has kernels of its own, at some shapes at least."""
+    return offered(layer, "prepare_training") is not None
+
+
+def kernels(layer: Layer, learning: Learning) -> Kernels:
+    """Return a layer's own kernels for its present shapes, or else those that autograd makes of its ``forward``."""
+    prepare = offered(layer, "prepare_training")
+    return (prepare and prepare(learning)) or recorded(layer.run, learning)
+
+
+def weight_and_bias(
+    layer: Layer, learning: Learning
+) -> tuple[tuple[torch.Tensor, torch.Tensor | None], tuple[Diff, Diff]]:
+    """Return the values of blobs 0 and 1, and where their gradients are added up; blob 1 may be missing."""
+    values = layer.values()
+    has_bias = len(values) > 1
+    return (values[0], values[1] if has_bias else None), (learning.sums[0], learning.sums[1] if has_bias else None)
 
 
 def recorded(run: Callable[..., Sequence[torch.Tensor]], learning: Learning) -> Kernels:

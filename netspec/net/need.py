@@ -11,6 +11,7 @@ from netspec.errors import SpecError
 from netspec.files.limits import amount, most
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
+from netspec.layers.reading import bytes_ahead
 from netspec.proto.schema import TEST
 
 BYTES = 4  # of a number: float32
@@ -55,8 +56,9 @@ class Need:
         self._alive += made
         self.tops = max(self.tops, self._alive)
         self.parameters += parameters
-        self.ahead += layer.ahead
-        self._largest = max(self._largest, (made + parameters + layer.ahead, -i))
+        ahead = bytes_ahead(layer)
+        self.ahead += ahead
+        self._largest = max(self._largest, (made + parameters + ahead, -i))
         for v in self._ends[i]:
             home = self._home.pop(v, None)
             if home is not None:

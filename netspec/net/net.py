@@ -27,6 +27,7 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.base import Context, Layer, Random, Shape, shape_string
+from netspec.layers.reading import Fed, Restarts
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.net.table import table
@@ -402,13 +403,14 @@ class Net(torch.nn.Module):
     def missing_inputs(self) -> Iterator[SpecError]:
         """Yield an error for each layer that needs inputs: a solver gives no inputs to its nets."""
         for layer in self.layers:
-            if fault := layer.missing_input():
+            if isinstance(layer, Fed) and (fault := layer.missing_input()):
                 yield fault
 
     def restart_data(self) -> None:
         """Make every data layer start again at its first record."""
         for layer in self.layers:
-            layer.restart()
+            if isinstance(layer, Restarts):
+                layer.restart()
 
     def close(self) -> None:
         """Close files and stop threads."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.layers import layer_class
 from netspec.layers.base import Shape
+from netspec.layers.reading import reads_data
 from netspec.proto.binary import parse_net_binary
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
@@ -82,7 +83,7 @@ def _without_splits(net: NetParameter) -> list[LayerParameter]:
 
 def _reads_data(layer: LayerParameter) -> bool:
     cls = layer_class(layer.type)
-    return not layer.bottom and (cls is None or cls.reads_data or layer.type == "Python")
+    return not layer.bottom and (cls is None or reads_data(cls) or layer.type == "Python")
 
 
 def _inputs(layers: list[LayerParameter]) -> dict[str, Shape]:

@@ -21,7 +21,10 @@ import torch
 
 from netspec.exact.blas import one_thread
 from netspec.layers.base import Layer
-from netspec.layers.training import Kernels, Learning
+from netspec.layers.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.offers import offered
+from netspec.layers.reading import Constant
+from netspec.layers.training import Kernels, Learning, has_kernels, kernels
 from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
@@ -86,7 +89,7 @@ class Passes:
             [(top, weight) for top, weight in zip(tops, weights, strict=True) if weight]
             for tops, weights in zip(self.tops, net.loss_weights, strict=True)
         ]
-        self._kept = [layer.filled_once() for layer in self._layers]
+        self._kept = [layer.filled_once() if isinstance(layer, Constant) else () for layer in self._layers]
         self._records = [self._is_recorded(i) for i in range(len(self._layers))]
         self._has_kernels = [self._can_bind(i) for i in range(len(self._layers))]
         for i in range(len(self._layers)):
@@ -144,13 +147,13 @@ class Passes:
                 if layer.is_input:
                     given.append((v, b))
                 else:
-                    results[b] = v, self.blobs[b], "data" in layer.shares, layer.fresh
+                    results[b] = v, self.blobs[b], "data" in layer.shares, bool(offered(layer, "fresh"))
         return given, list(results.values())
 
     def _is_recorded(self, i: int) -> bool:
         """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
         layer, plan = self._layers[i], self.net.backward_plan
-        from_memory = isinstance(layer, Python) or layer.shares or layer.gradient_reads
+        from_memory = isinstance(layer, Python) or layer.shares or gradient_reads(layer)
         wanted = any(plan.bottoms[i]) or any(blob.requires_grad for blob in layer.blobs)
         return plan.layers[i] and wanted and not from_memory
 
@@ -158,7 +161,7 @@ class Passes:
         """Return whether layer ``i`` has kernels of its own for what autograd would watch."""
         layer = self._layers[i]
         return (
-            type(layer).prepare_training is not Layer.prepare_training
+            has_kernels(layer)
             and self.net.device.type == "cpu"
             and not any(self._is_in_place(i, blob) for blob in self.bottoms[i])
             and all(blob.dtype == torch.float32 and blob.is_contiguous() for blob in layer.blobs)
@@ -228,7 +231,8 @@ class Passes:
             self.net.prepared is not None
             and self.net.device.type == "cpu"
             and not any(self._records)
-            and not any(isinstance(layer, Python) or layer.filled_once() for layer in self._layers)
+            and not any(map(any, self._kept))
+            and not any(isinstance(layer, Python) for layer in self._layers)
             and AUTOMATIC not in self.names
             and not self._overwrites_shared()
         )
@@ -390,7 +394,7 @@ class Passes:
             layer.fit(shapes)
             sums = tuple(_gradient(blob) if blob.requires_grad else None for blob in layer.blobs)
             learning = Learning(tuple(self.net.backward_plan.bottoms[i]), sums, steady=False)
-            bound = self._bound[i] = _Bound(shapes, _places(layer), layer.prepare_training(learning))
+            bound = self._bound[i] = _Bound(shapes, _places(layer), kernels(layer, learning))
         return bound
 
     def _tape(self, i: int) -> _Tape:
@@ -421,10 +425,10 @@ class Passes:
         if "diff" in layer.shares:
             return
         diffs = [top.diff_memory.tensor(top.shape) for top in tops]
-        if layer.gradient_reads:
+        if gradient_reads(layer):
             if wanted[0]:
                 bottom, top = (blob.data_memory.tensor(blob.shape) for blob in (bottoms[0], tops[0]))
-                bottoms[0].diff_memory.put(layer.caffes_gradient(bottom, top, diffs[0]))
+                bottoms[0].diff_memory.put(gradient_from_memory(layer, bottom, top, diffs[0]))
             return
         tape = self._tape(i)
         found = tape.backward(*diffs)

@@ -1,4 +1,4 @@
-"""Layers in a row that one kernel may compute together (``Layer.run_with``)."""
+"""Layers in a row that one kernel may compute together (netspec/layers/preparing.py, RunsWith)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
+from netspec.layers.offers import offered
 
 LONGEST = 3  # BatchNorm, Scale, ReLU
 
@@ -21,7 +22,7 @@ def chains(plan: Plan, layers: Sequence[Layer], apart: Sequence[bool]) -> list[l
     readers = Counter(v for node in plan.nodes for v in node.bottoms)
     found: list[list[int]] = [[] for _ in plan.nodes]
     for i, layer in enumerate(layers):
-        if type(layer).run_with is Layer.run_with or apart[i]:
+        if apart[i] or offered(layer, "run_with") is None:
             continue
         for k in range(i + 1, min(i + LONGEST, len(plan.nodes))):
             tops = plan.nodes[k - 1].tops
@@ -33,11 +34,11 @@ def chains(plan: Plan, layers: Sequence[Layer], apart: Sequence[bool]) -> list[l
 
 def together(layers: Sequence[Layer]) -> Callable[..., tuple[torch.Tensor, ...]]:
     """Return what runs layers of a chain: by one kernel where there is one and no hook looks at what lies between."""
-    first, following = layers[0], list(layers[1:])
+    run_with, following = offered(layers[0], "run_with"), list(layers[1:])
 
     def run(*bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         hooked = any(layer._forward_hooks for layer in layers)
-        done, tops = first.run_with([] if hooked else following, *bottoms)
+        done, tops = run_with([] if hooked else following, *bottoms)
         for layer in following[done:]:
             tops = layer.run(*tops)
         return tops

@@ -3,7 +3,7 @@
 A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
 weights s W and the bias s b + t. A BatchNorm that normalizes by its past is such a map, s = 1 / sqrt(var + eps) and t =
 -mean s, and so is a Scale; maps in a row are one map. The arithmetic is in double precision. The layers know their own
-part: :meth:`Layer.as_affine`, :meth:`Layer.absorb` and :meth:`Layer.absorb_before`; here they are only put together.
+part (netspec/layers/folding.py); here they are only put together.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import torch
 
 from netspec.graph.fold import Chain, Roles, find_chains
 from netspec.graph.plan import Plan
-from netspec.layers.base import Absorbed, Affine, Layer
+from netspec.layers.base import Layer
+from netspec.layers.folding import Absorbed, Affine, as_affine, passes_on
+from netspec.layers.offers import offered
 
 
 @dataclass(frozen=True)
@@ -28,13 +30,14 @@ class Fold:
 
 def roles_of(plan: Plan, layers: Sequence[Layer]) -> Roles:
     """Return what each layer of a plan is for folding."""
-    one_to_one = [len(node.bottoms) == 1 and len(node.tops) == 1 for node in plan.nodes]
-    affine = [one and layer.as_affine() is not None for one, layer in zip(one_to_one, layers, strict=True)]
+    one_top = [len(node.tops) == 1 for node in plan.nodes]
+    one_to_one = [one and len(node.bottoms) == 1 for one, node in zip(one_top, plan.nodes, strict=True)]
+    affine = [one and as_affine(layer) is not None for one, layer in zip(one_to_one, layers, strict=True)]
     return Roles(
-        absorbs=[len(node.tops) == 1 and layer.absorbs for node, layer in zip(plan.nodes, layers, strict=True)],
+        absorbs=[one and bool(offered(layer, "absorbs")) for one, layer in zip(one_top, layers, strict=True)],
         affine=affine,
-        absorbs_before=[one and layer.absorbs_before for one, layer in zip(affine, layers, strict=True)],
-        passes_on=[layer.passes_on for layer in layers],
+        absorbs_before=[a and bool(offered(layer, "absorbs_before")) for a, layer in zip(affine, layers, strict=True)],
+        passes_on=[passes_on(layer) for layer in layers],
     )
 
 
@@ -48,11 +51,11 @@ def absorbed_by(chain: Chain, layers: Sequence[Layer], like: torch.Tensor | None
 
     What scales and shifts is composed in double in any case.
     """
-    keeper = layers[chain.keeper]
-    scale, shift = composed([layers[i].as_affine() for i in chain.folded])
+    scale, shift = composed([as_affine(layers[i]) for i in chain.folded])
     if like is not None:
         scale, shift = scale.to(like), shift.to(like)
-    return (keeper.absorb if chain.keeper < chain.folded[0] else keeper.absorb_before)(scale, shift)
+    absorb = offered(layers[chain.keeper], "absorb" if chain.keeper < chain.folded[0] else "absorb_before")
+    return absorb(scale, shift)
 
 
 def composed(maps: Sequence[Affine | None]) -> Affine:

@@ -18,6 +18,7 @@ import torch
 
 from netspec.graph.plan import Node, Plan
 from netspec.layers.base import Layer
+from netspec.layers.gradients import gradient_from_memory, gradient_reads
 
 
 @dataclass
@@ -29,16 +30,16 @@ class Memory:
 
 def is_overwritten(layer: Layer, node: Node, plan: Plan) -> bool:
     """Return whether the layer's backward reads data that this layer, or a later one, has overwritten."""
-    if not layer.gradient_reads:
+    reads = gradient_reads(layer)
+    if not reads:
         return False
     in_place, later = node.in_place[0], plan.final[node.tops[0]] != node.tops[0]
-    reads = layer.gradient_reads
     return ("bottom" in reads and in_place) or ("sign" in reads and in_place and later) or ("top" in reads and later)
 
 
 def run_overwritten(layer: Layer, bottom: torch.Tensor, memory: Memory, in_place: bool) -> tuple[torch.Tensor, ...]:
     """Run a layer; its gradient reads ``memory`` as its top and, if it is in place, as its bottom."""
-    held = in_place and bool(layer.gradient_reads & {"bottom", "sign"})
+    held = in_place and bool(gradient_reads(layer) & {"bottom", "sign"})
     return (_Overwritten.apply(bottom, layer, memory, held),)
 
 
@@ -54,4 +55,4 @@ class _Overwritten(torch.autograd.Function):
     def backward(ctx: Any, diff: torch.Tensor) -> Any:
         held = ctx.memory.data
         bottom = held if ctx.bottom_is_held else ctx.saved_tensors[0]
-        return ctx.layer.caffes_gradient(bottom, held, diff), None, None, None
+        return gradient_from_memory(ctx.layer, bottom, held, diff), None, None, None

@@ -18,14 +18,19 @@ from typing import Any
 
 import torch
 
+from netspec.data.blobs import Shape
 from netspec.exact import ALL
 from netspec.exact.blas import one_thread
 from netspec.exact.switch import is_recorded
 from netspec.graph import steps as planned
 from netspec.graph.plan import Plan
 from netspec.graph.steps import PACK, Schedule, schedule
-from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape
+from netspec.layers.base import Layer
+from netspec.layers.folding import Absorbed, absorbing
 from netspec.layers.learned import Stamp, is_lent, stamp
+from netspec.layers.offers import offered
+from netspec.layers.preparing import Kernel, Preparation, finished, finishing, own_kernel
+from netspec.layers.reading import changes_itself
 from netspec.process.heap import give_back_freed_memory
 from netspec.run.fold import absorbed_by, roles_of
 from netspec.run.shapes import fitted
@@ -149,8 +154,8 @@ class Prepared:
                 affine=_both(roles.affine, foldable),
                 absorbs_before=_both(roles.absorbs_before, foldable),
             ),
-            finishes=[fit is not None and fit.finishing() is not None for fit in found],
-            fresh=[fit is not None and fit.fresh for fit in found],
+            finishes=[fit is not None and finishing(fit) is not None for fit in found],
+            fresh=[fit is not None and bool(offered(fit, "fresh")) for fit in found],
             given=[v for v, *_ in given],
             kept=kept | {v for node, losses in zip(plan.nodes, self._losses, strict=True) if losses for v in node.tops},
             passes=self.passes,
@@ -183,7 +188,7 @@ class Prepared:
         layer = layers[step.node]
         promised = layers[step.chain.last if step.chain else step.node]
         if unknown:
-            layer = layer if layer.remembers else copy.copy(layer)
+            layer = layer if changes_itself(layer) else copy.copy(layer)
             return lambda *bottoms: layer.run(*(bottom.contiguous() for bottom in bottoms)), "by value"
         members = (step.node, *(step.chain.folded if step.chain else ()))
         blobs = [blob for i in members for blob in layers[i].blobs]
@@ -200,14 +205,15 @@ class Prepared:
 
         if step.chain:
             chain = step.chain
-            layer = layer.absorbing(memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
-        finish = layers[step.finish].finishing() if step.finish is not None else None
+            layer = absorbing(layer, memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
+        finish = None if step.finish is None else finishing(layers[step.finish])
         how = Preparation(finish, step.reuse, memo, PACK in self.passes)
-        kernel = Layer.prepare(layer, how) if as_is else layer.prepare(how)
-        if not layer.any_layout or self._exact == ALL:
+        own = None if as_is else own_kernel(layer, how)
+        kernel = finished(layer.forward, finish) if own is None else own
+        if not offered(layer, "any_layout") or self._exact == ALL:
             inner = kernel
             kernel = lambda *bottoms: inner(*(bottom.contiguous() for bottom in bottoms))  # noqa: E731
-        if type(layer).prepare is Layer.prepare or as_is:
+        if own is None:
             kernel = _checked(kernel, promised)
         return kernel, "as is" if as_is else "packed" if len(uses) > bool(step.chain) else "prepared"
 

@@ -26,6 +26,7 @@ from netspec.exact import NONE
 from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
+from netspec.layers.offers import offered
 from netspec.run.walk import Step, walk
 from netspec.terminal import log
 
@@ -50,7 +51,7 @@ def rows(layers: Sequence[Layer], apart: Sequence[bool]) -> Iterator[list[int]]:
     """Yield the numbers of layers in a row that make a segment; layers that are ``apart`` belong to none."""
     row: list[int] = []
     for i in range(len(layers) + 1):
-        if i < len(layers) and layers[i].traceable and not apart[i]:
+        if i < len(layers) and not apart[i] and offered(layers[i], "traceable"):
             row.append(i)
             continue
         if len(row) >= FEWEST:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from netspec.data.blobs import Shape
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
+from netspec.layers.reading import changes_itself
 
 
 def fitted(
@@ -22,7 +23,7 @@ def fitted(
     found: list[Layer | None] = []
     for node, layer in zip(plan.nodes, layers, strict=True):
         known = bool(node.bottoms) and all(v in shapes for v in node.bottoms)
-        if known and not layer.remembers:
+        if known and not changes_itself(layer):
             layer = copy.copy(layer)
             layer.fit([shapes[v] for v in node.bottoms])
             if layer.counted_axis is None and layer.promises:

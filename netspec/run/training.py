@@ -21,7 +21,8 @@ from netspec.exact.blas import one_thread
 from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
-from netspec.layers.training import Backward, Diff, Forward, Kernels, Learning, recorded
+from netspec.layers.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.training import Backward, Diff, Forward, Kernels, Learning, has_kernels, kernels, recorded
 
 LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
 Values = list[Any]  # by value number, a tensor or None
@@ -52,7 +53,7 @@ def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int
         return "a blob has several readers without a Split"
     owned = Counter(id(blob) for layer in layers for blob in layer.blobs)
     for node, layer in zip(plan.nodes, layers, strict=True):
-        if type(layer).prepare_training is Layer.prepare_training and any(owned[id(blob)] > 1 for blob in layer.blobs):
+        if not has_kernels(layer) and any(owned[id(blob)] > 1 for blob in layer.blobs):
             return f'"{node.name}" shares parameters, and only autograd adds up their gradients'
     return ""
 
@@ -228,19 +229,19 @@ class TrainingStep:
             return self._overwritten_kernels(i)
         whole = all(layer.blob(j) is blob and blob.is_contiguous() for j, blob in enumerate(layer.blobs))
         learning = Learning(wanted, tuple(blob.grad if blob.requires_grad else None for blob in layer.blobs))
-        return layer.prepare_training(learning) if whole else recorded(layer.run, learning)
+        return kernels(layer, learning) if whole else recorded(layer.run, learning)
 
     def _overwritten_kernels(self, i: int) -> Kernels:
         """Return the kernels of a layer whose gradient reads what later layers have left in its memory."""
         node, layer = self._plan.nodes[i], self._layers[i]
         final = self._plan.final[node.tops[0]]
-        held = node.in_place[0] and bool(layer.gradient_reads & {"bottom", "sign"})
+        held = node.in_place[0] and bool(gradient_reads(layer) & {"bottom", "sign"})
 
         def forward(bottom: torch.Tensor) -> torch.Tensor:
             return layer.run(bottom)[0]
 
         def backward(diff: torch.Tensor) -> torch.Tensor:
             top = self._values[final]
-            return layer.caffes_gradient(top if held else self._values[node.bottoms[0]], top, diff)
+            return gradient_from_memory(layer, top if held else self._values[node.bottoms[0]], top, diff)
 
         return forward, backward

@@ -20,6 +20,7 @@ import torch
 
 from netspec.errors import SpecError, Where
 from netspec.files.whole_file import whole_file
+from netspec.layers import reading
 from netspec.net.net import Net
 from netspec.net.stamp import FAULTS, Stamp, damaged, sealed, shown, unsealed, whole_number
 from netspec.solver.settings import Settings
@@ -35,7 +36,7 @@ class Extra:
     """What the file has.
 
     ``seed`` is the solver's; ``losses`` are the last ``average_loss`` ones; ``nets`` has, for the training nets of all
-    ranks and the test nets, in this order, what each of their layers remembers (``Layer.running_state``).
+    ranks and the test nets, in this order, what each of their layers remembers (netspec/layers/reading.py).
     """
 
     seed: int
@@ -53,7 +54,7 @@ def path_beside(state: str | Path) -> Path:
 
 def running_state(net: Net) -> Remembered:
     """Return what the layers of a net remember, as JSON has it."""
-    states = {str(i): layer.running_state() for i, layer in enumerate(net.layers)}
+    states = {str(i): reading.running_state(layer) for i, layer in enumerate(net.layers)}
     return {i: {name: _packed(value) for name, value in state.items()} for i, state in states.items() if state}
 
 
@@ -62,7 +63,7 @@ def resume(net: Net, states: Remembered) -> None:
     for i, state in states.items():
         if int(i) >= len(net.layers):
             raise SpecError(f"remembers layer {i} of a net of {len(net.layers)} layers")
-        net.layers[int(i)].resume({name: _unpacked(value) for name, value in state.items()})
+        reading.resume(net.layers[int(i)], {name: _unpacked(value) for name, value in state.items()})
 
 
 def write_extra(path: str | Path, extra: Extra) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from netspec.graph.plan import Node
+from netspec.layers.reading import resume, running_state
 from netspec.net.net import Net
 
 
@@ -28,9 +29,9 @@ def bad_top(net: Net, passes: int, part: str) -> str:
     ``part`` is what :meth:`Random.begin` got for them. "" if no top is bad: what layers remember has changed.
     """
     for layer in net.layers:
-        state = layer.running_state()
+        state = running_state(layer)
         if "iteration" in state:
-            layer.resume({"iteration": max(0, int(state["iteration"]) - passes)})  # pyright: ignore[reportArgumentType]
+            resume(layer, {"iteration": max(0, int(state["iteration"]) - passes)})  # pyright: ignore[reportArgumentType]
     net.random.begin(part)
     found: list[str] = []
     hooks = [

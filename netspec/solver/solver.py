@@ -17,6 +17,7 @@ import torch
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
+from netspec.layers.reading import reads_data, waited
 from netspec.proto.text import parse_solver
 from netspec.solver import update
 from netspec.solver.checks import check_prefix
@@ -243,7 +244,7 @@ class Solver(Tested):
         pace = f"{log.number(speed)} iter/s, {log.number(now - then)}s/{self.param.display} iters"
         log.info("solver.cpp:239", f"Iteration {self.iteration} ({pace}), loss = {log.number(self.loss)}")
         log_scores("solver.cpp:258", "Train", as_scores(outputs), self.net.output_loss_weights)
-        if any(layer.reads_data for layer in self.net.layers):
+        if any(reads_data(layer) for layer in self.net.layers):
             waited = self._seconds_waited()
             share = 100 * (waited - self._waited) / (now - then or 1)
             log.info("blocking_queue.cpp:49", f"Waiting for data: {share:.1f} % of the time")
@@ -251,4 +252,4 @@ class Solver(Tested):
         self._displayed = (now, self.iteration)
 
     def _seconds_waited(self) -> float:
-        return sum(layer.waited for layer in self.net.layers)
+        return waited(self.net.layers)

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from netspec.layers.reading import Scores
 from netspec.net.net import Net
 from netspec.terminal.log import number
 
@@ -19,10 +20,10 @@ Scorer = Callable[[Sequence[torch.Tensor]], list[float]]
 
 
 def scorers(net: Net, solver: Any = None) -> dict[str, Scorer]:
-    """Return, by output, how its score follows from all batches, for those whose layers gather (layers/base.py)."""
+    """Return, by output, how its score follows from all batches, where its layer scores by itself."""
     makers = {v: layer for node, layer in zip(net.plan.nodes, net.layers, strict=True) for v in node.tops}
-    outputs = net.plan.outputs.items()
-    return {name: partial(makers[v].score, solver=solver) for name, v in outputs if v in makers and makers[v].gathers}
+    found = [(name, makers.get(v)) for name, v in net.plan.outputs.items()]
+    return {name: partial(layer.score, solver=solver) for name, layer in found if isinstance(layer, Scores)}
 
 
 class Tally:

@@ -15,6 +15,7 @@ import torch
 
 from netspec.errors import SpecError, Where
 from netspec.graph.options import BuildOptions
+from netspec.layers.reading import Scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
@@ -200,7 +201,9 @@ class Training:
 
     def _say_doubts(self) -> None:
         """Warn of fields without effect, and of what makes the training slow or its bits depend on the machine."""
-        read = frozenset[str]().union(*(layer.solver_reads for net in self.test_nets for layer in net.layers))
+        read = frozenset[str]().union(
+            *(layer.solver_reads for net in self.test_nets for layer in net.layers if isinstance(layer, Scores))
+        )
         for line in fields_without_effect(self.param, self.node, read):
             log.warning("solver.cpp:45", line)
         if said := dependence(self.net, torch.get_num_threads()):

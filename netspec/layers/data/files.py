@@ -45,6 +45,7 @@ class ReadingLayer(Layer):
     bottoms = (0, 0)
     tops = (2, 2)
     reads_data = True
+    ahead: int = 0
     group: ClassVar[str]  # the field with the layer's own settings
 
     def __getstate__(self) -> dict[str, Any]:
@@ -144,7 +145,6 @@ class ReadingLayer(Layer):
         return self._feed.position if self._feed else 0
 
     @property
-    @override
     def waited(self) -> float:
         return self._feed.waited if self._feed else 0.0
 
@@ -152,18 +152,14 @@ class ReadingLayer(Layer):
         """Return the keys (or file names) of the records of an iteration, one per row of the tops."""
         return self.source.keys(iteration)
 
-    @override
     def restart(self, iteration: int = 0) -> None:
         if self._feed:
             self._feed.restart(iteration)
 
-    @override
     def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
         return {"iteration": self.iteration}
 
-    @override
     def resume(self, state: Mapping[str, Any]) -> None:
-        super().resume(state)
         if state["iteration"] < 0:
             raise self.error(f"found iteration {state['iteration']} to go on from, expected at least 0")
         self.restart(state["iteration"])

@@ -13,6 +13,7 @@ from typing_extensions import override
 from netspec.errors import SpecError
 from netspec.layers import fillers
 from netspec.layers.base import Layer, Shape
+from netspec.layers.exporting import refusal
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import FillerParameter
@@ -48,7 +49,6 @@ class Input(Layer):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self.shapes
 
-    @override
     def missing_input(self) -> SpecError:
         blobs = " and ".join(f'"{top}"' for top in self.param.top)
         advice = "use a layer that reads data (Data, ImageData, HDF5Data, ...)"
@@ -58,11 +58,9 @@ class Input(Layer):
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return [graph.input(i) for i in range(self.num_tops)]
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return [code.input(i) for i in range(self.num_tops)]
 
@@ -98,7 +96,6 @@ class DummyData(Layer):
             except ValueError as fault:
                 yield self.error(str(fault), "dummy_data_param", "data_filler", i)
 
-    @override
     def filled_once(self) -> Sequence[torch.Tensor | None]:
         return self._constants
 
@@ -131,7 +128,6 @@ class DummyData(Layer):
             raise self.error(message, "dummy_data_param", field)
         return values * self.num_tops if len(values) == 1 else values
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return [graph.node("Identity", graph.constant(values)) for values in self._fixed("ONNX")]
 
@@ -139,10 +135,9 @@ class DummyData(Layer):
         """Return the tops, which must be constant."""
         fixed = [blob for blob in self._constants if blob is not None]
         if len(fixed) < self.num_tops:
-            raise self.refusal(target)
+            raise refusal(self, target)
         return fixed
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return [code.buffer(values) for values in self._fixed("PyTorch")]
 
@@ -187,22 +182,17 @@ class MemoryData(Layer):
         self._arrays = torch.from_numpy(data), torch.from_numpy(labels)
         self._next = 0
 
-    @override
     def missing_input(self) -> SpecError | None:
         message = "has no data yet; call set_input_arrays(data, labels) on the net first"
         return self.error(message) if self._arrays is None else None
 
-    @override
     def restart(self) -> None:
         self._next = 0
 
-    @override
     def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
         return {"next": self._next}
 
-    @override
     def resume(self, state: Mapping[str, Any]) -> None:
-        super().resume(state)
         following = state["next"]
         if following % self.shape[0] or (self._arrays is not None and not 0 <= following < len(self._arrays[0])):
             raise self.error(f"found row {following} to go on from, which is none that a batch starts with")

@@ -22,6 +22,7 @@ from netspec.exact.losses import Infogain, Logarithm, SigmoidCrossEntropy, bound
 from netspec.exact.sums import RowMagnitudes, RowSquares
 from netspec.files.limits import read_bytes
 from netspec.layers.base import Shape, rounded
+from netspec.layers.exporting import refusal
 from netspec.layers.loss.base import (
     BATCH_SIZE,
     FULL,
@@ -39,7 +40,7 @@ from netspec.layers.loss.base import (
 )
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, Room, recorded
+from netspec.layers.training import Kernels, Learning, Room
 from netspec.proto.schema import BlobProto
 
 FLT_MIN = 1.17549435e-38  # SoftmaxWithLoss takes no logarithm of less
@@ -121,11 +122,10 @@ class SoftmaxWithLoss(SoftmaxLoss):
         losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, exact)
         return (self.sum_up(losses, valid, exact), p.reshape(scores.shape))[: self.num_tops]
 
-    @override
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def prepare_training(self, learning: Learning) -> Kernels | None:
         """Return the kernels, where every label counts."""
         if self.ignore_label is not None or math.prod(self.bottom_shapes[0]) == 0:
-            return recorded(self.run, learning)
+            return None
         shape, tops, room = self.bottom_shapes[0], self.num_tops, Room()
         split, flat = (self.outer, self.classes, self.inner), (self.outer, 1, self.inner)
         divisor = normalizer(self.normalization, self.outer, self.inner, None)
@@ -150,7 +150,6 @@ class SoftmaxWithLoss(SoftmaxLoss):
 
         return forward, backward
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         scores, labels = self.onnx_scores_and_labels(graph, *bottoms)
         valid, labels = self.onnx_valid(graph, labels, self.ignore_label)
@@ -160,12 +159,11 @@ class SoftmaxWithLoss(SoftmaxLoss):
         loss = onnx_normalized_sum(graph, losses, valid, self.normalization)
         return (loss,) if self.num_tops == 1 else (loss, graph.reshape_to_top(softmax, 1))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         scores, labels = self.bottom_shapes
         y = bottoms[1] if labels == (scores[0], *scores[2:]) else code.call("{y}.squeeze(1)", y=bottoms[1])
         if scores[1] != self.classes or labels not in ((scores[0], *scores[2:]), (scores[0], 1, *scores[2:])):
-            raise self.refusal("PyTorch", "it is exported for scores (N, C, ...) and labels (N, ...) or (N, 1, ...)")
+            raise refusal(self, "PyTorch", "it is exported for scores (N, C, ...) and labels (N, ...) or (N, 1, ...)")
         if self.ignore_label is None and self.normalization in (FULL, VALID):
             loss = code.call("F.cross_entropy({x}, {y}.long())", x=bottoms[0], y=y)
         else:
@@ -255,7 +253,6 @@ class InfogainLoss(SoftmaxLoss):
             loss, p = self.sum_up(losses, valid, exact=False), log_p.detach().exp()
         return (loss, p.reshape(scores.shape))[: self.num_tops]
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         scores, labels = self.onnx_scores_and_labels(graph, *bottoms[:2])
         valid, labels = self.onnx_valid(graph, labels, self.ignore_label)
@@ -264,7 +261,7 @@ class InfogainLoss(SoftmaxLoss):
         elif self.matrix is not None:
             matrix = graph.constant(self.matrix.reshape(self.classes, self.classes))
         else:
-            raise self.refusal("ONNX", "the infogain matrix was not read")
+            raise refusal(self, "ONNX", "the infogain matrix was not read")
         log_p = graph.node("LogSoftmax", scores, axis=1)
         floored = graph.node("Max", log_p, graph.constant(math.log(LOG_THRESHOLD)))
         rows = graph.node("Gather", matrix, graph.node("Squeeze", labels, graph.constant([1])), axis=0)
@@ -299,13 +296,11 @@ class MultinomialLogisticLoss(Loss, Classified):
         exact = self.is_exact(chosen)
         return -total(Logarithm.apply(chosen) if exact else chosen.log(), exact) / self.outer
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p, labels = self.onnx_scores_and_labels(graph, *bottoms)
         chosen = graph.node("Max", graph.node("GatherElements", p, labels, axis=1), graph.constant(LOG_THRESHOLD))
         return onnx_normalized_sum(graph, graph.node("Neg", graph.node("Log", chosen)), "", BATCH_SIZE)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         template = "F.nll_loss(torch.log({x}.flatten(1).clamp(min={least})), {y}.flatten().long())"
         return code.call(template, x=bottoms[0], y=bottoms[1], least=LOG_THRESHOLD)
@@ -343,7 +338,6 @@ class HingeLoss(Loss, Classified):
             return (RowSquares if squared else RowMagnitudes).apply(margins.reshape(1, -1))[0] / self.outer
         return (margins.square() if squared else margins).sum() / self.outer
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         x, labels = self.onnx_scores_and_labels(graph, *bottoms)
         classes = graph.constant(torch.arange(self.classes).reshape(-1, 1))
@@ -354,7 +348,6 @@ class HingeLoss(Loss, Classified):
             margins = graph.node("Mul", margins, margins)
         return onnx_normalized_sum(graph, margins, "", BATCH_SIZE)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         norm = 2 if self.param.hinge_loss_param.norm == self.L2 else 1
         return code.call(
@@ -398,7 +391,6 @@ class SigmoidCrossEntropyLoss(Loss):
             losses = losses.where(valid, 0)
         return total(losses, exact) / normalizer(self.normalization, x.shape[0], math.prod(x.shape[1:]), valid)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         x, targets = bottoms
         if self.bottom_shapes[0] != self.bottom_shapes[1]:
@@ -411,10 +403,9 @@ class SigmoidCrossEntropyLoss(Loss):
             valid = graph.cast(graph.node("Not", ignored), "float32")
         return onnx_normalized_sum(graph, graph.node("Add", linear, softplus), valid, self.normalization)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.ignore_label is not None:
-            raise self.refusal("PyTorch", "torch's cross entropy of sigmoids ignores no label")
+            raise refusal(self, "PyTorch", "torch's cross entropy of sigmoids ignores no label")
         x, y = bottoms
         if self.bottom_shapes[0] != self.bottom_shapes[1]:
             y = code.call("{y}.reshape({x}.shape)", x=x, y=y)
@@ -453,7 +444,6 @@ class EuclideanLoss(Loss):
         squares = RowSquares.apply(difference.reshape(1, -1))[0] if exact else difference.square().sum()
         return squares / (2 * a.shape[0])
 
-    @override
     def prepare_training(self, learning: Learning) -> Kernels:
         shape, other = self.bottom_shapes
         difference, found = torch.empty(shape), [torch.empty(shape) if wanted else None for wanted in learning.wanted]
@@ -475,14 +465,12 @@ class EuclideanLoss(Loss):
 
         return forward, backward
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms)
         difference = graph.node("Sub", a, b)
         total = graph.node("ReduceSum", graph.node("Mul", difference, difference), keepdims=0)
         return graph.node("Div", total, graph.node("Mul", onnx_items(graph, a), graph.constant(2.0)))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         x, y = bottoms
         if self.bottom_shapes[0] != self.bottom_shapes[1]:
@@ -554,7 +542,6 @@ class ContrastiveLoss(Loss):
         exact = self.is_exact(a, small=True)
         return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version, exact)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p = self.param.contrastive_loss_param
         a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms[:2])
@@ -568,7 +555,6 @@ class ContrastiveLoss(Loss):
         losses = graph.node("Where", graph.node("Equal", label, graph.constant(0)), dissimilar, squared)
         return graph.node("Mul", graph.node("ReduceMean", losses, keepdims=0), graph.constant(0.5))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         p = self.param.contrastive_loss_param
         function = code.function(legacy_contrastive_loss if p.legacy_version else contrastive_loss)
@@ -625,7 +611,6 @@ class Accuracy(Classified):
         occurrences = zeros.scatter_add(0, label.flatten(), valid.to(x.dtype).flatten())
         return accuracy, hits / occurrences.clamp(min=1)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         x, labels = self.onnx_scores_and_labels(graph, *bottoms)
         counted, known = self.onnx_valid(graph, labels, self.ignore_label)
@@ -644,10 +629,9 @@ class Accuracy(Classified):
         hits = graph.node("ReduceSum", graph.node("Mul", of_class, right), axes, keepdims=0)
         return accuracy, graph.node("Div", hits, graph.node("Max", occurrences, graph.constant(1.0)))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
         if self.num_tops > 1 or self.inner != math.prod(self.bottom_shapes[0][2:]):
-            raise self.refusal("PyTorch", "it is exported for scores (N, C, ...), without the accuracy of each class")
+            raise refusal(self, "PyTorch", "it is exported for scores (N, C, ...), without the accuracy of each class")
         function = code.function(accuracy)
         template = f"{function}({', '.join(bottoms)}, top_k={{top_k}}, ignore_label={{ignore}})"
         return code.call(template, top_k=self.top_k, ignore=self.ignore_label)

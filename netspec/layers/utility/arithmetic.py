@@ -12,7 +12,8 @@ from typing_extensions import override
 from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
 from netspec.exact.sums import Product, RowMagnitudes, RowSquares, RowSums
-from netspec.layers.base import Kernel, Layer, Preparation, Shape, finished
+from netspec.layers.base import Layer, Shape
+from netspec.layers.preparing import Kernel, Preparation, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 
@@ -81,13 +82,11 @@ class Eltwise(Layer):
     fresh = True
     any_layout = True
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
+    def prepare(self, how: Preparation) -> Kernel | None:
         if self.operation != self.SUM or self.coeff != [1.0, 1.0]:
-            return super().prepare(how)
+            return None
         return finished(torch.Tensor.add_ if how.reuse else torch.add, how.finish)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.operation == self.SUM:
             scaled = zip(bottoms, self.coeff, strict=True)
@@ -98,7 +97,6 @@ class Eltwise(Layer):
             top = graph.node(op, top, bottom)
         return top
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.operation == self.MAX:
             top, *others = bottoms
@@ -152,7 +150,6 @@ class Reduction(Layer):
             sums = RowSquares.apply(rows) if operation == self.SUMSQ else RowSums.apply(rows, 1.0)
         return sums.reshape(self.top_shapes[0])
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p, (data,) = self.param.reduction_param, bottoms
         if p.operation == self.ASUM:
@@ -164,7 +161,6 @@ class Reduction(Layer):
         top = graph.node(op, data, axes, keepdims=0)
         return top if p.coeff == 1 else graph.node("Mul", top, graph.constant(p.coeff))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         p = self.param.reduction_param
         form = {self.ASUM: "{x}.abs()", self.SUMSQ: "{x}.square()"}.get(p.operation, "{x}")
@@ -214,7 +210,6 @@ class ArgMax(Layer):
         top = torch.stack([indices, values], 1) if p.out_max_val else indices
         return top.reshape(self.top_shapes[0])
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
         p, (data,) = self.param.argmax_param, bottoms
         axis = 1 if self.axis is None else self.axis
@@ -234,7 +229,6 @@ class ArgMax(Layer):
         ones = len(self.top_shapes[0]) - 3
         return graph.node("Unsqueeze", top, graph.constant(list(range(3, 3 + ones)))) if ones > 0 else top
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         p, (x,) = self.param.argmax_param, bottoms
         axis = 1 if self.axis is None else self.axis
@@ -277,17 +271,14 @@ class Softmax(Layer):
         """Return x as (outer, classes, inner)."""
         return x.reshape(math.prod(x.shape[: self.axis]), x.shape[self.axis], -1)
 
-    @override
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         if self.is_exact(top):
             return softmax_gradient(self._by_class(top), self._by_class(diff)).reshape(top.shape)
         return (diff - (diff * top).sum(self.axis, keepdim=True)) * top
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Softmax", *bottoms, axis=self.axis)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("F.softmax({x}, dim={axis})", x=bottoms[0], axis=self.axis)
 
@@ -312,11 +303,9 @@ class Silence(Layer):
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return ()
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return ()
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return ()
 
@@ -346,11 +335,9 @@ class Parameter(Layer):
         blob = self.blob(0)
         return blob.view_as(blob)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Identity", graph.blob(0))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return (code.parameter(0),)
 

@@ -113,7 +113,6 @@ class Python(Layer):
             for blob, need in zip([*self.bottom, *self.code.blobs], needed, strict=True)
         ]
 
-    @override
     def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
         """Return what the code's running_state returns, as JSON; "" where it has none."""
         if not hasattr(self.code, "running_state"):
@@ -124,9 +123,7 @@ class Python(Layer):
         except (TypeError, ValueError, RecursionError) as fault:
             raise self._fault("running_state", f"returned what JSON cannot hold ({fault})") from None
 
-    @override
     def resume(self, state: Mapping[str, Any]) -> None:
-        super().resume(state)
         if not (hasattr(self.code, "running_state") and hasattr(self.code, "resume")):
             remedy = "give its class running_state() and resume(state)"
             told = f"what the code remembers besides its blobs is not restored; if that matters, {remedy}"

@@ -37,16 +37,13 @@ class _OtherShape(Layer):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])
 
-    @override
     def prepare_training(self, learning: Learning) -> Kernels:
         (shape,), (top_shape,) = self.bottom_shapes, self.top_shapes
         return lambda x: x.reshape(top_shape), lambda diff: diff.reshape(shape)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.reshape_to_top(bottoms[0])
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.reshape_to_top(bottoms[0])
 
@@ -148,7 +145,6 @@ class Concat(Layer):
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
 
-    @override
     def prepare_training(self, learning: Learning) -> Kernels:
         axis, sizes = self.axis, [shape[self.axis] for shape in self.bottom_shapes]
         return lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis)
@@ -156,15 +152,13 @@ class Concat(Layer):
     any_layout = True
 
     @property
-    def fresh(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def fresh(self) -> bool:
         """Whether the top is memory of its own."""
         return len(self.bottom_shapes) > 1
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Concat", *bottoms, axis=self.axis)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if len(bottoms) == 1:
             return bottoms[0]
@@ -215,7 +209,6 @@ class Slice(Layer):
 
     any_layout = True
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         if self.num_tops == 1:
             return [graph.node("Identity", *bottoms)]
@@ -230,7 +223,6 @@ class Slice(Layer):
             for start, end in zip([0, *points], [*points, 2**62], strict=True)
         ]
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
         if self.num_tops == 1:
             return bottoms
@@ -267,7 +259,6 @@ class Split(Layer):
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
 
-    @override
     def prepare_training(self, learning: Learning) -> Kernels:
         """Return the kernels; gradients are added in Caffe's order, or in the order of autograd: the last one first."""
         order = 1 if self.num_tops > 2 and switch.applies(self.context.options.exact, torch.empty(1)) else -1
@@ -279,16 +270,13 @@ class Split(Layer):
 
         return lambda x: (x,) * tops, backward
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return bottoms * self.num_tops
 
     @property
-    @override
     def passes_on(self) -> bool:
         return True
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return bottoms * self.num_tops
 
@@ -318,11 +306,9 @@ class Tile(Layer):
             return Tiles.apply(values, self.repeats[self.axis]).reshape(self.top_shapes[0])
         return x.repeat(self.repeats)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Tile", *bottoms, graph.constant(self.repeats))
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("{x}.repeat({repeats})", x=bottoms[0], repeats=tuple(self.repeats))
 
@@ -355,11 +341,9 @@ class BatchReindex(Layer):
             raise self.error(f"found index {int(wrong[0])}, expected 0 to {x.shape[0] - 1}", "bottom", 1)
         return x.index_select(0, chosen)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Gather", bottoms[0], graph.cast(bottoms[1], "int64"), axis=0)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("{x}[{index}.long()]", x=bottoms[0], index=bottoms[1])
 
@@ -404,14 +388,12 @@ class Filter(Layer):
         kept = selector.reshape(-1).nonzero().squeeze(1)
         return tuple(x.index_select(0, kept) for x in data)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         *data, selector = bottoms
         dropped = graph.node("Equal", graph.reshape(selector, [-1]), graph.constant(0.0))
         kept = graph.node("Squeeze", graph.node("NonZero", graph.node("Not", dropped)), graph.constant([0]))
         return [graph.node("Gather", x, kept, axis=0) for x in data]
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         *data, selector = bottoms
         return [code.call("{x}[{selector}.flatten() != 0]", x=x, selector=selector) for x in data]

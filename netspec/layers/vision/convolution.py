@@ -25,10 +25,13 @@ from netspec.exact.products import (
 )
 from netspec.exact.switch import is_recorded
 from netspec.layers import fused
-from netspec.layers.base import Absorbed, Kernel, Layer, Preparation, Shape, copy_of, finished
+from netspec.layers.base import Layer, Shape, copy_of
+from netspec.layers.exporting import refusal
+from netspec.layers.folding import Absorbed, blob_like
+from netspec.layers.preparing import Kernel, Preparation, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, recorded
+from netspec.layers.training import Kernels, Learning, weight_and_bias
 from netspec.layers.vision.layout import channels_side_by_side
 
 
@@ -263,13 +266,12 @@ class Convolution(_SlidingFilter):
     fresh = True
     any_layout = True
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
+    def prepare(self, how: Preparation) -> Kernel | None:
         usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(self.bottom_shapes[0]))
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         exact = self.is_exact(weight, self.small)
         if not usual or len(self.bottom_shapes) > 1 or (exact and self.group > 1):
-            return super().prepare(how)
+            return None
         shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
         if exact:
             return finished(prepared_columns(shape, sliding, *self.values()), how.finish)
@@ -278,15 +280,14 @@ class Convolution(_SlidingFilter):
         geometry = (self.stride, self.pad, self.dilation, self.group)
         return finished(lambda maps: torch.conv2d(maps, weight, bias, *geometry), how.finish)
 
-    @override
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def prepare_training(self, learning: Learning) -> Kernels | None:
         """Return the kernels for a single bottom (N, C, H, W)."""
         shape = self.bottom_shapes[0]
         usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(shape))
         if not usual or len(self.bottom_shapes) > 1 or math.prod(self.top_shapes[0]) == 0:
-            return recorded(self.run, learning)
+            return None
         sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
-        (weight, bias), sums = self.weight_and_bias(learning)
+        (weight, bias), sums = weight_and_bias(self, learning)
         if self.is_exact(weight, self.small):
             asked = (learning.wanted[0], learning.steady)
             bound = BoundColumns(shape, sliding, self.group, weight, bias, *sums, *asked)
@@ -331,7 +332,6 @@ class Convolution(_SlidingFilter):
         pixels = math.prod(self.top_shapes[0]) // self.num_output
         return len(self.top_shapes) * pixels * math.prod(self.blob_shapes[0])
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         weights = [graph.blob(0, (*self.blob_shapes[0], *(() if self.kernel else (1,))))]
         if len(self.blobs) > 1:
@@ -364,28 +364,25 @@ class Convolution(_SlidingFilter):
         return graph.reshape(bottom, [-1, self.channels, *spatial])
 
     @property
-    @override
     def absorbs(self) -> bool:
         return self.channel_axis == 1
 
-    @override
     def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         param = copy_of(self.param)
         param.convolution_param.bias_term = True
-        bias = self.blob_like(1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
+        bias = blob_like(self, 1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
         return Absorbed(param, (self.scaled_filters(scale.expand(self.num_output)), scale * bias + shift))
 
     def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
         """Return blobs[0] with the filters of each output channel multiplied by a number of their own."""
-        filters = self.blob_like(0, scale)
+        filters = blob_like(self, 0, scale)
         return filters * scale.reshape(-1, *(1,) * (filters.dim() - 1))
 
     torch_module: ClassVar[str] = "Conv"
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         if self.channel_axis != 1 or not self.spatial_axes or any(self.overhang(self.bottom_shapes[0])):
-            raise self.refusal("PyTorch", "it is exported for (N, C, spatial axes) and filters that fit")
+            raise refusal(self, "PyTorch", "it is exported for (N, C, spatial axes) and filters that fit")
         numbers = {"in_channels": self.channels, "out_channels": self.num_output}
         numbers |= {**self.torch_geometry(), "groups": self.group}
         options = ", ".join(f"{name}={{{name}}}" for name in list(numbers)[2:])
@@ -444,12 +441,10 @@ class Deconvolution(Convolution):
     def small(self) -> bool:
         return False
 
-    @override
-    def prepare_training(self, learning: Learning) -> Kernels:
-        return recorded(self.run, learning)
+    def prepare_training(self, learning: Learning) -> Kernels | None:
+        return None
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
+    def prepare(self, how: Preparation) -> Kernel | None:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         usual = self.channel_axis == 1 and self.spatial_axes == 2 and len(self.bottom_shapes) == 1
         exact, large = self.is_exact(weight, self.small), self.multiply_adds() > SMALL_PRODUCT
@@ -460,7 +455,7 @@ class Deconvolution(Convolution):
             fits = all(p < e for p, e in zip(self.pad, self.extent, strict=True))
             if self.group == self.channels == self.num_output and fits and max(self.stride) <= 2:
                 return fused.spread_by_channel(shape, weight, bias, sliding, how)
-        return Layer.prepare(self, how)
+        return None
 
     onnx_op = "ConvTranspose"
 
@@ -471,7 +466,7 @@ class Deconvolution(Convolution):
 
     @override
     def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
-        filters = self.blob_like(0, scale)
+        filters = blob_like(self, 0, scale)
         grouped = filters.reshape(self.group, -1, *filters.shape[1:])
         factors = scale.reshape(self.group, 1, -1, *(1,) * self.spatial_axes)
         return (grouped * factors).reshape(filters.shape)
@@ -523,20 +518,18 @@ class Im2col(_SlidingFilter):
         order = (*range(first), *range(last, windows.dim()), *range(first, last))
         return windows.permute(order).reshape(self.top_shapes[0])
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.channel_axis != 1 or self.spatial_axes > 3 or any(self.overhang(self.bottom_shapes[0])):
-            raise self.refusal("ONNX", "it is exported for (N, C, spatial axes) and filters that fit")
+            raise refusal(self, "ONNX", "it is exported for (N, C, spatial axes) and filters that fit")
         pixels = math.prod(self.kernel)
         picks = (
             torch.eye(pixels).reshape(pixels, 1, *self.kernel).repeat(self.channels, *(1,) * (1 + self.spatial_axes))
         )
         return self.onnx_convolved(graph, bottoms[0], [graph.constant(picks)], self.channels, self.onnx_geometry())
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.channel_axis != 1 or self.spatial_axes != 2 or any(self.overhang(self.bottom_shapes[0])):
-            raise self.refusal("PyTorch", "it is exported for (N, C, H, W) and filters that fit")
+            raise refusal(self, "PyTorch", "it is exported for (N, C, H, W) and filters that fit")
         numbers = self.torch_geometry()
         options = ", ".join(f"{name}={{{name}}}" for name, value in numbers.items() if value != TORCH_USUAL.get(name))
         rows = self.top_shapes[0][2]
@@ -588,7 +581,6 @@ class Crop(Layer):
     def forward(self, data: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
         return data[tuple(self.window)]
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         axis = next((i for i, part in enumerate(self.window) if part != slice(None)), 0)
         starts = [part.start or 0 for part in self.window[axis:]]
@@ -597,7 +589,6 @@ class Crop(Layer):
         axes = graph.constant(list(range(axis, len(self.window))))
         return graph.node("Slice", bottoms[0], start, graph.node("Add", wanted, start), axes)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         parts = []
         for axis, part in enumerate(self.window):

@@ -13,7 +13,9 @@ from typing_extensions import override
 
 from netspec.exact.sums import Copies
 from netspec.exact.switch import is_recorded
-from netspec.layers.base import Kernel, Layer, Preparation, Shape, finished
+from netspec.layers.base import Layer, Shape
+from netspec.layers.exporting import refusal
+from netspec.layers.preparing import Kernel, Preparation, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.training import Kernels, Learning, recorded
@@ -181,8 +183,8 @@ class _PoolingBase(Layer):
     ) -> Sequence[str]:
         """Return the pooled maps and, where it is asked for, the mask."""
         if any(r >= k for r, k in zip(windows.reach, windows.kernel, strict=True)):
-            raise self.refusal(
-                "ONNX", "unpadded windows at a stride above the kernel can miss the map; use round_mode: FLOOR"
+            raise refusal(
+                self, "ONNX", "unpadded windows at a stride above the kernel can miss the map; use round_mode: FLOOR"
             )
         pads = [*windows.pad, *windows.reach]
         geometry = {"kernel_shape": list(windows.kernel), "strides": list(windows.stride), "pads": pads}
@@ -191,7 +193,7 @@ class _PoolingBase(Layer):
         if method == AVE:
             return [self._onnx_average(graph, data, windows, geometry)]
         if self.phase == TRAIN:
-            raise self.refusal("ONNX", "STOCHASTIC pooling draws random numbers in the training phase")
+            raise refusal(self, "ONNX", "STOCHASTIC pooling draws random numbers in the training phase")
         squares = graph.node("AveragePool", graph.node("Mul", data, data), count_include_pad=1, **geometry)
         mean = graph.node("AveragePool", data, count_include_pad=1, **geometry)
         least = graph.constant(SMALLEST / math.prod(windows.kernel))
@@ -223,10 +225,10 @@ class _PoolingBase(Layer):
     def torch_pool(self, code: TorchCode, x: str, windows: Windows, method: int, mask: bool = False) -> str:
         """Return the expression of the pooled maps; with ``mask`` of them and of the mask."""
         if self.phase == TRAIN and method == STOCHASTIC:
-            raise self.refusal("PyTorch", "STOCHASTIC pooling draws random numbers in the training phase")
+            raise refusal(self, "PyTorch", "STOCHASTIC pooling draws random numbers in the training phase")
         geometry = list(zip(windows.kernel, windows.stride, windows.pad, windows.reach, strict=True))
         if any(r >= k for k, _, _, r in geometry) or (method != MAX and any(2 * p > k for k, _, p, _ in geometry)):
-            raise self.refusal("PyTorch", "windows that can miss the map; use round_mode: FLOOR, or less padding")
+            raise refusal(self, "PyTorch", "windows that can miss the map; use round_mode: FLOOR, or less padding")
         numbers: dict[str, Any] = {"kernel_size": windows.kernel, "stride": windows.stride, "padding": windows.pad}
         options = ["{kernel_size}"]
         if windows.stride != windows.kernel:
@@ -309,7 +311,7 @@ class Pooling(_PoolingBase):
         return [(*shape[:2], *self.windows.count)] * self.num_tops
 
     @property
-    def traceable(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def traceable(self) -> bool:
         """Whether it draws nothing."""
         return self.method != STOCHASTIC
 
@@ -321,11 +323,10 @@ class Pooling(_PoolingBase):
     fresh = True
     any_layout = True
 
-    @override
-    def prepare(self, how: Preparation) -> Kernel:
+    def prepare(self, how: Preparation) -> Kernel | None:
         windows, empty = self.windows, math.prod(self.top_shapes[0]) == 0
         if self.num_tops > 1 or self.method == STOCHASTIC or empty or not windows.known_to_torch:
-            return super().prepare(how)
+            return None
         geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
         if self.method == AVE:
             return finished(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.finish)
@@ -338,13 +339,12 @@ class Pooling(_PoolingBase):
 
         return finished(kernel, how.finish)
 
-    @override
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def prepare_training(self, learning: Learning) -> Kernels | None:
         """Return the kernels; where a window has no pixel to win, autograd records the pass."""
         windows, empty = self.windows, math.prod(self.top_shapes[0]) == 0
-        record, trace = recorded(self.run, learning)
         if self.num_tops > 1 or self.method == STOCHASTIC or empty or not windows.known_to_torch:
-            return record, trace
+            return None
+        record, trace = recorded(self.run, learning)
         geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
         given = bottom = indices = torch.empty(0)
         if self.method == AVE:
@@ -373,7 +373,6 @@ class Pooling(_PoolingBase):
 
         return forward, backward
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         if self.param.pooling_param.global_pooling and self.method != STOCHASTIC and self.num_tops == 1:
             return [graph.node("GlobalMaxPool" if self.method == MAX else "GlobalAveragePool", *bottoms)]
@@ -382,7 +381,6 @@ class Pooling(_PoolingBase):
                 graph.size(0, axis, "its one window is the whole map")
         return self.onnx_pool(graph, bottoms[0], self.windows, self.method, mask=self.num_tops > 1)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
         mask = self.num_tops > 1
         if not self.param.pooling_param.global_pooling or self.method == STOCHASTIC or mask:
@@ -428,7 +426,6 @@ class SPP(_PoolingBase):
         pooled = [self.pool(copy, windows, method)[0] for copy, windows in zip(copies, self.levels, strict=True)]
         return pooled[0] if len(pooled) == 1 else torch.cat([level.flatten(1) for level in pooled], dim=1)
 
-    @override
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         for axis in (2, 3):
             graph.size(0, axis, "the windows of its pyramid follow from the map's size")
@@ -438,7 +435,6 @@ class SPP(_PoolingBase):
             return levels[0]
         return graph.node("Concat", *(graph.node("Flatten", level, axis=1) for level in levels), axis=1)
 
-    @override
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         for axis in (2, 3):
             code.size(0, axis, "the windows of its pyramid follow from the map's size")

@@ -11,7 +11,7 @@ from netspec.exact import CHOICES
 from netspec.exact.blas import one_thread
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, layer_class
-from netspec.layers.training import Learning, recorded
+from netspec.layers.training import Learning, kernels, recorded
 from netspec.proto.schema import TRAIN, LayerParameter
 
 MAPS = (3, 4, 9, 8)
@@ -83,7 +83,7 @@ def test_kernels_are_what_autograd_computes(
     mine = copy.deepcopy(watched)
     for blob in (*watched.blobs, *mine.blobs):
         blob.grad = torch.zeros_like(blob)
-    forward, backward = mine.prepare_training(Learning(wanted, tuple(blob.grad for blob in mine.blobs)))
+    forward, backward = kernels(mine, Learning(wanted, tuple(blob.grad for blob in mine.blobs)))
     expected_forward, expected_backward = recorded(watched.run, Learning(wanted))
     generator = torch.Generator().manual_seed(1)
 

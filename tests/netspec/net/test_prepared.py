@@ -16,10 +16,11 @@ from exported import trained
 from netspec.graph.steps import PASSES
 from netspec.layers.activation import ReLU
 from netspec.layers.base import Layer
+from netspec.layers.offers import offered
 from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, write_binary
-from netspec.proto.schema import TRAIN
+from netspec.proto.schema import TRAIN, LayerParameter
 from netspec.run import prepared as programs
 
 FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
@@ -378,9 +379,13 @@ def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> No
     class Named(Convolution):
         """The same forward pass."""
 
-    assert Halved.prepare is Layer.prepare
-    assert Halved.absorbs is Layer.absorbs
-    assert not Halved.fresh
-    assert Named.prepare is Convolution.prepare
-    assert Named.fresh
-    assert ReLU.fresh
+    def made(cls: type[Layer]) -> Layer:
+        param = LayerParameter(name="it", type="Convolution", bottom=["x"], top=["y"])
+        param.convolution_param.num_output = 2
+        param.convolution_param.kernel_size.append(3)
+        return cls(param, [(1, 2, 4, 4)])
+
+    names = ("prepare", "absorbs", "absorb", "fresh", "to_onnx")
+    assert [offered(made(Halved), name) for name in names] == [None] * len(names)
+    assert None not in [offered(made(Named), name) for name in names]
+    assert offered(made(ReLU), "fresh")

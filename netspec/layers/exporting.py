@@ -1,0 +1,45 @@
+"""How a layer is written in another form: netspec/export asks, with a writer of netspec/layers/targets.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from netspec.errors import SpecError
+from netspec.layers.base import Layer
+from netspec.layers.offers import offered
+from netspec.layers.targets import OnnxGraph, TorchCode
+
+
+class Exported(Protocol):
+    """A layer that can be exported. What it writes must compute what ``forward`` computes, at every free size."""
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
+        """Write the layer into an ONNX graph, given the values of its bottoms; return those of its tops."""
+        ...
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+        """Write the layer as source for PyTorch, given the expressions of its bottoms; return those of its tops."""
+        ...
+
+
+def write_onnx(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
+    """Write a layer into an ONNX graph. Raises SpecError where it cannot be."""
+    write = offered(layer, "to_onnx")
+    if write is None:
+        raise refusal(layer, "ONNX")
+    return write(graph, *bottoms)
+
+
+def write_torch(layer: Layer, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+    """Write a layer as source for PyTorch. Raises SpecError where it cannot be."""
+    write = offered(layer, "to_torch")
+    if write is None:
+        raise refusal(layer, "PyTorch")
+    return write(code, *bottoms)
+
+
+def refusal(layer: Layer, target: str, reason: str = "") -> SpecError:
+    """Return the error of a layer that cannot be exported: for this reason, or the one its class has."""
+    reason = reason or getattr(layer, "not_exported", "its class does not define it")
+    return layer.error(f"cannot be exported to {target}: {reason}")

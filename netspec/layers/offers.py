@@ -1,0 +1,33 @@
+"""What a layer may offer beside its forward pass, each thing by an attribute that the class defines.
+
+exporting.py  to_onnx, to_torch: the layer in another form
+preparing.py  prepare, finishing, run_with, and facts about memory: faster passes without gradients
+training.py   prepare_training: faster passes with gradients
+folding.py    as_affine, absorb, absorb_before, passes_on: one layer does the work of others
+gradients.py  caffes_gradient: the gradient from what lies in memory
+reading.py    running_state, restart, and the like: records, and what goes on from one pass to the next
+
+:class:`netspec.layers.base.Layer` knows none of them. What is offered is found by one function, :func:`offered`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from netspec.layers.base import Layer
+
+
+@cache
+def _has(cls: type[Layer], name: str) -> bool:
+    """Return whether a class has an attribute that was defined for the forward pass of this class.
+
+    A subclass that replaces ``forward`` does not inherit what was said of the one that it replaces.
+    """
+    owner = next((each for each in cls.__mro__ if name in vars(each)), None)
+    return owner is not None and getattr(owner, "forward", Layer.forward) in (cls.forward, Layer.forward)
+
+
+def offered(layer: Layer, name: str) -> Any:
+    """Return an attribute that tells of a layer's forward pass, or does the same; None where its class has none."""
+    return getattr(layer, name) if _has(type(layer), name) else None

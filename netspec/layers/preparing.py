@@ -1,0 +1,107 @@
+"""How a layer is made ready to be run many times at fixed shapes, without gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+import torch.nn.functional as F
+
+from netspec.layers.base import Layer
+from netspec.layers.offers import offered
+
+Kernel = Callable[..., Any]  # bottoms to a top, or to a tuple of tops
+
+
+@dataclass(frozen=True)
+class Finish:
+    """A map from number to number, known by its name; ``change`` does it to its argument in place, and returns it."""
+
+    name: str
+    change: Callable[[torch.Tensor], torch.Tensor] = field(compare=False)
+
+
+RELU = Finish("relu", F.relu_)  # whose gradient does not read what it overwrites
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What a layer may know when it prepares for many passes at its present shapes, without gradients.
+
+    ``finish`` is to be done in place to its top; its first bottom may be overwritten where ``reuse``. What it makes of
+    its blobs for all shapes it gets by ``memo(name, make)``, which makes it once; weights may be laid out for a kernel
+    where ``pack``.
+    """
+
+    finish: Finish | None = None
+    reuse: bool = False
+    memo: Callable[[str, Callable[[], Any]], Any] = lambda _, make: make()
+    pack: bool = True
+
+
+class Prepares(Protocol):
+    """A layer that has something better than to call ``forward`` again and again."""
+
+    def prepare(self, how: Preparation) -> Kernel | None:
+        """Return what computes ``forward`` and then ``how.finish``, for bottoms of the present shapes.
+
+        Only this kernel uses the layer from now on, at these shapes. It may keep the blobs in another form, copied:
+        whoever writes to them has the layer prepared anew. No kernel may keep an alias of them. None: there is nothing
+        better at these shapes.
+        """
+        ...
+
+
+class Facts(Protocol):
+    """What those who lay out memory ask; a layer that has none of these attributes promises nothing."""
+
+    fresh: bool  # its one top is memory of its own, not a bottom's
+    any_layout: bool  # its kernel takes bottoms whose channels lie side by side (channels_last)
+    traceable: bool  # torch.compile can follow its forward pass: see netspec/run/segments.py
+
+
+class Finishes(Protocol):
+    """A layer that maps number to number."""
+
+    def finishing(self) -> Finish | None:
+        """Return the map, None where there is no function that does it in place."""
+        ...
+
+
+class RunsWith(Protocol):
+    """A layer whose kernel can do the work of some that follow."""
+
+    def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
+        """Run this layer and, where one kernel does their work too, some of those that follow.
+
+        Each of ``following`` has one bottom, the top of the layer before it, which nobody else reads. Returns how many
+        of them were run, and the tops of the last.
+        """
+        ...
+
+
+def own_kernel(layer: Layer, how: Preparation) -> Kernel | None:
+    """Return the kernel that a layer has for its present shapes, None where it has none of its own."""
+    prepare = offered(layer, "prepare")
+    return None if prepare is None else prepare(how)
+
+
+def finishing(layer: Layer) -> Finish | None:
+    """Return the map from number to number that a layer is, where it can be done in place."""
+    find = offered(layer, "finishing")
+    return None if find is None else find()
+
+
+def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
+    """Return a kernel of one top followed by what changes it in place."""
+    if finish is None:
+        return kernel
+    change = finish.change
+
+    def both(*bottoms: torch.Tensor) -> torch.Tensor:
+        top = kernel(*bottoms)
+        return change(top[0] if isinstance(top, tuple) else top)
+
+    return both

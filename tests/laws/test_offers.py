@@ -1,0 +1,49 @@
+"""What layers offer beside their forward pass is described once, by protocols; Layer itself stays on a page."""
+
+import ast
+import inspect
+from collections.abc import Iterator
+
+from netspec.layers import Layer, exporting, folding, gradients, preparing, reading, training
+from paths import ROOT
+
+MOST_METHODS, MOST_ATTRIBUTES = 24, 14
+ROOMS = [exporting, folding, gradients, preparing, reading, training]
+
+
+def members(cls: type) -> set[str]:
+    return {name for name in (*vars(cls), *inspect.get_annotations(cls)) if not name.startswith("_")}
+
+
+OFFERED = {
+    name
+    for room in ROOMS
+    for cls in vars(room).values()
+    if inspect.isclass(cls) and getattr(cls, "_is_protocol", False) and cls.__module__ == room.__name__
+    for name in members(cls)
+}
+
+
+def undescribed() -> Iterator[str]:
+    for folder in ("layers", "dialects"):
+        for path in sorted((ROOT / "netspec" / folder).rglob("*.py")):
+            classes = [each for each in ast.walk(ast.parse(path.read_text())) if isinstance(each, ast.ClassDef)]
+            public = [each for each in classes if not each.name.startswith("_")]
+            for method in (method for cls in public for method in cls.body if isinstance(method, ast.FunctionDef)):
+                marks = {ast.unparse(each).rpartition(".")[2] for each in method.decorator_list}
+                known = method.name in OFFERED or marks & {"override", "staticmethod", "setter"}
+                if not (known or method.name.startswith("_") or ast.get_docstring(method)):
+                    yield f"{path.relative_to(ROOT)}:{method.lineno}: {method.name}"
+
+
+def test_what_no_protocol_describes_has_a_docstring_of_its_own() -> None:
+    assert list(undescribed()) == []
+
+
+def test_the_layer_stays_on_a_page() -> None:
+    own = {name: value for name, value in vars(Layer).items() if name != "__doc__"}
+    methods = [name for name, value in own.items() if inspect.isfunction(value) or isinstance(value, property)]
+    assert len(methods) <= MOST_METHODS
+    attributes = [name for name in own if name not in methods and not name.startswith("_")]
+    assert len(attributes) <= MOST_ATTRIBUTES
+    assert not OFFERED & set(own)
