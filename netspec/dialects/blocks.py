@@ -17,7 +17,7 @@ from netspec.layers import Layer, register
 from netspec.layers.activation import Activation
 from netspec.layers.base import Shape, rounded
 from netspec.layers.folding import Affine, blob_in_double
-from netspec.layers.normalization import onnx_centered, torch_batch_norm
+from netspec.layers.normalization import onnx_normalized, torch_batch_norm
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.convolution import Convolution
 from netspec.proto.schema import TRAIN, value
@@ -503,9 +503,8 @@ class BN(Layer):
         if not self.by_batch:
             blobs = [graph.blob(i, (self.channels,)) for i in range(4)]
             return graph.node("BatchNormalization", *bottoms, *blobs, epsilon=self.eps)
-        centered, variance = onnx_centered(graph, bottoms[0], len(self.bottom_shapes[0]))
-        length = graph.node("Sqrt", graph.node("Add", variance, graph.constant(self.eps)))
-        return graph.node("Add", graph.node("Mul", graph.node("Div", centered, length), slope), bias)
+        normalized = onnx_normalized(graph, bottoms[0], len(self.bottom_shapes[0]), self.eps)
+        return graph.node("Add", graph.node("Mul", normalized, slope), bias)
 
     def as_affine(self) -> Affine | None:
         if self.by_batch:
@@ -519,25 +518,13 @@ class BN(Layer):
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         axes = len(self.bottom_shapes[0])
-        weight, bias = (self.blob(i).reshape(-1) for i in (0, 1))
-        shape = (self.channels, *(1,) * (axes - 2))
-        if self.by_batch:
-            template = "F.batch_norm({x}, None, None, training=True, eps={eps}) * {y} + {z}"
-            return code.call(
-                template,
-                x=bottoms[0],
-                eps=rounded(self.eps),
-                y=code.parameter(0, shape, "slope"),
-                z=code.parameter(1, shape, "bias"),
-            )
-        if not self.moving:
-            return code.call(
-                "{x} * {y} + {z}", x=bottoms[0], y=code.parameter(0, shape, "slope"), z=code.parameter(1, shape, "bias")
-            )
-        mean, variance = (self.blob(i).reshape(-1) for i in (2, 3))
-        state = {"weight": weight, "bias": bias, "running_mean": mean, "running_var": variance}
-        state["num_batches_tracked"] = torch.zeros((), dtype=torch.long)
-        norm = torch_batch_norm(code, axes, state, self.channels, rounded(self.eps))
+        shape, eps = (self.channels, *(1,) * (axes - 2)), rounded(self.eps)
+        if self.by_batch or not self.moving:
+            template = "F.batch_norm({x}, None, None, training=True, eps={eps})" if self.by_batch else "{x}"
+            operands = {"y": code.parameter(0, shape, "slope"), "z": code.parameter(1, shape, "bias")}
+            return code.call(f"{template} * {{y}} + {{z}}", x=bottoms[0], eps=eps, **operands)
+        weight, bias, mean, variance = (self.blob(i).reshape(-1) for i in range(4))
+        norm = torch_batch_norm(code, axes, mean, variance, eps, weight=weight, bias=bias)
         return code.call("{norm}({x})", norm=norm, x=bottoms[0])
 
 

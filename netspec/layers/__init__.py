@@ -1,6 +1,6 @@
 """Caffe's layers; importing this package registers them all."""
 
-from netspec.layers import activation, common, normalization, recurrent  # noqa: F401
+from netspec.layers import activation, common, normalization, recurrent, scale  # noqa: F401
 from netspec.layers.base import Context, Layer, Random
 from netspec.layers.data import files, memory  # noqa: F401
 from netspec.layers.loss import losses  # noqa: F401

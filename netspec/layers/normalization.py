@@ -1,4 +1,4 @@
-"""Layers that normalize or scale values: BatchNorm, Scale, Bias, LRN, MVN."""
+"""Layers that normalize values: BatchNorm, LRN, MVN."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import ALL, SMALL_ITEM, libm
-from netspec.exact.channels import BatchNormalization, ChannelProducts, RowNormalization
+from netspec.exact.channels import BatchNormalization, RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.base import MOST, Layer, Shape, copy_of, rounded
-from netspec.layers.folding import Absorbed, Affine, blob_in_double
-from netspec.layers.learned import values_of
-from netspec.layers.preparing import RELU, Kernel, Preparation, finished, finishing
+from netspec.layers.base import MOST, Layer, Shape, rounded
+from netspec.layers.folding import Affine, blob_in_double
+from netspec.layers.preparing import RELU, Kernel, Preparation, channel_factors, finished, finishing
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TEST
@@ -72,34 +71,36 @@ class BatchNorm(Layer):
     @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalized values; in training also add the batch's statistics to the sums."""
-        return self._by_past(data) if self.use_global_stats else self._by_batch(data)
+        if self.use_global_stats:
+            return self._by_past(self.is_exact(data, self.small))(data)
+        return self._by_batch(data)
 
     def past(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the mean and the variance of each channel, (C,), that the sums stand for."""
         with torch.no_grad():
-            weight = self.blob(2)
-            factor = torch.where(weight == 0, 0, 1 / weight)
-            return self.blob(0) * factor, self.blob(1) * factor
+            return _means(*(self.blob(i) for i in range(3)))
 
-    def _by_past(self, data: torch.Tensor) -> torch.Tensor:
+    def _by_past(self, exact: bool) -> Kernel:
+        """Return what normalizes a bottom of the present shape by the past, as it is now."""
         mean, variance = self.past()
-        eps = self.param.batch_norm_param.eps
-        if self.is_exact(data, self.small):
-            return (data - _along(mean, 1, data)) / _along(libm.sqrt(variance + eps), 1, data)
-        if _far_from_zero(mean, variance, eps):
-            data, mean = data - _along(mean, 1, data), torch.zeros_like(mean)
-        return torch.batch_norm(data, None, None, mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
+        eps, axes = self.param.batch_norm_param.eps, (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
+        by_channel = mean.view(axes)
+        if exact:
+            deviation = libm.sqrt(variance + eps).view(axes)
+            return lambda data: (data - by_channel).div_(deviation)
+        far = _far_from_zero(mean, variance, eps)
+        arguments = (torch.zeros_like(mean) if far else mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
+        return lambda data: torch.batch_norm(data - by_channel if far else data, None, None, *arguments)
 
     def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
         """Normalize a batch; torch's kernel also scales by channel, and its top may be overwritten by an activation."""
-        data, scale = bottoms[0], following[0] if following else None
+        data, factors = bottoms[0], channel_factors(following[0]) if following else None
         self.fit([tuple(data.shape)])
-        exact = self.is_exact(data, self.small)
-        if exact or self.use_global_stats or not isinstance(scale, Scale) or not scale.by_channel:
+        if factors is None or self.use_global_stats or self.is_exact(data, self.small):
             return 0, self.run(*bottoms)
-        top = self._by_batch(data, scale.blob(0), scale.blob(1) if len(scale.blobs) > 1 else None)
+        top = self._by_batch(data, *factors)
         if len(following) > 1 and finishing(following[1]) == RELU:
-            return 2, (F.relu_(top),)
+            return 2, (RELU.change(top),)
         return 1, (top,)
 
     def _by_batch(
@@ -116,7 +117,7 @@ class BatchNorm(Layer):
             top, mean, variance = _normalize(data, eps, factors, bias)
             if _far_from_zero(mean, variance, eps):
                 # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
-                top, _, variance = _normalize(data - _along(mean, 1, data), eps, factors, bias)
+                top, _, variance = _normalize(data - mean.view(-1, *(1,) * (data.dim() - 2)), eps, factors, bias)
             if values == 1:
                 variance = torch.zeros_like(variance)  # torch's unbiased variance is 0 / 0, Caffe's 0
         with torch.no_grad():
@@ -136,53 +137,46 @@ class BatchNorm(Layer):
     def prepare(self, how: Preparation) -> Kernel | None:
         if not self.use_global_stats:
             return None
-        eps, axes = self.param.batch_norm_param.eps, (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
-        mean, variance = self.past()
-        if self.is_exact(mean, self.small):
-            by_channel, deviation = mean.view(axes), libm.sqrt(variance + eps).view(axes)
-            return finished(lambda data: (data - by_channel).div_(deviation), how.finish)
-        far, by_channel, cudnn = _far_from_zero(mean, variance, eps), mean.view(axes), torch.backends.cudnn.enabled
-        mean = torch.zeros_like(mean) if far else mean
-
-        def kernel(data: torch.Tensor) -> torch.Tensor:
-            data = data - by_channel if far else data
-            return torch.batch_norm(data, None, None, mean, variance, False, 0.0, eps, cudnn)
-
-        return finished(kernel, how.finish)
+        return finished(self._by_past(self.is_exact(self.blob(0), self.small)), how.finish)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         eps = self.param.batch_norm_param.eps
-        if self.use_global_stats:
-            ones, zeros = torch.ones(self.channels), torch.zeros(self.channels)
-            constants = [graph.constant(values) for values in (ones, zeros, *self.past())]
-            return graph.node("BatchNormalization", *bottoms, *constants, epsilon=eps)
-        centered, variance = onnx_centered(graph, bottoms[0], len(self.bottom_shapes[0]))
-        return graph.node("Div", centered, graph.node("Sqrt", graph.node("Add", variance, graph.constant(eps))))
+        if not self.use_global_stats:
+            return onnx_normalized(graph, bottoms[0], len(self.bottom_shapes[0]), eps)
+        ones, zeros = torch.ones(self.channels), torch.zeros(self.channels)
+        constants = [graph.constant(values) for values in (ones, zeros, *self.past())]
+        return graph.node("BatchNormalization", *bottoms, *constants, epsilon=eps)
 
     def as_affine(self) -> Affine | None:
         if not self.use_global_stats:
             return None
-        weight = blob_in_double(self, 2)
-        factor = torch.where(weight == 0, 0, 1 / weight)
-        scale = (blob_in_double(self, 1) * factor + self.param.batch_norm_param.eps).rsqrt()
-        return scale, -blob_in_double(self, 0) * factor * scale
+        mean, variance = _means(*(blob_in_double(self, i) for i in range(3)))
+        scale = (variance + self.param.batch_norm_param.eps).rsqrt()
+        return scale, -mean * scale
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         eps = rounded(self.param.batch_norm_param.eps)
         if not self.use_global_stats:
             return code.call("F.batch_norm({x}, None, None, training=True, eps={eps})", x=bottoms[0], eps=eps)
-        mean, variance = self.past()
-        count = {"num_batches_tracked": torch.zeros((), dtype=torch.long)}
-        state = {"running_mean": mean, "running_var": variance, **count}
-        norm = torch_batch_norm(code, len(self.bottom_shapes[0]), state, self.channels, eps)
+        norm = torch_batch_norm(code, len(self.bottom_shapes[0]), *self.past(), eps)
         return code.call("{norm}({x})", norm=norm, x=bottoms[0])
 
 
-def torch_batch_norm(code: TorchCode, axes: int, state: dict[str, torch.Tensor], channels: int, eps: float) -> str:
-    """Add torch's batch normalization by the past for so many axes, scaling where ``state`` has a weight."""
-    options = ("" if eps == 1e-5 else ", eps={eps}") + ("" if "weight" in state else ", affine=False")
+def _means(means: torch.Tensor, variances: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the sums divided by their weight; 0 where nothing was added yet."""
+    factor = torch.where(weight == 0, 0, 1 / weight)
+    return means * factor, variances * factor
+
+
+def torch_batch_norm(
+    code: TorchCode, axes: int, mean: torch.Tensor, variance: torch.Tensor, eps: float, **affine: torch.Tensor
+) -> str:
+    """Add torch's batch normalization by the past for so many axes; ``affine`` has its weight and bias, or nothing."""
+    count = torch.zeros((), dtype=torch.long)
+    state = {**affine, "running_mean": mean, "running_var": variance, "num_batches_tracked": count}
+    options = ("" if eps == 1e-5 else ", eps={eps}") + ("" if affine else ", affine=False")
     template = f"nn.BatchNorm{max(1, axes - 2)}d({{channels}}{options})"
-    numbers = {"channels": channels, **({} if eps == 1e-5 else {"eps": eps})}
+    numbers = {"channels": len(mean), **({} if eps == 1e-5 else {"eps": eps})}
     return code.module(template, state, **numbers)
 
 
@@ -203,10 +197,11 @@ def standardize(x, axes, eps):
     return (x - mean) / (variance.sqrt() + eps)
 
 
-def onnx_centered(graph: OnnxGraph, data: str, axes: int) -> tuple[str, str]:
-    """Write a batch of so many axes less the mean of each channel, and its biased variance."""
+def onnx_normalized(graph: OnnxGraph, data: str, axes: int, eps: float) -> str:
+    """Write a batch of so many axes less the mean of each channel, divided by its deviation."""
     centered = graph.node("Sub", data, _onnx_channel_means(graph, data, axes))
-    return centered, _onnx_channel_means(graph, graph.node("Mul", centered, centered), axes)
+    variance = _onnx_channel_means(graph, graph.node("Mul", centered, centered), axes)
+    return graph.node("Div", centered, graph.node("Sqrt", graph.node("Add", variance, graph.constant(eps))))
 
 
 def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
@@ -239,220 +234,6 @@ def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bo
         and not torch.compiler.is_compiling()
         and bool((mean.square() > MAX_OFFSET**2 * (variance + eps)).any())
     )
-
-
-def _along(values: torch.Tensor, axis: int, data: torch.Tensor) -> torch.Tensor:
-    """Return ``values`` shaped to meet the axes of ``data`` from ``axis`` on."""
-    return values.reshape(*values.shape, *(1,) * (data.dim() - axis - values.dim()))
-
-
-class _Affine(Layer):
-    """What Scale and Bias have in common: an operand that is learned or a second bottom, laid over some axes."""
-
-    bottoms = (1, 2)
-    traceable = True
-
-    def learned_shape(self, param: Any, field: str) -> Shape:
-        """Return the shape of a learned operand: ``num_axes`` axes of the bottom from ``axis`` on (-1: all)."""
-        shape = self.bottom_shapes[0]
-        axis = self.canonical_axis(param.axis, shape, field, "axis")
-        if param.num_axes < -1:
-            raise self.error(f"num_axes must be at least -1, found {param.num_axes}", field, "num_axes")
-        end = len(shape) if param.num_axes == -1 else axis + param.num_axes
-        if end > len(shape):
-            message = f"{param.num_axes} axes from axis {axis} on are more than the bottom has, shape {shape}"
-            raise self.error(message, field, "num_axes")
-        return shape[axis:end]
-
-    def locate(self, shapes: Sequence[Shape], param: Any, field: str) -> int:
-        """Return the axis of the first bottom where the operand begins; refuse an operand that does not match."""
-        shape = shapes[0]
-        axis = 0
-        for operand in (*shapes[1:], *self.blob_shapes):
-            axis = self.canonical_axis(param.axis, shape, field, "axis") if operand else 0
-            if shape[axis : axis + len(operand)] != operand:
-                message = f"an operand of shape {operand} does not match the bottom's axes from {axis} on, {shape}"
-                raise self.error(message, "bottom", len(shapes) - 1)
-        return axis
-
-    def apply_exactly(
-        self, data: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, axis: int
-    ) -> torch.Tensor:
-        """Multiply and add in Caffe's order; the operands lie over the axes from ``axis`` on."""
-        operand = bias if factors is None else factors
-        assert operand is not None
-        values = data.reshape(math.prod(data.shape[:axis]), operand.numel(), -1)
-        tops = ChannelProducts.apply(values, factors, bias, self.context.options.accumulate_in_place)
-        return tops.reshape(data.shape)
-
-    def onnx_operand(self, graph: OnnxGraph, bottoms: Sequence[str], blob: int, axis: int) -> str:
-        """Return the second bottom, or else a learned blob, laid over the first bottom's axes from ``axis`` on."""
-        axes = len(self.bottom_shapes[0]) - axis
-        if len(bottoms) == 1:
-            shape = self.blob_shapes[blob]
-            return graph.blob(blob, (*shape, *(1,) * (axes - len(shape))))
-        given = len(self.bottom_shapes[1])
-        if given == axes:
-            return bottoms[1]
-        return graph.node("Unsqueeze", bottoms[1], graph.constant(list(range(given, axes))))
-
-    def torch_operand(self, code: TorchCode, bottoms: Sequence[str], blob: int, axis: int) -> str:
-        """Return the expression of the second bottom, or else of a learned blob, laid over axes from ``axis`` on."""
-        axes = len(self.bottom_shapes[0]) - axis
-        if len(bottoms) == 1:
-            shape = self.blob_shapes[blob]
-            name = "" if len(self.blobs) == 1 else ("scale", "bias")[blob]
-            return code.parameter(blob, (*shape, *(1,) * (axes - len(shape))), name)
-        missing = axes - len(self.bottom_shapes[1])
-        return code.call(f"{{x}}[..., {', '.join(['None'] * missing)}]", x=bottoms[1]) if missing else bottoms[1]
-
-
-@register("Scale", "scale_param")
-class Scale(_Affine):
-    """Multiply by a learned factor, or by a second bottom, and, with bias_term, add a learned bias.
-
-    bottom[0]  any shape
-    bottom[1]  optional, the factors: bottom[0]'s shape from ``axis`` on, as many axes as it has
-    top[0]     bottom[0]'s shape
-    blobs[0]   factors, bottom[0]'s shape from ``axis`` for ``num_axes``    unless bottom[1] is given
-    blobs[1]   bias, the shape of the factors                               with bias_term: true; blobs[0] if bottom[1]
-    Caffe: src/caffe/layers/scale_layer.cpp
-    """
-
-    @override
-    def setup(self) -> None:
-        param = self.param.scale_param
-        shape = self.bottom_shapes[1] if len(self.bottom_shapes) > 1 else self.learned_shape(param, "scale_param")
-        if len(self.bottom_shapes) == 1:
-            self.add_blob(shape, param.filler if param.HasField("filler") else None, value=1.0)
-        if param.bias_term:
-            self.add_blob(shape, param.bias_filler)
-
-    @override
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        self.axis = self.locate(bottom_shapes, self.param.scale_param, "scale_param")
-        return [bottom_shapes[0]]
-
-    @override
-    def forward(self, data: torch.Tensor, factors: torch.Tensor | None = None) -> torch.Tensor:
-        scale = self.blob(0) if factors is None else factors
-        bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
-        by_channel = self.axis == 1 and scale.dim() == 1
-        if self.is_exact(data, self.small):
-            return self.apply_exactly(data, scale, bias, self.axis)
-        if by_channel:
-            # By channel: batch normalization with mean 0 and variance 1 is this, three times as fast, backward too.
-            zero, one = torch.zeros_like(scale), torch.ones_like(scale)
-            return torch.batch_norm(data, scale, bias, zero, one, False, 0.0, 0.0, torch.backends.cudnn.enabled)
-        top = data * _along(scale, self.axis, data)
-        return top if bias is None else top + _along(bias, self.axis, data)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        top = graph.node("Mul", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
-        if not self.param.scale_param.bias_term:
-            return top
-        return graph.node("Add", top, self.onnx_operand(graph, bottoms[:1], len(self.blobs) - 1, self.axis))
-
-    @property
-    @override
-    def small(self) -> bool:
-        shape, axes = self.bottom_shapes[0], len((*self.bottom_shapes[1:], *self.blob_shapes)[0])
-        return self.axis == 1 and axes == 1 and math.prod(shape[1:]) <= SMALL_ITEM
-
-    fresh = True
-    any_layout = True
-
-    def prepare(self, how: Preparation) -> Kernel | None:
-        if not self.by_channel:
-            return None
-        scale, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
-        axes = (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
-        if self.is_exact(scale, self.small):
-            factors, shift = (
-                values_of(scale).clone().view(axes),
-                None if bias is None else values_of(bias).clone().view(axes),
-            )
-            if shift is None:
-                return finished(lambda data: data * factors, how.finish)
-            return finished(lambda data: (data * factors).add_(shift), how.finish)
-        zero, one, cudnn = torch.zeros_like(scale), torch.ones_like(scale), torch.backends.cudnn.enabled
-        kernel = lambda data: torch.batch_norm(data, scale, bias, zero, one, False, 0.0, 0.0, cudnn)  # noqa: E731
-        return finished(kernel, how.finish)
-
-    @property
-    def by_channel(self) -> bool:
-        """Whether it multiplies each channel by a learned factor."""
-        return len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
-
-    def as_affine(self) -> Affine | None:
-        if not self.by_channel:
-            return None
-        scale = blob_in_double(self, 0)
-        return scale, blob_in_double(self, 1) if len(self.blobs) > 1 else torch.zeros_like(scale)
-
-    @property
-    def absorbs_before(self) -> bool:
-        return self.by_channel
-
-    def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        own = self.as_affine()
-        assert own is not None
-        param = copy_of(self.param)
-        param.scale_param.bias_term = True
-        factor, offset = (values.to(scale) for values in own)
-        return Absorbed(param, (factor * scale, factor * shift + offset))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.by_channel:
-            scale = self.blob(0)
-            if code.affine(bottoms[0], scale, self.blob(1) if len(self.blobs) > 1 else torch.zeros_like(scale)):
-                return bottoms[0]
-        top = code.call("{x} * {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))
-        if not self.param.scale_param.bias_term:
-            return top
-        return code.call("{x} + {y}", x=top, y=self.torch_operand(code, bottoms[:1], len(self.blobs) - 1, self.axis))
-
-
-@register("Bias", "bias_param")
-class Bias(_Affine):
-    """Add a learned bias, or a second bottom.
-
-    bottom[0]  any shape
-    bottom[1]  optional, the bias: bottom[0]'s shape from ``axis`` on, as many axes as it has
-    top[0]     bottom[0]'s shape
-    blobs[0]   bias, bottom[0]'s shape from ``axis`` for ``num_axes``       unless bottom[1] is given
-    Caffe: src/caffe/layers/bias_layer.cpp
-    """
-
-    @override
-    def setup(self) -> None:
-        param = self.param.bias_param
-        if len(self.bottom_shapes) == 1:
-            self.add_blob(self.learned_shape(param, "bias_param"), param.filler)
-
-    @override
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        self.axis = self.locate(bottom_shapes, self.param.bias_param, "bias_param")
-        return [bottom_shapes[0]]
-
-    @override
-    def forward(self, data: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-        operand = self.blob(0) if bias is None else bias
-        if self.is_exact(data):
-            return self.apply_exactly(data, None, operand, self.axis)
-        return data + _along(operand, self.axis, data)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Add", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
-
-    def as_affine(self) -> Affine | None:
-        if len(self.bottom_shapes) > 1 or self.axis != 1 or len(self.blob_shapes[0]) != 1:
-            return None
-        shift = blob_in_double(self, 0)
-        return torch.ones_like(shift), shift
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("{x} + {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))
 
 
 @register("LRN", "lrn_param")

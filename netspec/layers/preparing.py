@@ -82,6 +82,14 @@ class RunsWith(Protocol):
         ...
 
 
+class ScalesChannels(Protocol):
+    """A layer that may multiply each channel, axis 1, by a learned factor."""
+
+    def channel_factors(self) -> tuple[torch.Tensor, torch.Tensor | None] | None:
+        """Return the factors and, where there are some, the biases added then; None where it does something else."""
+        ...
+
+
 def own_kernel(layer: Layer, how: Preparation) -> Kernel | None:
     """Return the kernel that a layer has for its present shapes, None where it has none of its own."""
     prepare = offered(layer, "prepare")
@@ -91,6 +99,12 @@ def own_kernel(layer: Layer, how: Preparation) -> Kernel | None:
 def finishing(layer: Layer) -> Finish | None:
     """Return the map from number to number that a layer is, where it can be done in place."""
     find = offered(layer, "finishing")
+    return None if find is None else find()
+
+
+def channel_factors(layer: Layer) -> tuple[torch.Tensor, torch.Tensor | None] | None:
+    """Return the learned factors and biases of channels, where to multiply and add them is all that a layer does."""
+    find = offered(layer, "channel_factors")
     return None if find is None else find()
 
 
