@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from google.protobuf import text_format
 
 from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, run_module, source_module
-from laws.test_registry import EXAMPLES, TYPES, folder  # noqa: F401
+from laws.examples import EXAMPLES
+from laws.test_registry import TYPES, folder  # noqa: F401
 from netspec.errors import SpecError
 from netspec.export.deploy import with_inputs
 from netspec.export.onnx import onnx_model
@@ -16,6 +18,7 @@ from netspec.graph.options import BuildOptions
 from netspec.layers import layer_class
 from netspec.net.build import build_net
 from netspec.net.net import Net
+from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text
 
 NOT_IN_ONNX = {"DummyData": "random", "HDF5Output": "writes a file", "Python": "code"}
@@ -26,16 +29,14 @@ DATA = [name for name in TYPES if getattr(layer_class(name), "reads_data", False
 def net_of_example(name: str, folder: Path) -> Net:  # noqa: F811
     example = EXAMPLES[name]
     text = "force_backward: false\n"
-    for i, shape in enumerate(example.shapes):
+    for blob, shape in zip(example.param.bottom, example.shapes, strict=True):
         dims = " ".join(f"dim: {size}" for size in shape)
-        text += f'layer {{ name: "bottom{i}" type: "Input" top: "bottom{i}" input_param {{ shape {{ {dims} }} }} }}\n'
-    bottoms = " ".join(f'bottom: "bottom{i}"' for i in range(len(example.shapes)))
-    tops = " ".join(f'top: "top{i}"' for i in range(example.tops))
-    text += f'layer {{ name: "it" type: "{name}" {bottoms} {tops} {example.text.replace("{tmp}", str(folder))} }}\n'
+        text += f'layer {{ name: "{blob}" type: "Input" top: "{blob}" input_param {{ shape {{ {dims} }} }} }}\n'
+    text += f"layer {{ {text_format.MessageToString(example.param)} }}\n"
     message, source = parse_net_text(text, "net.prototxt")
-    message = with_state(message, example.phase)
+    message = with_state(message, example.param.phase if example.param.HasField("phase") else TEST)
     if name in DATA:
-        message, source = with_inputs(message, source, {"top0": (3, 2, 9, 9)})
+        message, source = with_inputs(message, source, {"data": (3, 2, 9, 9)})
     return build_net(message, source, BuildOptions(seed=0, allow_python=True))
 
 
@@ -63,7 +64,10 @@ def test_layer_computes_the_same_elsewhere_or_says_why_it_cannot(
     write = onnx_model if target == "ONNX" else source_module
     refused = (NOT_IN_ONNX if target == "ONNX" else NOT_IN_TORCH).get(name)
     if refused:
-        with pytest.raises(SpecError, match=rf'layer "it" \({name}\): cannot be exported to {target}: .*{refused}'):
+        with pytest.raises(
+            SpecError,
+            match=rf'layer "{EXAMPLES[name].param.name}" \({name}\): cannot be exported to {target}: .*{refused}',
+        ):
             write(net)
         net.close()
         return

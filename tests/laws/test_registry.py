@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,150 +10,17 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from google.protobuf import text_format
 
 from each import each
 from fake_gpu import NAME, POSSIBLE, fake_gpu
+from laws.examples import EXAMPLES, Shape
 from netspec.errors import SpecError, Where
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, layer_class, layer_types
 from netspec.layers.data.memory import MemoryData
-from netspec.proto.schema import TEST, TRAIN, LayerParameter, PhaseValue
+from netspec.proto.schema import TEST, LayerParameter
 from paths import GOLDEN
 
-Shape = tuple[int, ...]
-MAPS = (2, 4, 5, 6)
-
-
-def labels(shape: Shape) -> torch.Tensor:
-    return torch.arange(int(np.prod(shape))).reshape(shape) % 4
-
-
-def flags(shape: Shape) -> torch.Tensor:
-    return torch.arange(int(np.prod(shape))).reshape(shape) % 2
-
-
-def ones(shape: Shape) -> torch.Tensor:
-    return torch.ones(shape)
-
-
-def beginnings(shape: Shape) -> torch.Tensor:
-    """Return the cont of sequences that begin with the batch."""
-    return torch.cat([torch.zeros(1, *shape[1:]), torch.ones(shape[0] - 1, *shape[1:])])
-
-
-def positive(shape: Shape) -> torch.Tensor:
-    return torch.linspace(0.1, 1, int(np.prod(shape))).reshape(shape)
-
-
-@dataclass(frozen=True)
-class Example:
-    """A layer's text, without type, bottoms and tops, and its bottoms: their shapes, and of some the ``values``.
-
-    ``batch`` is the axis of the items, None where there is no other batch to try; ``smooth``: there is a gradient.
-    """
-
-    text: str = ""
-    shapes: tuple[Shape, ...] = (MAPS,)
-    tops: int = 1
-    values: dict[int, Callable[[Shape], torch.Tensor]] = field(default_factory=dict)
-    phase: PhaseValue = TEST
-    batch: int | None = 0
-    smooth: bool = True
-
-    def bottoms(self, times: int = 1) -> list[torch.Tensor]:
-        """Return bottoms, in double, of ``times`` as many items as ``shapes`` say; most hold normal numbers."""
-        generator = torch.Generator().manual_seed(5)
-        made = []
-        for i, shape in enumerate(self.shapes):
-            sizes = tuple(size * (times if axis == self.batch else 1) for axis, size in enumerate(shape))
-            made.append(self.values[i](sizes) if i in self.values else torch.randn(sizes, generator=generator))
-        return [bottom.double() for bottom in made]
-
-
-def data(text: str, tops: int = 2) -> Example:
-    return Example(text, (), tops, batch=None, smooth=False)
-
-
-SEQUENCES = Example(
-    'recurrent_param { num_output: 3 weight_filler { type: "gaussian" std: 0.5 } }',
-    ((4, 2, 3), (4, 2)),
-    values={1: beginnings},
-    batch=1,
-)
-FILTERS = (
-    "convolution_param { num_output: 4 group: 2 kernel_size: 3 stride: 2 pad: 1 weight_filler { type: 'xavier' } }"
-)
-SCORES = ((3, 4), (3,))
-
-EXAMPLES = {
-    "AbsVal": Example(),
-    "Accuracy": Example("", SCORES, 2, {1: labels}, smooth=False),
-    "ArgMax": Example("argmax_param { top_k: 2 out_max_val: true }", smooth=False),
-    "BNLL": Example(),
-    "BatchNorm": Example("", phase=TRAIN),
-    "BatchReindex": Example("", (MAPS, (3,)), values={1: flags}),
-    "Bias": Example("bias_param { axis: 1 num_axes: 2 filler { type: 'uniform' } }"),
-    "Clip": Example("clip_param { min: -0.5 max: 0.75 }"),
-    "Concat": Example("", ((2, 3, 4), (2, 1, 4))),
-    "ContrastiveLoss": Example("contrastive_loss_param { margin: 4 }", ((3, 4), (3, 4), (3,)), values={2: flags}),
-    "Convolution": Example(FILTERS, (MAPS, MAPS), 2),
-    "Crop": Example("crop_param { offset: 1 offset: 2 }", (MAPS, (2, 1, 3, 2))),
-    "Data": data(f'data_param {{ source: "{GOLDEN}/pairs/train_lmdb" batch_size: 3 backend: LMDB }}'),
-    "Deconvolution": Example(FILTERS),
-    "Dropout": Example(),
-    "DummyData": data('dummy_data_param { shape { dim: 2 dim: 3 } data_filler { type: "uniform" } }', tops=2),
-    "ELU": Example("elu_param { alpha: 0.5 }"),
-    "Eltwise": Example("eltwise_param { operation: SUM coeff: 2 coeff: -1 }", (MAPS, MAPS)),
-    "Embed": Example(
-        "embed_param { num_output: 3 input_dim: 5 weight_filler { type: 'uniform' } }", ((2, 3),), values={0: labels}
-    ),
-    "EuclideanLoss": Example("", ((3, 4), (3, 4))),
-    "Exp": Example("exp_param { base: 2 scale: 0.5 shift: 1 }"),
-    "Filter": Example("", (MAPS, (2,)), values={1: ones}),
-    "Flatten": Example("flatten_param { axis: 1 end_axis: -2 }"),
-    "HDF5Data": data('hdf5_data_param { source: "{tmp}/files.txt" batch_size: 3 }', tops=1),
-    "HDF5Output": Example('hdf5_output_param { file_name: "{tmp}/out.h5" }', (MAPS, (2,)), 0, smooth=False),
-    "HingeLoss": Example("hinge_loss_param { norm: L2 }", SCORES, values={1: labels}),
-    "Im2col": Example("convolution_param { kernel_size: 3 pad: 1 dilation: 2 }"),
-    "ImageData": data('image_data_param { source: "{tmp}/list.txt" root_folder: "{tmp}/" batch_size: 2 }'),
-    "InfogainLoss": Example("", (*SCORES, (4, 4)), values={1: labels}, batch=None),
-    "InnerProduct": Example("inner_product_param { num_output: 3 weight_filler { type: 'xavier' } }"),
-    "Input": data("input_param { shape { dim: 2 dim: 3 } }", tops=1),
-    "LRN": Example("lrn_param { local_size: 3 alpha: 0.5 }"),
-    "LSTM": SEQUENCES,
-    "LSTMUnit": Example("", ((1, 2, 3), (1, 2, 12), (1, 2)), 2, {2: flags}, batch=1),
-    "Log": Example("log_param { base: 2 scale: 0.1 shift: 9 }"),
-    "MVN": Example(),
-    "MemoryData": data("memory_data_param { batch_size: 2 channels: 3 height: 4 width: 5 }"),
-    "MultinomialLogisticLoss": Example("", SCORES, values={0: positive, 1: labels}),
-    "PReLU": Example(),
-    "Parameter": Example("parameter_param { shape { dim: 2 dim: 3 } }", (), batch=None),
-    "Pooling": Example("pooling_param { kernel_size: 3 stride: 2 pad: 1 }", tops=2),
-    "Power": Example("power_param { power: 2 scale: 0.5 shift: 1 }"),
-    "Python": Example('python_param { module: "law_twice" layer: "Twice" }'),
-    "RNN": SEQUENCES,
-    "ReLU": Example("relu_param { negative_slope: 0.1 }"),
-    "Reduction": Example("reduction_param { operation: SUMSQ axis: 1 coeff: 0.5 }"),
-    "Reshape": Example("reshape_param { shape { dim: 0 dim: -1 dim: 2 } }"),
-    "SPP": Example("spp_param { pyramid_height: 2 }"),
-    "Scale": Example("scale_param { axis: 1 num_axes: 2 bias_term: true }"),
-    "Sigmoid": Example(),
-    "SigmoidCrossEntropyLoss": Example("", ((3, 4), (3, 4)), values={1: flags}),
-    "Silence": Example("", (MAPS, (2,)), 0, smooth=False),
-    "Slice": Example("slice_param { slice_point: 1 slice_point: 3 }", tops=3),
-    "Softmax": Example(),
-    "SoftmaxWithLoss": Example("", SCORES, 2, {1: labels}),
-    "Split": Example("", tops=2),
-    "Swish": Example("swish_param { beta: 2 }"),
-    "TanH": Example(),
-    "Threshold": Example("threshold_param { threshold: 0.25 }", smooth=False),
-    "Tile": Example("tile_param { tiles: 3 }"),
-    "WindowData": data(
-        'transform_param { crop_size: 9 } window_data_param { source: "{tmp}/windows.txt" root_folder: "{tmp}/" '
-        "batch_size: 4 }"
-    ),
-}
 TYPES = [name for name in layer_types() if getattr(layer_class(name), "__module__", "").startswith("netspec.layers.")]
 
 
@@ -163,10 +29,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of small data for the layers that read any, and a module for the one that runs code."""
     folder = tmp_path_factory.mktemp("registry")
     cv2.imwrite(str(folder / "a.png"), np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8))
-    (folder / "list.txt").write_text("a.png 0\n")
+    (folder / "train_lmdb").symlink_to(GOLDEN / "pairs" / "train_lmdb")
+    (folder / "train.txt").write_text("a.png 0\n")
     (folder / "windows.txt").write_text("# 0\na.png\n3\n20\n30\n2\n1 0.9 0 0 9 9\n0 0.1 5 5 19 19\n")
     with h5py.File(folder / "rows.h5", "w") as file:
-        file["top0"] = np.zeros((5, 2), np.float32)
+        file["data"] = np.zeros((5, 2), np.float32)
     (folder / "files.txt").write_text(f"{folder}/rows.h5\n")
     (folder / "law_twice.py").write_text(
         "import caffe\n"
@@ -180,11 +47,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu", exact: str = "small") -> Layer:
-    example = EXAMPLES[name]
-    param = LayerParameter(name="it", type=name)
-    text_format.Merge(example.text.replace("{tmp}", str(folder)), param)
-    param.bottom.extend(f"bottom{i}" for i in range(len(shapes)))
-    param.top.extend(f"top{i}" for i in range(example.tops))
+    param = LayerParameter()
+    param.CopyFrom(EXAMPLES[name].param)
+    param.bottom[:] = [f"bottom{i}" for i in range(len(shapes))]
     cls = layer_class(name)
     assert cls is not None
 
@@ -192,7 +57,7 @@ def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu",
         return Where(".".join(map(str, path)))
 
     options = BuildOptions(device, allow_python=True, exact=exact)
-    return cls(param, shapes, Context(example.phase, options, Random(0), at))
+    return cls(param, shapes, Context(TEST, options, Random(0), at))
 
 
 def of_each(names: Iterable[str], exacts: Sequence[str] = ("small",)) -> Callable[..., Any]:
