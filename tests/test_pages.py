@@ -89,6 +89,13 @@ NOT_RUN = {
     },
     "prototxt/README.md": {"lmdb-build compare prototxt/normalized/siamese_8": "needs a GPU"},
     "docs/faithful.md": {"tools/run_tests": "runs tests that run beside this one"},
+    "docs/from-pytorch.md": {
+        "pip install": "needs a package index",
+        "python3 examples/efficientnet_lite0.py": "tests/test_examples.py runs it",
+        "netspec check efficientnet_lite0": "needs what that script writes",
+        "netspec fold efficientnet_lite0": "needs what that script writes",
+        "netspec extract efficientnet_lite0": "needs what that script writes",
+    },
     "docs/growth.md": {"tools/bench growth layers": BENCH, "tools/bench growth batch": BENCH},
     "docs/performance.md": {"tools/bench": "times are measured, for minutes; " + BENCH},
     "docs/start.md": {
