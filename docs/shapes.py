@@ -10,7 +10,7 @@ import math
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -42,7 +42,7 @@ def examples() -> dict[str, Example]:
 
 
 def _example(found: re.Match[str]) -> tuple[str, Example]:
-    from netspec.check.check import check_file
+    from netspec.check.check import ON_META, check_file
 
     bottoms, given = (_shapes(found[part] or "") for part in ("bottoms", "tops"))
     inputs = [
@@ -53,7 +53,7 @@ def _example(found: re.Match[str]) -> tuple[str, Example]:
         path = Path(folder) / "layer.prototxt"
         path.write_text("".join(inputs) + found["text"])
         logging.getLogger("netspec").setLevel(logging.WARNING)
-        (checked,) = check_file(path, shapes=given)
+        (checked,) = check_file(path, options=replace(ON_META, given_shapes=given))
     if checked.net is None or checked.faults:
         raise ValueError(f"{EXAMPLES}: {checked.faults}\n{found['text']}")
     param, layer = checked.net.param.layer[-1], checked.net.layers[-1]

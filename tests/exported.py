@@ -85,7 +85,7 @@ def calibrated(net: Net, inputs: Arrays) -> Net:
         return step.run(*bottoms)
 
     with torch.no_grad():
-        walk(net.eager.one_by_one(), values, net.exact, visit)
+        walk(net.eager.one_by_one(), values, net.options.exact, visit)
     return net
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,10 +11,10 @@ import pytest
 import torch
 
 import netspec
-from netspec.check.check import check_file
+from netspec.check.check import ON_META, check_file
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
-from netspec.net.build import load_net
+from netspec.engines.net import load_net
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
 from netspec.proto.text import parse_net_text, read_net, read_solver
@@ -280,6 +281,6 @@ def test_every_net_checks_without_a_fault_or_advice(path: Path) -> None:
     batch = int(re.findall(r"batch_size: (\d+)", text)[0])
     label = re.findall(r'top: "(\w+)"', text)[1]
     shapes = {"pair_data": (batch, 6, 64, 64), label: (batch,)}
-    (checked,) = check_file(path, TRAIN, shapes=shapes)
+    (checked,) = check_file(path, TRAIN, replace(ON_META, given_shapes=shapes))
     assert not checked.faults
     assert not checked.advice

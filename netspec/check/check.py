@@ -8,7 +8,7 @@ settings too.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,9 @@ from netspec.check import net_rules, solver_rules  # noqa: F401, they register t
 from netspec.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
 from netspec.check.forks import gathered, others, python_layers, unknown_types
 from netspec.errors import ForkFault, SpecError
-from netspec.files.limits import most
+from netspec.files.limits import memory
 from netspec.graph.filter import with_state, with_train_state
 from netspec.graph.options import BuildOptions
-from netspec.layers.base import Shape
 from netspec.net.build import build_net
 from netspec.net.given_shapes import not_to_be_given
 from netspec.net.net import Net
@@ -49,40 +48,26 @@ class Checked:
     advice: list[Finding] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class _Manner:
-    shapes: Mapping[str, Shape]
-    open_data: bool
-    allow_python: bool
-    strict: bool
-    passes: Collection[str] | None
+ON_META = BuildOptions("meta", open_data=False, passes=())  # shapes only, and no data is opened
 
 
 def check_file(
     path: str | Path,
     phase: PhaseValue = TEST,
-    level: int = 0,
-    stages: Sequence[str] = (),
-    shapes: Mapping[str, Shape] | None = None,
-    open_data: bool = False,
+    options: BuildOptions = ON_META,
     weights: str | None = None,
-    allow_python: bool = False,
-    strict: bool = False,
-    passes: Collection[str] | None = None,
 ) -> list[Checked]:
     """Check a net for a phase, level and stages; or a solver and all its nets, where the training net gets these.
 
     Of a .caffemodel, the net inside it is checked (:func:`netspec.net.recovered.recover_net`).
 
-    ``shapes`` are those of data layers' tops; the data of the others is opened with ``open_data``. ``weights``, paths
-    separated by commas, are what a training would begin with, in the place of a solver's own; with ``strict`` they
-    must have every layer. A file that cannot be read comes alone, without a net. With ``passes`` a net gets memory, so
-    that :func:`netspec.check.plan.plan_text` can tell how it runs with them.
+    ``weights``, paths separated by commas, are what a training would begin with, in the place of a solver's own. A file
+    that cannot be read comes alone, without a net. On another device than "meta" a net gets memory, so that
+    :func:`netspec.check.plan.plan_text` can tell how it runs.
     """
-    manner = _Manner(shapes or {}, open_data, allow_python, strict, passes)
     given = [weights] if weights else []
     if is_net_binary(path):
-        return [_check_weights(path, manner)]
+        return [_check_weights(path, options)]
     unknown: list[SpecError] = []
     try:
         net, source = parse_net(path, report=unknown.append)
@@ -93,19 +78,19 @@ def check_file(
         except SpecError as as_solver:
             last = max([*unknown, as_net], [*of_solver, as_solver], key=_reach)
             return [Checked(str(path), None, gathered(last))]
-        solver = with_train_state(solver, level, stages)
-        return _check_solver(solver, node, path, given or solver.weights, manner, of_solver)
+        solver = with_train_state(solver, options.level, options.stages)
+        return _check_solver(solver, node, path, given or solver.weights, options, of_solver)
     if unknown:  # the build finds unknown types itself, but not behind what it cannot build
-        unknown += _unknown_layers(net, source, manner)
-    net = with_state(net, phase, level, stages)
-    checked = _check_net(net, source, str(path), [] if unknown else given, manner)
+        unknown += _unknown_layers(net, source, options)
+    net = with_state(net, phase, options.level, options.stages)
+    checked = _check_net(net, source, str(path), [] if unknown else given, options)
     checked.faults = gathered([*unknown, *others(checked.faults, unknown)])
-    checked.faults += not_to_be_given(manner.shapes, [net], path)
+    checked.faults += not_to_be_given(options.given_shapes, [net], path)
     return [checked]
 
 
-def _unknown_layers(net: NetParameter, source: SourceMap, manner: _Manner) -> list[SpecError]:
-    return [*unknown_types(net, source), *([] if manner.allow_python else python_layers(net, source))]
+def _unknown_layers(net: NetParameter, source: SourceMap, options: BuildOptions) -> list[SpecError]:
+    return [*unknown_types(net, source), *([] if options.allow_python else python_layers(net, source))]
 
 
 def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
@@ -114,36 +99,28 @@ def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
     return (where.line, where.column) if where else (0, 0)
 
 
-def _check_weights(path: str | Path, manner: _Manner) -> Checked:
+def _check_weights(path: str | Path, options: BuildOptions) -> Checked:
     """Check the net inside a .caffemodel, as a deploy net, and its weights."""
     try:
-        net, source = recover_net(path, manner.shapes)
+        net, source = recover_net(path, options.given_shapes)
     except SpecError as fault:
         return Checked(str(path), None, [fault])
     types = list(unknown_types(net, source))
     if types:
         return Checked(str(path), None, gathered(types))
-    return _check_net(with_state(net, TEST), source, str(path), [str(path)], replace(manner, shapes={}))
+    return _check_net(with_state(net, TEST), source, str(path), [str(path)], replace(options, given_shapes={}))
 
 
 def _check_net(
-    net: NetParameter, source: SourceMap, label: str, weights: Iterable[str], manner: _Manner, seed: int = 0
+    net: NetParameter, source: SourceMap, label: str, weights: Iterable[str], options: BuildOptions, seed: int = 0
 ) -> Checked:
     """Build a net (its ``state`` set) without memory, check weights against it, and collect the errors."""
     faults: list[SpecError] = []
-    options = BuildOptions(
-        "meta" if manner.passes is None else "cpu",
-        seed,
-        open_data=manner.open_data,
-        given_shapes=manner.shapes,
-        allow_python=manner.allow_python,
-        passes=manner.passes or (),
-    )
-    built = build_net(net, source.telling(faults.append), options)
-    if fault := built.need.fault(most()):
+    built = build_net(net, source.telling(faults.append), replace(options, seed=seed))
+    if fault := built.need.fault(memory() if options.limit is None else options.limit):
         faults.append(fault)
     if files := [path for paths in weights for path in split_paths(paths)]:
-        load_weights(built, files, manner.strict)
+        load_weights(built, files, options.strict)
     advice = [*findings(TEXT, net, source), *findings(PLAN, net, source, built.plan)]
     advice += [] if faults else findings(NET, built)
     return Checked(label, built, faults, not_ignored(advice, source.file, source.layers))
@@ -154,7 +131,7 @@ def _check_solver(
     node: Place,
     path: str | Path,
     weights: Iterable[str],
-    manner: _Manner,
+    options: BuildOptions,
     faults: list[SpecError],
 ) -> list[Checked]:
     """Check a solver and its nets; ``faults`` are those of its text, to which others are added."""
@@ -169,11 +146,11 @@ def _check_solver(
     described = solver_nets(solver, node, faults.append)
     unknown: list[SpecError] = [fault for fault in faults if isinstance(fault, ForkFault)]
     if unknown:
-        unknown += [fault for part in described for fault in _unknown_layers(part.net, part.source, manner)]
+        unknown += [fault for part in described for fault in _unknown_layers(part.net, part.source, options)]
         weights = []
-    faults += not_to_be_given(manner.shapes, [part.net for part in described], path)
+    faults += not_to_be_given(options.given_shapes, [part.net for part in described], path)
     parts = [
-        _check_net(part.net, part.source, part.label, weights, manner, seed_of(max(solver.random_seed, 0), part.label))
+        _check_net(part.net, part.source, part.label, weights, options, seed_of(max(solver.random_seed, 0), part.label))
         for part in described
     ]
     nets = [part.net for part in parts if part.net is not None]

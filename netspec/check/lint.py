@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from netspec.check.check import Checked, check_file
+from netspec.check.check import ON_META, Checked, check_file
 from netspec.check.findings import Finding
 from netspec.errors import SpecError, UnknownShape
-from netspec.layers.base import Shape
+from netspec.graph.options import BuildOptions
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, PhaseValue
 
@@ -31,21 +30,14 @@ class Linted:
     nets: list[Net] = field(default_factory=list)
 
 
-def lint_file(
-    path: str | Path,
-    level: int = 0,
-    stages: Sequence[str] = (),
-    shapes: Mapping[str, Shape] | None = None,
-    open_data: bool = False,
-    allow_python: bool = False,
-) -> Linted:
+def lint_file(path: str | Path, options: BuildOptions = ON_META) -> Linted:
     """Apply the rules to a net in both phases, or to a solver and its nets; arguments as for check_file.
 
     A phase for which a net has no data layer is left out where the other has one.
     """
 
     def check(phase: PhaseValue) -> list[Checked]:
-        return check_file(path, phase, level, stages, shapes, open_data, allow_python=allow_python)
+        return check_file(path, phase, options)
 
     parts = check(TRAIN)
     if len(parts) == 1 and parts[0].net is not None:

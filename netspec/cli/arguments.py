@@ -11,8 +11,10 @@ from typing import Any
 from netspec.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
+from netspec.graph.options import BuildOptions
 from netspec.graph.steps import PASSES
 from netspec.proto.binary import split_paths
+from netspec.proto.schema import PHASES
 from netspec.terminal import log
 from netspec.terminal.commands import WrongUsage, refuse
 
@@ -160,6 +162,18 @@ def shape(text: str) -> tuple[str, tuple[int, ...]]:
     return match[1], tuple(int(d) for d in match[2].split(","))
 
 
+_CHOSEN = {name: name for name in ("level", "exact", "strict", "passes", "limit")}
+_CHOSEN |= {"allow_python_layers": "allow_python", "data": "open_data", "compile": "compiled"}
+
+
+def options(arguments: argparse.Namespace, **chosen: Any) -> BuildOptions:
+    """Return how a command's nets are built: as its options say, and as ``chosen``."""
+    said = {_CHOSEN[name]: value for name, value in vars(arguments).items() if name in _CHOSEN}
+    if "stage" in arguments:
+        said["stages"] = stages(arguments)
+    return BuildOptions(**{**said, **chosen})
+
+
 def stages(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Return the stages of ``--stage``."""
     return tuple(stage for stage in arguments.stage.split(",") if stage)
@@ -207,17 +221,8 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
         log.info(cpu_site, "Use CPU.")
     else:
         log.info(gpu_site, f"Use GPU with device ID {chosen.index}")
-    return load_net(
-        path,
-        phase,
-        level=arguments.level,
-        stages=arguments.stage.split(","),  # without --stage an empty one, as in Caffe
-        device=chosen,
-        allow_python=arguments.allow_python_layers,
-        exact=arguments.exact,
-        write_files=write_files,
-        passes=arguments.passes,
-    )
+    stages = arguments.stage.split(",")  # without --stage an empty one, as in Caffe
+    return load_net(path, PHASES[phase], options(arguments, device=str(chosen), stages=stages, write_files=write_files))
 
 
 def load_weights(net: Any, paths: str | None, strict: bool) -> None:
@@ -235,5 +240,4 @@ def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:
         return net
     from netspec.engines.net import with_engine
 
-    paths = split_paths(weights) if weights else []
-    return with_engine(net, chosen, model(arguments), paths, arguments.level, arguments.stage.split(","))
+    return with_engine(net, chosen, model(arguments), split_paths(weights) if weights else [])

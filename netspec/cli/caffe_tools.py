@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 
-from netspec.cli.arguments import add_shapes, device, positive
+from netspec.cli.arguments import add_shapes, device, options, positive
 from netspec.cli.run import BUILT, READ, Commands
 from netspec.errors import SpecError
 from netspec.files.whole_file import whole_file
@@ -50,7 +50,8 @@ def _extract_features(arguments: argparse.Namespace) -> None:
 
     number = arguments.device.rpartition("=")[2]
     log.error("extract_features.cpp:62", "Using CPU" if arguments.mode == "CPU" else f"Using GPU {number}")
-    net = load_net(arguments.model, "TEST", arguments.weights, device=device(number if arguments.mode == "GPU" else ""))
+    chosen = options(arguments, device=str(device(number if arguments.mode == "GPU" else "")))
+    net = load_net(arguments.model, options=chosen, weights=[arguments.weights])
     write_features(
         net, arguments.blobs.split(","), arguments.databases.split(","), arguments.batches, arguments.db_type
     )

@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 
-from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, stages
+from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, options
 from netspec.cli.run import BUILT, Commands
 from netspec.errors import printable
 from netspec.process.garbage import no_collection
@@ -52,17 +52,12 @@ def _check(arguments: argparse.Namespace) -> int:
         refuse(arguments, ("passes",), "needs --plan, which prints what they do")
     elif arguments.json:
         refuse(arguments, ("plan",), "is not part of the JSON; leave out --json")
+    how = {} if arguments.plan else {"device": "meta", "passes": ()}
     checked = check_file(
         arguments.file,
-        phase=PHASES[arguments.phase],
-        level=arguments.level,
-        stages=stages(arguments),
-        shapes=dict(arguments.shape),
-        open_data=arguments.data,
-        weights=arguments.weights,
-        strict=arguments.strict,
-        allow_python=arguments.allow_python_layers,
-        passes=arguments.passes if arguments.plan else None,
+        PHASES[arguments.phase],
+        options(arguments, given_shapes=dict(arguments.shape), **how),
+        arguments.weights,
     )
     if len(checked) > 1:
         refuse(arguments, ("phase",), "is for a net; of a solver the nets of both phases are checked")

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from netspec.cli.arguments import add_python, add_shapes, add_state, stages
+from netspec.cli.arguments import add_python, add_shapes, add_state, options
 from netspec.cli.run import READ, Commands
 from netspec.errors import printable
 from netspec.proto.schema import PHASES, TEST, TRAIN
@@ -41,12 +41,8 @@ def _draw(arguments: argparse.Namespace) -> None:
         arguments.file,
         arguments.out,
         phases=[PHASES[arguments.phase]] if arguments.phase else [TRAIN, TEST],
-        level=arguments.level,
-        stages=stages(arguments),
-        shapes=dict(arguments.shape),
-        open_data=arguments.data,
+        options=options(arguments, given_shapes=dict(arguments.shape)),
         unfolded=arguments.unfold,
-        allow_python=arguments.allow_python_layers,
     )
     for fault in drawn.faults:
         print(f"warning: {fault}; shapes are missing from there on", file=sys.stderr)

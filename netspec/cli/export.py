@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from netspec.cli.arguments import add_python, add_shapes, add_state, stages
+from netspec.cli.arguments import add_python, add_shapes, add_state, options
 from netspec.cli.run import BUILT, Commands
 from netspec.files.limits import amount
 from netspec.proto.binary import split_paths
@@ -78,12 +78,9 @@ def _source(arguments: argparse.Namespace, labels: bool) -> Any:
         Path(arguments.file),
         weights,
         arguments.phase,
-        arguments.level,
-        stages(arguments),
-        dict(arguments.shape),
+        options(arguments, given_shapes=dict(arguments.shape)),
         arguments.blob,
         labels,
-        arguments.allow_python_layers,
     )
 
 

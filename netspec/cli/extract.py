@@ -22,6 +22,7 @@ from netspec.cli.arguments import (
     device,
     load_weights,
     model,
+    options,
     positive,
     run_by,
     shape,
@@ -113,14 +114,11 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
         weights,
         blob,
         arguments.input,
-        chosen,
         given,
         arguments.zooms or (1.0,),
-        arguments.exact,
-        arguments.strict,
         steps,
         choice(arguments),
-        arguments.passes,
+        options(arguments, device=str(chosen)),
     )
     size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "RGB" if net.scaling.swap else "BGR"
     print(f"{model(arguments)}: {blob} of {len(images.paths)} images from {arguments.images}")
@@ -131,7 +129,6 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
 def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.features.records import extract_records, with_sources
     from netspec.graph.filter import with_state
-    from netspec.graph.options import BuildOptions
     from netspec.net.build import build_net
     from netspec.proto.text import parse_net
 
@@ -140,9 +137,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     message, source = parse_net(model(arguments))
     stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
     stated = with_sources(stated, source, dict(arguments.source))
-    python, exact = arguments.allow_python_layers, arguments.exact
-    options = BuildOptions(str(device(arguments.gpu)), allow_python=python, exact=exact, passes=arguments.passes)
-    net = build_net(stated, source, options)
+    net = build_net(stated, source, options(arguments, device=str(device(arguments.gpu))))
     load_weights(net, arguments.weights, arguments.strict)
     net = run_by(net, arguments, arguments.weights)
     arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))

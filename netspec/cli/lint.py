@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from netspec.cli.arguments import add_python, add_shapes, add_state, stages
+from netspec.cli.arguments import add_python, add_shapes, add_state, options
 from netspec.cli.run import READ, Commands
 from netspec.terminal.commands import DONE, SOMETHING, UNREADABLE, WrongUsage, refuse
 
@@ -40,9 +40,7 @@ def _lint(arguments: argparse.Namespace) -> int:
     status = DONE
     for path in arguments.files:
         given = dict(arguments.shape)
-        linted = lint_file(
-            path, arguments.level, stages(arguments), given, arguments.data, arguments.allow_python_layers
-        )
+        linted = lint_file(path, options(arguments, device="meta", given_shapes=given, passes=()))
         for fault in linted.unknown:
             print(f"warning: {fault}; rules that need shapes are not applied", file=sys.stderr)
         if arguments.json:

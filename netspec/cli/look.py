@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from netspec.cli.arguments import add_steps, positive, shape
+from netspec.cli.arguments import add_steps, options, positive, shape
 from netspec.cli.run import BUILT, Commands
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto.binary import split_paths
@@ -150,10 +150,9 @@ def _net(arguments: argparse.Namespace) -> ImageNet:
         split_paths(arguments.weights),
         arguments.blob,
         arguments.input,
-        shape=given,
+        given,
         steps=steps,
-        exact="none",
-        passes=(),
+        options=options(arguments, exact="none", passes=()),
     )
 
 

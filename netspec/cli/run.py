@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from netspec.dialects import use_dialect
-from netspec.files.limits import limited, read_amount
+from netspec.files.limits import read_amount
 from netspec.terminal import commands, log
 
 READ, BUILT = 1, 2  # what a command does with nets: it reads their files, or makes them, which takes memory
@@ -38,8 +38,7 @@ class Commands(commands.Commands):
         def with_dialects(arguments: argparse.Namespace) -> int | None:
             for plugin in arguments.plugin:
                 use_dialect(plugin)
-            with limited(arguments.limit):
-                return function(arguments)
+            return function(arguments)
 
         added = super().add(name, with_dialects, summary)
         added.set_defaults(plugin=[], limit=None)

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, devices
+from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, devices, options
 from netspec.cli.run import BUILT, Commands, signals
 from netspec.runs.scores import Score, Scores, Snapshot, read_scores
 from netspec.terminal import log
@@ -139,27 +139,16 @@ def _as_caffe() -> bool:
 def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | None], processes: Processes) -> Solver:
     """Return the solver, resumed where that is asked for."""
     from netspec.process.heap import keep_freed_memory
-    from netspec.solver.solver import load_solver
+    from netspec.solver.options import TrainingOptions
+    from netspec.solver.solver import make_solver
 
     keep_freed_memory()
     if arguments.resume and (found := _newest(path)):
         arguments.snapshot, arguments.weights = str(found), None
-    solver = load_solver(
-        path,
-        weights=arguments.weights,
-        snapshot=arguments.snapshot,
-        device=devices(arguments.gpu) if arguments.gpu else None,
-        level=arguments.level,
-        stages=tuple(arguments.stage.split(",")),
-        allow_python=arguments.allow_python_layers,
-        action=action,
-        exact=arguments.exact,
-        strict=arguments.strict,
-        precision=arguments.precision,
-        nan=arguments.nan,
-        processes=processes,
-        compiled=arguments.compile,
-    )
+    build = options(arguments, stages=arguments.stage.split(","))  # without --stage an empty one, as in Caffe
+    gpus = devices(arguments.gpu) if arguments.gpu else ()
+    chosen = TrainingOptions(build, gpus, arguments.nan, arguments.precision, processes, action)
+    solver = make_solver(path, chosen, arguments.weights, arguments.snapshot)
     if arguments.scores and processes.is_root:
         _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
     return solver

@@ -425,7 +425,7 @@ class Net:
                 seconds[step.node] = time.perf_counter() - begin
             return tops
 
-        walk([step for step in net.eager.one_by_one() if step.node <= end], values, net.exact, visit)
+        walk([step for step in net.eager.one_by_one() if step.node <= end], values, net.options.exact, visit)
         return values
 
     # What can be wrong

@@ -91,26 +91,17 @@ def diagram_of(
     net: NetParameter,
     source: SourceMap,
     phases: Sequence[PhaseValue],
-    level: int = 0,
-    stages: Sequence[str] = (),
-    shapes: Mapping[str, Shape] | None = None,
-    open_data: bool = False,
-    allow_python: bool = False,
+    options: BuildOptions | None = None,
 ) -> Diagram:
-    """Return the diagram of an upgraded net in the given phases."""
+    """Return the diagram of an upgraded net in the given phases; nothing is written, and no memory is used."""
     faults: list[SpecError] = []
-    options = BuildOptions(
-        "meta",
-        0,
-        open_data=open_data,
-        write_files=False,
-        given_shapes=shapes or {},
-        allow_python=allow_python,
-        passes=(),
-    )
+    options = replace(options or BuildOptions(open_data=False), device="meta", seed=0, write_files=False, passes=())
     with log.silent():
         source = source.telling(faults.append)
-        seen = [_look(with_state(net, phase, level, stages), source, PHASE_NAMES[phase], options) for phase in phases]
+        seen = [
+            _look(with_state(net, phase, options.level, options.stages), source, PHASE_NAMES[phase], options)
+            for phase in phases
+        ]
     return _merged(net, source, seen, tuple({str(fault): fault for fault in faults}.values()))
 
 

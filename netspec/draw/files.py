@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from netspec.data.blobs import Shape
 from netspec.draw.diagram import Diagram, diagram_of
 from netspec.draw.html import html_of
 from netspec.draw.picture import picture_of
 from netspec.draw.svg import svg_of
 from netspec.errors import SpecError
 from netspec.files.whole_file import whole_file
+from netspec.graph.options import BuildOptions
 from netspec.net.recovered import recover_net
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import NetParameter, PhaseValue
@@ -24,19 +24,15 @@ def write_picture(
     path: str | Path,
     out: Path,
     phases: Sequence[PhaseValue],
-    level: int = 0,
-    stages: Sequence[str] = (),
-    shapes: Mapping[str, Shape] | None = None,
-    open_data: bool = False,
+    options: BuildOptions,
     unfolded: bool = False,
-    allow_python: bool = False,
 ) -> Diagram:
     """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
 
     Of a .caffemodel the net inside it is drawn. Returns what was drawn; its faults keep parts of the net from being
     built: the picture has no shapes there. Raises SpecError for a file that cannot be read.
     """
-    diagram = diagram_of(*_net_of(path, shapes or {}), phases, level, stages, shapes, open_data, allow_python)
+    diagram = diagram_of(*_net_of(path, options.given_shapes), phases, options)
     picture = picture_of(diagram)
     if out.suffix == ".png":
         from netspec.draw.png import png_of

@@ -18,13 +18,14 @@ from netspec.engines.model import Model, Origin
 from netspec.engines.runners import Unable, tell_unable
 from netspec.exact import SMALL
 from netspec.export.convert import Source
+from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Node
 from netspec.graph.steps import PASSES
 from netspec.layers.learned import Stamp, is_lent, stamp
 from netspec.layers.reading import reads_data
 from netspec.net import build
 from netspec.net.net import Net
-from netspec.proto.schema import PHASE_NAMES, TEST
+from netspec.proto.schema import PHASE_NAMES, TEST, phase_of
 from netspec.run.shapes import fitted
 from netspec.run.walk import Result, walk, weighted_sum
 
@@ -46,25 +47,36 @@ def load_net(
     engine: str = TORCH,
     precision: str = "fp32",
     cache: str | Path | bool | None = None,
+    limit: int | None = None,
 ) -> Net:
     """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
 
+    It takes what a user may choose as keywords; from here on that is one BuildOptions (netspec/graph/options.py).
     A warning names the layers that the weights lack; with ``strict`` that is an error.
     ``passes`` are what may speed up a net of phase TEST that runs without gradients (netspec/graph/steps.py).
     ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
     ``engine`` is "torch", "onnxruntime" or "openvino" (docs/engines.md), ``precision`` "fp32", or "bf16" where the
     engine has it, ``cache`` the folder that keeps exported models (None: the user's cache folder, False: none).
+    ``limit`` is the memory, in bytes, that the net may need (None: what there is).
     Raises SpecError for every fault of the files.
     """
     choice = Choice.of(engine, precision, cache)
-    stages = tuple(stages)
-    net = build.load_net(path, phase, weights, level, stages, device, seed, allow_python, exact, strict, passes)
-    return with_engine(net, choice, path, [] if weights is None else [weights], level, stages)
+    options = BuildOptions(
+        str(device),
+        seed,
+        level=level,
+        stages=tuple(stages),
+        allow_python=allow_python,
+        exact=exact,
+        passes=passes,
+        strict=strict,
+        limit=limit,
+    )
+    files = [] if weights is None else [weights]
+    return with_engine(build.load_net(path, phase_of(phase), options, files), choice, path, files)
 
 
-def with_engine(
-    net: Net, choice: Choice, path: str | Path, weights: Iterable[str | Path], level: int, stages: Iterable[str]
-) -> Net:
+def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[str | Path]) -> Net:
     """Let the chosen engine run a net that was read from ``path`` and ``weights``; return the net.
 
     Torch does by choice, or where a warning says what the engine cannot do.
@@ -81,8 +93,8 @@ def with_engine(
     if reason:
         tell_unable(choice, reason)
         return net
-    origin = Origin([path, *weights], {"level": level, "stages": tuple(stages)})
-    net.runners.insert(0, Engine(net, choice, origin if weights else None, _writer(net, Path(path), level, stages)))
+    origin = Origin([path, *weights], {"level": net.options.level or 0, "stages": tuple(net.options.stages)})
+    net.runners.insert(0, Engine(net, choice, origin if weights else None, _writer(net, Path(path))))
     return net
 
 
@@ -96,7 +108,7 @@ class Engine:
     """
 
     def __init__(self, net: Net, choice: Choice, origin: Origin | None, write: Write) -> None:
-        self._plan, self._layers, self._exact = net.plan, list(net.layers), net.exact
+        self._plan, self._layers, self._exact = net.plan, list(net.layers), net.options.exact
         self._choice, self._from, self._write = choice, origin, write
         self._losses = [tuple((j, w) for j, w in enumerate(row) if w) for row in net.loss_weights]
         self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
@@ -181,9 +193,9 @@ class Engine:
         return Origin(files, {**options, "blobs": blobs, "shapes": self._built})
 
 
-def _writer(net: Net, path: Path, level: int, stages: Iterable[str]) -> Write:
+def _writer(net: Net, path: Path) -> Write:
     """Return what exports a net as it is, read from ``path``; it does not keep the net alive."""
-    held, stages = weakref.ref(net), tuple(stages)
+    held, chosen = weakref.ref(net), net.options
     readers = [blob for layer in net.layers if reads_data(layer) for blob in layer.param.top]
 
     def write(to: Path, blobs: Sequence[str]) -> None:
@@ -191,7 +203,8 @@ def _writer(net: Net, path: Path, level: int, stages: Iterable[str]) -> Write:
         assert original is not None, "it is run by what calls this"
         if readers:
             shapes = {blob: original.shapes[blob] for blob in readers}
-            copy = Source(path, (), "TEST", level, stages, shapes).net()
+            given = BuildOptions(level=chosen.level, stages=chosen.stages, given_shapes=shapes)
+            copy = Source(path, options=given).net()
             copy.share_weights_with(original)
             original = copy
         write_model(original, to, blobs)

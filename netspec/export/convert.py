@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 
-from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
 from netspec.export.deploy import fold, with_inputs, write_caffe
 from netspec.export.onnx import export_onnx
@@ -30,31 +29,28 @@ from netspec.terminal.version import version
 
 @dataclass(frozen=True)
 class Source:
-    """What is exported: a net's prototxt, for a phase, level and stages, and its weights, some files in a row.
+    """What is exported: a net's prototxt, for a phase, and its weights, some files in a row.
 
-    ``shapes``: of the tops of data layers, and of inputs, by blob. ``blobs``: only what computes these is exported.
-    Without ``labels`` nothing that needs labels is: losses, accuracies.
+    Of ``options`` the level and stages count, the shapes of the tops of data layers and of inputs, and whether Python
+    layers may run. ``blobs``: only what computes these is exported. Without ``labels`` nothing that needs labels is:
+    losses, accuracies.
     """
 
     file: Path
     weights: Sequence[Path] = ()
     phase: str = "TEST"
-    level: int = 0
-    stages: Sequence[str] = ()
-    shapes: Mapping[str, Shape] = field(default_factory=dict)
+    options: BuildOptions = field(default_factory=BuildOptions)
     blobs: Sequence[str] = ()
     labels: bool = True
-    allow_python: bool = False
 
     def net(self) -> Net:
         """Return the net with its weights; layers that read data are inputs. Raises SpecError."""
         message, source = parse_net(self.file)
-        message = with_state(message, PHASES[self.phase], self.level, self.stages)
-        message, source = with_inputs(message, source, self.shapes, self.labels, self.allow_python)
+        message = with_state(message, PHASES[self.phase], self.options.level, self.options.stages)
+        message, source = with_inputs(message, source, self.options, self.labels)
         if self.blobs:
             message, source = prune(message, source, self.blobs, {})
-        options = BuildOptions(seed=0, given_shapes=self.shapes, allow_python=self.allow_python)
-        net = build_net(message, source, options)
+        net = build_net(message, source, replace(self.options, seed=0))
         if self.weights:
             load_weights(net, self.weights)
         return net
@@ -65,10 +61,10 @@ class Source:
         if self.weights:
             told["weights"] = ",".join(path.name for path in self.weights)
             told["weights.sha256"] = ",".join(_sha256(path) for path in self.weights)
-        if self.level:
-            told["level"] = str(self.level)
-        if any(self.stages):
-            told["stages"] = ",".join(self.stages)
+        if self.options.level:
+            told["level"] = str(self.options.level)
+        if any(self.options.stages):
+            told["stages"] = ",".join(self.options.stages)
         return {**told, "version": version()}
 
     @property

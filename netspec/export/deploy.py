@@ -6,13 +6,13 @@ The result is a NetParameter with its weights, for Caffe or any reader of its fi
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from netspec.data import blobs
-from netspec.data.blobs import Shape
 from netspec.files.whole_file import whole_file
 from netspec.graph.filter import filter_net
 from netspec.graph.fold import origins
@@ -29,27 +29,17 @@ from netspec.proto.upgrade.rewrite import copy_without
 from netspec.run.fold import Fold, find_folds
 
 
-def with_inputs(
-    net: Any,
-    source: SourceMap,
-    shapes: Mapping[str, Shape],
-    labels: bool = True,
-    allow_python: bool = False,
-) -> tuple[Any, SourceMap]:
-    """Return a net in which layers that read data are Input layers; ``shapes`` are those of their tops, by blob.
+def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool = True) -> tuple[Any, SourceMap]:
+    """Return a net in which layers that read data are Input layers; ``options`` has the shapes of their tops.
 
     Without ``labels`` every top of such a layer but the first is left out, and so is what needs one of them: losses
     and accuracies; the scores that they compared become outputs. The net's own ``state`` says which layers it has.
-    Raises SpecError for faults of the net, and where ``shapes`` names a blob that no such layer makes.
+    Raises SpecError for faults of the net, and where a shape is given for a blob that no such layer makes.
     """
     filtered, source = filter_net(net, source)
-    for fault in not_to_be_given(shapes, [filtered], source.file):
+    for fault in not_to_be_given(options.given_shapes, [filtered], source.file):
         raise fault
-    probe = build_net(
-        filtered,
-        source,
-        BuildOptions("meta", seed=0, open_data=False, given_shapes=shapes, allow_python=allow_python),
-    )
+    probe = build_net(filtered, source, replace(options, device="meta", seed=0, open_data=False))
     built = {layer.param.name: layer for layer in probe.layers}
     result = copy_without(filtered, {"layer"})
     places, missing = [], set()

@@ -11,6 +11,7 @@ from netspec.engines.choice import Choice
 from netspec.features.images import ImageNet
 from netspec.features.scaling import Steps
 from netspec.features.views import read_zooms
+from netspec.graph.options import BuildOptions
 from netspec.proto.binary import split_paths
 
 
@@ -46,7 +47,7 @@ class Describer:
         choice = Choice.of(engine, precision, cache)
         views = read_zooms(zooms)
         self.image_net = ImageNet(
-            model, split_paths(weights), blob, input, device, zooms=views, steps=steps, choice=choice
+            model, split_paths(weights), blob, input, None, views, steps, choice, BuildOptions(str(device))
         )
         self.views = len(self.image_net.zooms)
 

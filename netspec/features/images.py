@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +16,13 @@ from netspec.engines.choice import TORCH, Choice
 from netspec.engines.model import Model, Origin
 from netspec.engines.runners import Unable, tell_unable
 from netspec.errors import SpecError, Where
-from netspec.exact import SMALL
 from netspec.features.scaling import Steps, scaling_of
 from netspec.features.views import middle
 from netspec.files.image_list import ImageList
 from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, with_state
+from netspec.graph.options import BuildOptions
 from netspec.graph.prune import prune
-from netspec.graph.steps import PASSES
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
@@ -43,7 +43,7 @@ class ImageNet:
 
     The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
     None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning;
-    something in them must fit, and with ``strict`` every layer must be there. ``steps``, if any are given, are done to
+    something in them must fit. ``steps``, if any are given, are done to
     the pixels in the place of what the data layer's transform_param says. ``choice`` is the engine that runs the net:
     with another than torch, whose model the cache has, torch is not imported. Raises SpecError for faults of the files;
     warns where the weights were trained on other pixels.
@@ -55,19 +55,17 @@ class ImageNet:
         weights: Sequence[str | Path],
         blob: str,
         input_blob: str,
-        device: torch.device | str = "cpu",
         shape: Shape | None = None,
         zooms: Sequence[float] = (1.0,),
-        exact: str = SMALL,
-        strict: bool = False,
         steps: Steps | None = None,
         choice: Choice | None = None,
-        passes: Collection[str] = PASSES,
+        options: BuildOptions | None = None,
     ) -> None:
+        options = replace(options or BuildOptions(), seed=0)
         net, source = parse_net(model)
         net, source = filter_net(with_state(net, TEST), source)
         before, before_source = prune(net, source, [input_blob], {})
-        shape = shape or _shape_of(input_blob, before, before_source)
+        shape = shape or _shape_of(input_blob, before, before_source, options)
         if len(shape) != 4 or shape[1] not in (1, 3):
             message = f'input blob "{input_blob}" has shape {tuple(shape)}, expected N x 1 or 3 x H x W for images'
             raise SpecError(message, Where(source.file))
@@ -80,7 +78,7 @@ class ImageNet:
         after, after_source = prune(net, source, [blob], {input_blob: shape})
 
         def build() -> Net:
-            built = _build(after, after_source, weights, device, exact, strict, passes)
+            built = _build(after, after_source, weights, options)
             for path in weights:
                 if not transforming and not steps:
                     readers = [layer.name for layer in after.layer if input_blob in layer.bottom]
@@ -89,12 +87,14 @@ class ImageNet:
 
         self._build, self._net, self._model = build, None, None
         self._choice = choice or Choice()
-        if self._choice.engine == TORCH or str(device) != "cpu":
-            self._use_torch("" if self._choice.engine == TORCH else f"it runs on the CPU, this net is on {device}")
+        if self._choice.engine == TORCH or options.device != "cpu":
+            self._use_torch(
+                "" if self._choice.engine == TORCH else f"it runs on the CPU, this net is on {options.device}"
+            )
             return
-        options = {"blob": blob, "input": input_blob, "shape": shape, "strict": strict, "scaled": bool(steps)}
+        made_of = {"blob": blob, "input": input_blob, "shape": shape, "strict": options.strict, "scaled": bool(steps)}
         try:
-            self._model = Model(self._choice, Origin([model, *weights], options), self._export)
+            self._model = Model(self._choice, Origin([model, *weights], made_of), self._export)
         except Unable as fault:
             self._use_torch(str(fault))
 
@@ -159,37 +159,25 @@ def extract_images(describe: ImageNet, images: ImageList, progress: Progress = i
     return arrays
 
 
-def _shape_of(blob: str, net: NetParameter, source: SourceMap) -> Shape:
+def _shape_of(blob: str, net: NetParameter, source: SourceMap, options: BuildOptions) -> Shape:
     """Return the shape of a blob of a net; data is opened, but no memory for blobs is used."""
     if len(net.layer) == 1 and net.layer[0].type == "Input" and net.layer[0].input_param.shape:  # no need of torch
         shapes: Any = net.layer[0].input_param.shape
         return tuple(shapes[list(net.layer[0].top).index(blob) if len(shapes) > 1 else 0].dim)
-
-    from netspec.graph.options import BuildOptions
     from netspec.net.build import build_filtered
 
-    built = build_filtered(net, source, BuildOptions("meta", seed=0))
+    built = build_filtered(net, source, replace(options, device="meta"))
     built.close()
     return built.shapes[blob]
 
 
-def _build(
-    net: NetParameter,
-    source: SourceMap,
-    weights: Sequence[str | Path],
-    device: torch.device | str,
-    exact: str,
-    strict: bool,
-    passes: Collection[str],
-) -> Net:
-
-    from netspec.graph.options import BuildOptions
+def _build(net: NetParameter, source: SourceMap, weights: Sequence[str | Path], options: BuildOptions) -> Net:
     from netspec.net.build import build_filtered
     from netspec.net.weights import load_weights
 
-    built = build_filtered(net, source, BuildOptions(str(device), seed=0, exact=exact, passes=passes))
+    built = build_filtered(net, source, options)
     if weights:
-        load_weights(built, weights, strict, some=True)
+        load_weights(built, weights, options.strict, some=True)
     return built
 
 

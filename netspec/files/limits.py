@@ -6,8 +6,6 @@ import errno
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 ALWAYS = 1 << 28  # bytes that any file may ask for
@@ -15,7 +13,6 @@ MOST_PACKED = 100  # times a file's size: real data is packed 2 to 20 times, a f
 
 _UNITS = {"": 0, "k": 10, "m": 20, "g": 30, "t": 40}
 _CONTAINER = Path("/sys/fs/cgroup/memory.max")  # Linux: what a container may use, a number or "max"
-_limit: int | None = None  # of this process, for all of its threads
 
 
 def memory() -> int:
@@ -31,26 +28,6 @@ def memory() -> int:
         return min(machine, int(_CONTAINER.read_text()))
     except (ValueError, OSError):  # no limit, or no container
         return machine
-
-
-def most(available: Callable[[], int] = memory) -> int:
-    """Return the bytes of memory that a net may need: all there is, unless :func:`limited` sets another limit.
-
-    ``available`` tells how much there is, by default the machine's memory.
-    """
-    return available() if _limit is None else _limit
-
-
-@contextmanager
-def limited(size: int | None) -> Iterator[None]:
-    """Set what a net may need within the block, in bytes, for the whole process; None changes nothing."""
-    global _limit
-    before = _limit
-    _limit = before if size is None else size
-    try:
-        yield
-    finally:
-        _limit = before
 
 
 def is_out_of_memory(fault: BaseException) -> bool:

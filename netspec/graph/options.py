@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from netspec.exact import SMALL, check_choice
@@ -13,17 +13,19 @@ from netspec.graph.steps import PASSES
 class BuildOptions:
     """How a net is built.
 
-    ``device`` is torch's name of where its blobs are; on "meta" they have shapes and no values. ``seed`` None draws
-    one; ``open_data`` False opens no data (``given_shapes``: the tops of data layers, by blob). No layer writes a file
-    on "meta", nor without ``write_files``; ``allow_python`` lets Python layers run code. This net is number ``rank`` of
-    ``ranks`` nets that train in parallel: its data layers read their share of the records, and draw from ``data_seed``,
-    which must be the same for all ranks (None: from ``seed``).
+    Of the layers those are built whose rules fit ``level`` and ``stages``, besides the phase; level None leaves the one
+    that the prototxt has. ``device`` is torch's name of where its blobs are; on "meta" they have shapes and no values.
+    ``seed`` None draws one; ``open_data`` False opens no data (``given_shapes``: the tops of data layers, by blob). No
+    layer writes a file on "meta", nor without ``write_files``; ``allow_python`` lets Python layers run code. This net
+    is number ``rank`` of ``ranks`` nets that train in parallel: its data layers read their share of the records, and
+    draw from ``data_seed``, which must be the same for all ranks (None: from ``seed``).
     ``exact`` sets which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
     ``accumulate_in_place`` makes layers add the gradients that they sum up to ``grad`` themselves, like Caffe
     (netspec/exact/accumulate.py); hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see
     these gradients. With ``compiled``, torch.compile makes functions of those layers that it can follow.
     ``passes`` are those of netspec/graph/steps.py that a net of phase TEST may use when it runs without gradients.
-    Weights must have every layer of the net if ``strict``.
+    Weights must have every layer of the net if ``strict``. The net may need ``limit`` bytes of memory (None: what there
+    is on its device).
     """
 
     device: str = "cpu"
@@ -31,6 +33,8 @@ class BuildOptions:
     data_seed: int | None = None
     open_data: bool = True
     write_files: bool = True
+    level: int | None = 0
+    stages: Sequence[str] = ()
     given_shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     allow_python: bool = False
     rank: int = 0
@@ -40,6 +44,7 @@ class BuildOptions:
     passes: Collection[str] = PASSES
     compiled: bool = False
     strict: bool = False
+    limit: int | None = None
 
     def __post_init__(self) -> None:
         check_choice(self.exact)

@@ -6,54 +6,34 @@ Caffe: Net::Init (src/caffe/net.cpp)
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
-import torch
-
-from netspec.exact import SMALL
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
-from netspec.graph.steps import PASSES
 from netspec.net.net import Net
 from netspec.net.weights import copy_weights, load_weights
 from netspec.process.garbage import no_collection
-from netspec.proto.schema import NetParameter, phase_of
+from netspec.proto.schema import TEST, NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 from netspec.terminal import log
 
 
 def load_net(
-    path: str | Path,
-    phase: str | int = "TEST",
-    weights: str | Path | None = None,
-    level: int = 0,
-    stages: Iterable[str] = (),
-    device: str | torch.device = "cpu",
-    seed: int | None = None,
-    allow_python: bool = False,
-    exact: str = SMALL,
-    strict: bool = False,
-    passes: Collection[str] = PASSES,
-    write_files: bool = True,
+    path: str | Path, phase: PhaseValue = TEST, options: BuildOptions | None = None, weights: Iterable[str | Path] = ()
 ) -> Net:
-    """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
+    """Build the net of a prototxt, with the weights of files. Raises SpecError for every fault of the files.
 
-    A warning names the layers that the weights lack; with ``strict`` that is an error.
-    ``passes`` are what may speed up a net of phase TEST that runs without gradients (netspec/graph/steps.py).
-    ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
-    Without ``write_files`` no layer writes one. Raises SpecError for every fault of the files.
+    ``netspec.load_net`` (netspec/engines/net.py) is this with a keyword for each option.
     """
+    options = options or BuildOptions()
     net, source = parse_net(path)
-    options = BuildOptions(
-        str(device), seed, allow_python=allow_python, exact=exact, write_files=write_files, passes=passes
-    )
-    built = build_net(with_state(net, phase_of(phase), level, stages), source, options)
-    if weights is not None:
-        load_weights(built, weights, strict)
+    built = build_net(with_state(net, phase, options.level, options.stages), source, options)
+    if files := list(weights):
+        load_weights(built, files, options.strict)
     return built
 
 

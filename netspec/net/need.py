@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from netspec.errors import SpecError
-from netspec.files.limits import amount, most
+from netspec.files.limits import amount, memory
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
 from netspec.layers.reading import bytes_ahead
@@ -83,9 +83,11 @@ class Need:
         return f"{amount(self.total)}: parameters {amount(self.parameters)}, tops {amount(self.tops)}{ahead}"
 
 
-def limit_on(device: torch.device) -> int:
-    """Return the bytes that a net may need on a device: the device's memory, or the limit that was set."""
-    return most(lambda: torch.cuda.mem_get_info(device)[1]) if device.type == "cuda" else most()
+def limit_on(device: torch.device, limit: int | None = None) -> int:
+    """Return the bytes that a net may need on a device: the limit that was chosen, or the device's memory."""
+    if limit is not None:
+        return limit
+    return torch.cuda.mem_get_info(device)[1] if device.type == "cuda" else memory()
 
 
 def limit_text(limit: int) -> str:

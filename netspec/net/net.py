@@ -72,8 +72,8 @@ class Net(torch.nn.Module):
         self.param = plan.net
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
+        self.options = options
         self.device = torch.device(options.device)
-        self.exact = options.exact
         self.keep: str | Iterable[str] = ()
         self._kept_of: dict[str | tuple[str, ...], frozenset[int]] = {}  # by ``keep``, as it was last
         self._passing = _Passing()
@@ -84,7 +84,7 @@ class Net(torch.nn.Module):
         self._surveyed, self._too_much = False, None  # whether the whole net was looked at, and what was found
         seed = int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed
         self.random = Random(seed)
-        if self.exact == ALL and self.device.type == "cpu" and (said := other_kernels()):
+        if options.exact == ALL and self.device.type == "cpu" and (said := other_kernels()):
             log.warning("net.cpp:53", said)
         self.layers = self._build_layers(options)
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
@@ -92,15 +92,15 @@ class Net(torch.nn.Module):
         self._given = [
             v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
         ]
-        self._passes, self._compiled = options.passes, options.compiled
         if len(self.layers) == len(plan.nodes):  # otherwise errors were collected: it will not run
             self._set_runners()
 
     def _set_runners(self) -> None:
         """Make what runs the net: of ``runners`` the first that can. The last, ``eager``, always can."""
-        made = self.plan, list(self.layers), self.loss_weights, self.exact
-        self.eager = Eager(*made, self._compiled, learns=self.phase == TRAIN)
-        self.prepared = Prepared(*made, self._passes) if self.phase == TEST and self._passes else None
+        options = self.options
+        made = self.plan, list(self.layers), self.loss_weights, options.exact
+        self.eager = Eager(*made, options.compiled, learns=self.phase == TRAIN)
+        self.prepared = Prepared(*made, options.passes) if self.phase == TEST and options.passes else None
         self._training: TrainingStep | str | None = None  # made at the first pass that trains
         self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]
 
@@ -173,7 +173,7 @@ class Net(torch.nn.Module):
             owned = len(self.learnable)
             self._adopt_params(layers, i, layer)
             self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
-        if self.device.type != "meta" and (fault := self.need.fault(limit_on(self.device))):
+        if self.device.type != "meta" and (fault := self.need.fault(limit_on(self.device, options.limit))):
             report(fault)
         if len(layers) == len(self.plan.nodes):
             self._finish(list(layers.values()))
@@ -185,7 +185,10 @@ class Net(torch.nn.Module):
         Raises SpecError where that, or what the whole net needs, is too much. Only a net that takes much is looked at
         as a whole.
         """
-        if self.device.type == "meta" or self.need.total + size <= (limit := limit_on(self.device)) // MUCH:
+        if (
+            self.device.type == "meta"
+            or self.need.total + size <= (limit := limit_on(self.device, options.limit)) // MUCH
+        ):
             return
         if not self._surveyed:
             self._surveyed, self._too_much = True, self._survey(options).fault(limit)
@@ -317,7 +320,7 @@ class Net(torch.nn.Module):
             return "its layers are compiled"
         if why := obstacle(self.plan, list(self.layers), self.eager.chains):
             return why
-        weighted = partial(weighted_sum, exact=self.exact)
+        weighted = partial(weighted_sum, exact=self.options.exact)
         return TrainingStep(self.plan, list(self.layers), self.loss_weights, self.eager.overwritten, weighted)
 
     def given(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:

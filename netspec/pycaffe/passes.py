@@ -208,7 +208,7 @@ class Passes:
         if self._prepares and (start, end) == (0, len(self._layers) - 1) and not self._has_hooks():
             return self._forward_prepared()
         with one_thread() if any(self._has_kernels) else nullcontext():
-            loss = walk(self._steps(start, end), {}, self.net.exact)
+            loss = walk(self._steps(start, end), {}, self.net.options.exact)
         return torch.zeros((), device=self.net.device) if loss is None else loss
 
     def _steps(self, start: int, end: int) -> Iterator[Step]:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import torch
 from typing_extensions import override
 
+from netspec.graph.options import BuildOptions
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
 from netspec.pycaffe import mode
@@ -103,13 +104,9 @@ class Solver:
         if self.type_name:
             param.type = self.type_name
         with caffes_errors():
-            options = TrainingOptions(
-                mode.device(),
-                allow_python=True,
-                exact=mode.exact(),
-                seed=mode.solver_seed(),
-                nan="warn",  # as Caffe goes on: a script may look for itself
-            )
+            build = BuildOptions(seed=mode.solver_seed(), allow_python=True, exact=mode.exact())
+            # nan: as Caffe goes on: a script may look for itself
+            options = TrainingOptions(build, [mode.device()], nan="warn")
             self._training = _Training(param, node, options)
         self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
         self._training.on_start = lambda: self._call(0)

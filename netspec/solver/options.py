@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 
 from netspec.errors import SpecError
-from netspec.exact import NONE, SMALL
+from netspec.exact import NONE
+from netspec.graph.options import BuildOptions
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.solver.precision import FP32, check_precision
@@ -19,36 +21,34 @@ from netspec.terminal import log
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """How a training runs.
+    """How a training runs, and how its nets are built: ``build`` as far as it is one for all of them.
 
-    ``device`` overrides solver_mode and device_id; replicas of the training net run on ``others``. ``seed`` is used if
-    there is no random_seed; without it one is drawn. Python layers run if ``allow_python``. Weights to start from must
-    have every layer of each net if ``strict``. ``nan`` says what a loss of NaN or infinity does: "stop" raises
-    SpecError, "warn" warns once. In another ``precision`` than "fp32" (netspec/solver/precision.py) the training net
-    computes no sums in Caffe's order, whatever ``exact`` says. Of several ``processes`` each has one training net and
-    calls the same methods; the root tests and writes the snapshots. ``compiled`` nets run through torch.compile
-    (netspec/run/segments.py); they compute no sums in Caffe's order either.
+    ``devices`` override solver_mode and device_id: the training net is on the first, replicas of it are on the others.
+    ``build.seed`` is used if there is no random_seed; without it one is drawn. Level and stages are the training net's.
+    ``nan`` says what a loss of NaN or infinity does: "stop" raises SpecError, "warn" warns once. In another
+    ``precision`` than "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order, whatever
+    ``build.exact`` says, nor does a compiled one. Of several ``processes`` each has one training net and calls the same
+    methods; the root tests and writes the snapshots.
+    ``action`` is called between iterations, also those of a test: "stop" ends the training, "snapshot" takes one.
+    ``clock`` gives the seconds for "iter/s".
     """
 
-    device: torch.device | None = None
-    others: Sequence[torch.device] = ()
-    seed: int | None = None
-    allow_python: bool = False
-    exact: str = SMALL
-    strict: bool = False
+    build: BuildOptions = field(default_factory=BuildOptions)
+    devices: Sequence[torch.device] = ()
     nan: str = "stop"
     precision: str = FP32
     processes: Processes = field(default_factory=Processes)
-    compiled: bool = False
+    action: Callable[[], str | None] = lambda: None
+    clock: Callable[[], float] = time.perf_counter
 
     def __post_init__(self) -> None:
         check_precision(self.precision)
-        assert not (self.others and self.processes.count > 1), "each of several processes has one device"
+        assert not (self.devices[1:] and self.processes.count > 1), "each of several processes has one device"
 
     @property
     def exact_sums(self) -> str:
         """Which sums the training net computes as Caffe does, to the last bit."""
-        return self.exact if self.precision == FP32 and not self.compiled else NONE
+        return self.build.exact if self.precision == FP32 and not self.build.compiled else NONE
 
 
 def choose_device(param: Any, node: Place) -> torch.device:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import torch
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
+from netspec.graph.options import BuildOptions
 from netspec.layers.reading import reads_data, waited
 from netspec.proto.text import parse_solver
 from netspec.solver import update
@@ -25,7 +27,7 @@ from netspec.solver.extra import read_extra
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions, choose_device
 from netspec.solver.precision import FP16, FP32, LossScale, computing
-from netspec.solver.processes import Processes, own_device
+from netspec.solver.processes import own_device
 from netspec.solver.tally import as_scores
 from netspec.solver.testing import Tested, log_scores
 from netspec.terminal import log
@@ -39,54 +41,64 @@ def load_solver(
     level: int | None = None,
     stages: Iterable[str] = (),
     allow_python: bool = False,
-    action: Callable[[], str | None] | None = None,
+    action: Callable[[], str | None] = lambda: None,
     exact: str = SMALL,
     strict: bool = False,
     precision: str = FP32,
     nan: str = "stop",
-    processes: Processes | None = None,
     compiled: bool = False,
+    limit: int | None = None,
 ) -> Solver:
     """Build the solver of a prototxt and its nets, ready to run.
 
     ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
     ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
-    ``stages`` go to the training net. Several devices train side by side, the first being the root; where ``device`` is
-    None, each of several processes has the GPU of its number on its machine. For ``action`` see :class:`Training`, for
-    the others :class:`~netspec.solver.options.TrainingOptions`. Raises SpecError for every fault of the files.
+    ``stages`` go to the training net. Several devices train side by side, the first being the root. For the others see
+    :class:`~netspec.solver.options.TrainingOptions` and :class:`~netspec.graph.options.BuildOptions`, which all of this
+    is from here on. Raises SpecError for every fault of the files.
+    """
+    build = BuildOptions(
+        level=level,
+        stages=tuple(stages),
+        allow_python=allow_python,
+        exact=exact,
+        strict=strict,
+        compiled=compiled,
+        limit=limit,
+    )
+    given = [] if device is None else [device] if isinstance(device, (str, torch.device)) else device
+    options = TrainingOptions(build, [torch.device(d) for d in given], nan, precision, action=action)
+    return make_solver(path, options, weights, snapshot)
+
+
+def make_solver(
+    path: str | Path,
+    options: TrainingOptions,
+    weights: str | Path | Iterable[str | Path] | None = None,
+    snapshot: str | Path | None = None,
+) -> Solver:
+    """Build a solver as :func:`load_solver` does.
+
+    Where no device is given, each of several processes has the GPU of its number on its machine.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
     param, node = parse_solver(path)
-    if level is not None or stages:
-        param = with_train_state(param, level, stages)
+    if options.build.level is not None or options.build.stages:
+        param = with_train_state(param, options.build.level, options.build.stages)
     if weights is not None:
         param.ClearField("weights")
         param.weights.extend([str(weights)] if isinstance(weights, (str, Path)) else map(str, weights))
-    if device is None:
-        chosen = [choose_device(param, node)]
-        if processes is not None and processes.count > 1 and chosen[0].type == "cuda":
-            chosen = [own_device()]
-    else:
-        chosen = [torch.device(d) for d in ([device] if isinstance(device, (str, torch.device)) else device)]
-    if chosen[0].type == "cpu":
+    devices = options.devices or [choose_device(param, node)]
+    if not options.devices and options.processes.count > 1 and devices[0].type == "cuda":
+        devices = [own_device()]
+    if devices[0].type == "cpu":
         log.info("caffe.cpp:197", "Use CPU.")
     else:
-        log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in chosen))
+        log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in devices))
     extra = None if snapshot is None else read_extra(snapshot)
-    options = TrainingOptions(
-        chosen[0],
-        chosen[1:],
-        seed=None if extra is None else extra.seed,
-        allow_python=allow_python,
-        exact=exact,
-        strict=strict,
-        precision=precision,
-        nan=nan,
-        processes=processes or Processes(),
-        compiled=compiled,
-    )
-    solver = Solver(param, node, options, action=action or (lambda: None))
+    build = options.build if extra is None else replace(options.build, seed=extra.seed)
+    solver = Solver(param, node, replace(options, build=build, devices=devices))
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
         solver.restore(snapshot)
@@ -140,7 +152,7 @@ class Solver(Tested):
         self.losses.clear()
         self.losses.extend(self.losses_before)
         self.losses_before = ()
-        self._displayed = (self.clock(), self.iteration)
+        self._displayed = (self.options.clock(), self.iteration)
         self._waited = self._seconds_waited()
         for _ in range(iterations):
             if self.is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
@@ -159,7 +171,7 @@ class Solver(Tested):
             self.on_gradients()
             self.apply_update()
             self.on_iteration()
-            request = self.options.processes.agree(self.action())
+            request = self.options.processes.agree(self.options.action())
             if self.is_due(self.param.snapshot) or request == "snapshot":
                 self.snapshot()
             if request == "stop":
@@ -239,7 +251,7 @@ class Solver(Tested):
         return learning_rate(self.param, self.iteration, step)
 
     def _display(self, outputs: dict[str, torch.Tensor]) -> None:
-        now, (then, iteration) = self.clock(), self._displayed
+        now, (then, iteration) = self.options.clock(), self._displayed
         speed = (self.iteration - iteration) / (now - then or 1)
         pace = f"{log.number(speed)} iter/s, {log.number(now - then)}s/{self.param.display} iters"
         log.info("solver.cpp:239", f"Iteration {self.iteration} ({pace}), loss = {log.number(self.loss)}")

@@ -37,7 +37,9 @@ class Tested(Resumable):
         net.random.begin(f"test at iteration {self.iteration}")
         tally = Tally(scorers(net, self.param))
         for _ in range(batches):
-            while self.options.processes.count == 1 and (request := self.action()):  # several agree after an iteration
+            while self.options.processes.count == 1 and (
+                request := self.options.action()
+            ):  # several agree after an iteration
                 if request == "snapshot":
                     self.snapshot()
                 self.stopped |= request == "stop"

@@ -9,12 +9,12 @@ from netspec.net.net import Net
 
 def divided_sums(net: Net) -> list[str]:
     """Return the layers on the CPU whose sums torch divides among its threads: those not computed in Caffe's order."""
-    if net.exact == ALL or net.device.type != "cpu":
+    if net.options.exact == ALL or net.device.type != "cpu":
         return []
     return [
         node.name
         for node, layer in zip(net.plan.nodes, net.layers, strict=True)
-        if type(layer).small is not Layer.small and (net.exact == NONE or not layer.small)
+        if type(layer).small is not Layer.small and (net.options.exact == NONE or not layer.small)
     ]
 
 

@@ -6,15 +6,14 @@ Caffe: src/caffe/solver.cpp (Solver::Init); the sites in the log calls are the l
 from __future__ import annotations
 
 import os
-import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
 
 from netspec.errors import SpecError, Where
-from netspec.graph.options import BuildOptions
 from netspec.layers.reading import Scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
@@ -58,9 +57,6 @@ class Training:
     param: Any
     node: Place
     options: TrainingOptions
-    action: Callable[[], str | None]
-    clock: Callable[[], float]
-
     on_start: Callable[[], object] = staticmethod(lambda: None)
     on_gradients: Callable[[], object] = staticmethod(lambda: None)
     on_iteration: Callable[[], object] = staticmethod(lambda: None)
@@ -82,30 +78,17 @@ class Training:
     states_before_test: tuple[Remembered, ...] = ()
     _told_nan = False
 
-    def __init__(
-        self,
-        param: Any,
-        node: Place | None = None,
-        options: TrainingOptions | None = None,
-        *,
-        action: Callable[[], str | None] = lambda: None,
-        clock: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError.
-
-        ``action`` is called between iterations, also those of a test: "stop" ends the training, "snapshot" takes one.
-        ``clock`` gives the seconds for "iter/s".
-        """
+    def __init__(self, param: Any, node: Place | None = None, options: TrainingOptions | None = None) -> None:
+        """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError."""
         self.param, self.node, self.options = param, node or Place(Where("<solver>")), options or TrainingOptions()
-        self.action, self.clock = action, clock
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         check_settings(param, self.node)
         options = self.options
         if param.snapshot and options.processes.is_root:
             check_prefix(param, self.node)
         check_readable(self._weights())
-        self.device = options.device or choose_device(param, self.node)
-        if options.compiled and (lack := missing_tool(self.device)):
+        self.device = options.devices[0] if options.devices else choose_device(param, self.node)
+        if options.build.compiled and (lack := missing_tool(self.device)):
             raise SpecError(f"--compile: {lack}", self.node.where)
         self.seed = self._chosen_seed()
         rule = update.find_rule(param.type)
@@ -139,7 +122,7 @@ class Training:
         return sum(self.losses) / len(self.losses) if self.losses else 0.0
 
     def _chosen_seed(self) -> int:
-        given = self.options.processes.seed if self.options.seed is None else self.options.seed
+        given = self.options.processes.seed if self.options.build.seed is None else self.options.build.seed
         drawn = int.from_bytes(os.urandom(4), "little") if given is None else given
         return self.param.random_seed if self.param.random_seed >= 0 else drawn
 
@@ -147,7 +130,7 @@ class Training:
         train, *tests = nets.solver_nets(self.param, self.node)
         site, sentence = _CREATING[train.origin.split()[0]]
         log.info(site, sentence.format(train.origin))
-        processes, others = self.options.processes, self.options.others
+        processes, others = self.options.processes, self.options.devices[1:]
         rank, ranks = processes.rank, processes.count * (1 + len(others))
         self.net = self.build(train, f"rank {rank}" if rank else train.label, self.device, rank, ranks)
         with log.silent():  # Caffe logs only the root
@@ -164,24 +147,23 @@ class Training:
 
         Each ``role`` has its own random numbers, except for the records: nets that train in parallel share their order.
         """
-        options = BuildOptions(
-            str(device),
+        options = replace(
+            self.options.build,
+            device=str(device),
             seed=nets.seed_of(self.seed, role),
             data_seed=self.seed if ranks > 1 else None,
-            allow_python=self.options.allow_python,
             rank=rank,
             ranks=ranks,
             exact=self.exact,
             accumulate_in_place=True,
             passes=(),
-            compiled=self.options.compiled,
         )
         net = build_net(described.net, described.source, options)
         files = self._weights()
         for path in files:
             log.info("solver.cpp:72", f"Finetuning from {path}")
         if files:
-            load_weights(net, files, self.options.strict)
+            load_weights(net, files, self.options.build.strict)
         return net
 
     def _weights(self) -> list[str]:

@@ -22,7 +22,6 @@ from netspec.export.deploy import fold
 from netspec.export.onnx import onnx_model
 from netspec.export.pt2 import torch_module
 from netspec.export.torch import torch_source
-from netspec.files.limits import limited
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
@@ -71,37 +70,35 @@ SENT = [
 def _net(path: Path) -> Net:
     """Return the net of a damaged text. Raises SpecError for most."""
     message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
-    return build_net(with_state(message, TEST), source, BuildOptions(seed=0))
+    return build_net(with_state(message, TEST), source, BuildOptions(seed=0, limit=MOST))
 
 
 def exported(path: Path) -> None:
     """Write a net in all forms: each parses, or a SpecError says why it cannot be."""
-    with limited(MOST):
-        net = _net(path)
-        for write in (
-            lambda: ast.parse(torch_source(net, "x.prototxt")[0]),
-            lambda: torch_module(net),
-            lambda: onnx_model(net)[0].SerializeToString(),
-            lambda: write_text(fold(net)),
-            lambda: {name: tensor.numpy() for name, tensor in blob_tensors(net).items()},
-        ):
-            try:
-                write()
-            except SpecError as fault:
-                if "\n" in str(fault):
-                    raise ValueError("an error of several lines") from fault
+    net = _net(path)
+    for write in (
+        lambda: ast.parse(torch_source(net, "x.prototxt")[0]),
+        lambda: torch_module(net),
+        lambda: onnx_model(net)[0].SerializeToString(),
+        lambda: write_text(fold(net)),
+        lambda: {name: tensor.numpy() for name, tensor in blob_tensors(net).items()},
+    ):
+        try:
+            write()
+        except SpecError as fault:
+            if "\n" in str(fault):
+                raise ValueError("an error of several lines") from fault
 
 
 def drawn(path: Path) -> None:
     """Draw a net as SVG and HTML: both parse."""
-    with limited(MOST):
-        message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
-        diagram = diagram_of(message, source, [TRAIN, TEST])
-        picture = picture_of(diagram)
-        ElementTree.fromstring(svg_of(picture).encode())
-        html = html_of(diagram, picture)
-        json.loads(html.partition("const layers = ")[2].partition(";\n")[0])
-        html.encode()
+    message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
+    diagram = diagram_of(message, source, [TRAIN, TEST], BuildOptions(open_data=False, limit=MOST))
+    picture = picture_of(diagram)
+    ElementTree.fromstring(svg_of(picture).encode())
+    html = html_of(diagram, picture)
+    json.loads(html.partition("const layers = ")[2].partition(";\n")[0])
+    html.encode()
 
 
 def talk(path: Path) -> None:

@@ -36,7 +36,7 @@ def net_of_example(name: str, folder: Path) -> Net:  # noqa: F811
     message, source = parse_net_text(text, "net.prototxt")
     message = with_state(message, example.param.phase if example.param.HasField("phase") else TEST)
     if name in DATA:
-        message, source = with_inputs(message, source, {"data": (3, 2, 9, 9)})
+        message, source = with_inputs(message, source, BuildOptions(given_shapes={"data": (3, 2, 9, 9)}))
     return build_net(message, source, BuildOptions(seed=0, allow_python=True))
 
 

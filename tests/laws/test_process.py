@@ -84,7 +84,7 @@ compared("import")
 """
 COMPILED = """
 import numpy as np
-from netspec.net.build import load_net
+from netspec.engines.net import load_net
 net = load_net("deploy.prototxt", phase="TEST", seed=0, passes=("compile",))
 compared("build")
 with torch.no_grad():

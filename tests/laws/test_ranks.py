@@ -101,4 +101,4 @@ def training(ranks: int, batch: int = BATCH) -> Solver:
     net = layer_text("ImageData, shuffled", batch) + 'layer { type: "Silence" bottom: "data" bottom: "label" }'
     text = f'net_param {{ {net} }} base_lr: 1 lr_policy: "fixed" random_seed: 7 solver_mode: CPU '
     param, node = parse_solver_text(text + "test_iter: 1 test_iter: 1 test_interval: 1", "solver.prototxt")
-    return Solver(param, node, TrainingOptions(torch.device("cpu"), [torch.device("cpu")] * (ranks - 1)))
+    return Solver(param, node, TrainingOptions(devices=[torch.device("cpu")] * ranks))

@@ -1,12 +1,13 @@
 """Public nets and solvers, as they are found: the blobs, split blobs and parameters that BVLC Caffe builds."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from each import each
-from netspec.check.check import as_json, check_file
+from netspec.check.check import ON_META, as_json, check_file
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_solver
 from paths import SHARED
@@ -50,7 +51,7 @@ def test_nets_with_data_layers_and_solvers_check(name: str, monkeypatch: pytest.
     monkeypatch.chdir((CORPUS / name).parent if name.startswith("forresti") else root)  # where its paths begin
     shapes = given_shapes(name)
     for phase in (TRAIN, TEST):
-        checked = check_file(CORPUS / name, phase, stages=["test-on-test"], shapes=shapes)
+        checked = check_file(CORPUS / name, phase, replace(ON_META, stages=["test-on-test"], given_shapes=shapes))
         assert [str(fault) for part in checked for fault in part.faults] == []
         assert (checked[0].net is None) == (name in SOLVERS)
 

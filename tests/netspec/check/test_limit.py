@@ -160,13 +160,12 @@ def test_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1, 20 * MIB))
     assert limit_on(torch.device("cuda", 1)) == 20 * MIB
     assert limit_on(torch.device("cpu")) == limits.memory()
-    with limits.limited(3 * MIB):
-        assert limit_on(torch.device("cuda")) == 3 * MIB
+    assert limit_on(torch.device("cuda"), 3 * MIB) == 3 * MIB
 
 
 def test_a_net_on_a_gpu(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch, filled: list[int]) -> None:
     """The device is the CPU, which says that it has what a GPU has."""
-    monkeypatch.setattr("netspec.net.net.limit_on", lambda device: 20 * MIB)
+    monkeypatch.setattr("netspec.net.net.limit_on", lambda device, limit: 20 * MIB)
     with pytest.raises(SpecError, match="the limit is 20 MiB"):
         net_of(DUMMY)
     assert sum(filled) == 0
@@ -205,8 +204,8 @@ def test_nothing_is_filled_before(net_of: Callable[..., Net], filled: list[int])
         for i in range(10)
     )
     data = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1024 } } }\n'
-    with limits.limited(20 * MIB), pytest.raises(SpecError, match="needs at least 40") as caught:
-        net_of(data + layers)
+    with pytest.raises(SpecError, match="needs at least 40") as caught:
+        net_of(data + layers, limit=20 * MIB)
     assert 'layer "ip0"' in str(caught.value)
     assert sum(filled) == 0
 
@@ -218,8 +217,7 @@ def test_shared_parameters_count_once(net_of: Callable[..., Net]) -> None:
         for i in range(10)
     )
     data = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1024 } } }\n'
-    with limits.limited(9 * MIB):
-        assert net_of(data + layers).need.parameters == 4 * MIB
+    assert net_of(data + layers, limit=9 * MIB).need.parameters == 4 * MIB
 
 
 def test_tops_live_until_their_last_use_in_a_test(net_of: Callable[..., Net]) -> None:
@@ -258,9 +256,4 @@ def test_a_container_has_less_memory(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_training_that_fits_goes_on() -> None:
     Path("net.prototxt").write_text(DUMMY)
-    with limits.limited(600 * MIB):
-        assert load_solver("solver.prototxt").net.need.tops == 4 * 64_000_000 + 4
-
-
-def test_the_default_is_the_machines_memory() -> None:
-    assert limits.most() == limits.memory()
+    assert load_solver("solver.prototxt", limit=600 * MIB).net.need.tops == 4 * 64_000_000 + 4

@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from netspec.check.check import check_file
+from netspec.check.check import ON_META, check_file
 from netspec.cli import main
 from netspec.proto.schema import TRAIN, PhaseValue
 from paths import GOLDEN
@@ -52,7 +53,7 @@ def advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., lis
             Path("solver.prototxt").write_text('net: "net.prototxt"\n' + solver)
         path = "net.prototxt" if solver is None else "solver.prototxt"
         shapes = {"pair": (10, 2, 4, 4), "sim": (10,)} if "pair" in net and not open_data else {}
-        checked = check_file(path, phase, shapes=shapes, open_data=open_data)
+        checked = check_file(path, phase, replace(ON_META, given_shapes=shapes, open_data=open_data))
         assert not [fault for part in checked for fault in part.faults]
         return [f"{found.where}: {found.message}" for part in checked for found in part.advice]
 

@@ -1,10 +1,12 @@
 """``netspec lint``: each rule finds its mistake at its place, and keeps silent where a comment says so."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from netspec.check.check import ON_META
 from netspec.check.findings import RULES
 from netspec.check.lint import Linted, lint_file
 from netspec.cli import main
@@ -231,7 +233,7 @@ def pair_shape(path: Path) -> dict[str, tuple[int, ...]]:
 def test_the_projects_own_nets_give_no_reason_to_complain(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     shapes = pair_shape(path) if "train" in path.name else {}
-    linted = lint_file(path.relative_to(ROOT), shapes=shapes)
+    linted = lint_file(path.relative_to(ROOT), replace(ON_META, given_shapes=shapes))
     assert [*map(str, linted.found), *map(str, linted.faults)] == []
     assert linted.readable
 

@@ -16,7 +16,7 @@ import netspec
 from golden_cases import LayerCase, assert_same_layers, parameters, train
 from netspec.dialects import use_dialects_of
 from netspec.dialects._boxes import highest
-from netspec.net.build import load_net
+from netspec.engines.net import load_net
 from paths import GOLDEN
 
 SSD = GOLDEN / "ssd"

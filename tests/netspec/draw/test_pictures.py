@@ -21,6 +21,7 @@ from netspec.draw.picture import picture_of
 from netspec.draw.settings import settings_text
 from netspec.draw.svg import svg_of
 from netspec.errors import SpecError, Where
+from netspec.graph.options import BuildOptions
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_net_text
 from paths import ROOT, SHARED
@@ -76,7 +77,11 @@ def test_nothing_overlaps_whatever_the_wiring(seed: int) -> None:
 @pytest.mark.slow
 @each("path", [*OWN, *CORPUS], last_parts)
 def test_nothing_overlaps_in_nets_as_they_are_found(path: Path) -> None:
-    picture = picture_of(diagram_of(*parse_net(path), PHASES, shapes={"pair_data": (8, 6, 224, 224)}))
+    picture = picture_of(
+        diagram_of(
+            *parse_net(path), PHASES, BuildOptions(open_data=False, given_shapes={"pair_data": (8, 6, 224, 224)})
+        )
+    )
     assert [*faults(picture), *faults(picture, unfolded=True)] == []
 
 

@@ -10,6 +10,7 @@ import torch
 import netspec
 from exported import assert_same, here, random_inputs, trained
 from netspec.export.deploy import fold, with_inputs, write_caffe
+from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST
@@ -125,7 +126,9 @@ def test_a_training_net_becomes_a_deploy_net(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.chdir(GOLDEN)
     message, source = parse_net("train/sgd_step/train_val.prototxt")
     message.state.phase = TEST
-    deploy, source = with_inputs(message, source, {"pair_data": (4, 2, 28, 28)}, labels=False)
+    deploy, source = with_inputs(
+        message, source, BuildOptions(given_shapes={"pair_data": (4, 2, 28, 28)}), labels=False
+    )
     net = build_net(deploy, source)
     assert net.inputs == ["pair_data"]
     assert not any(layer.is_loss for layer in net.layers)

@@ -9,10 +9,10 @@ import pytest
 from loopclosure.detector.detector import LoopDetector
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
+from netspec.engines.net import load_net
 from netspec.errors import SpecError
 from netspec.features.describer import Describer
 from netspec.features.records import extract_records
-from netspec.net.build import load_net
 from paths import GOLDEN
 
 

@@ -16,6 +16,7 @@ from netspec.features.embedding import in_plane, read_features
 from netspec.features.images import ImageNet
 from netspec.features.saliency import of_distance, of_unit
 from netspec.features.thumbnails import thumbnails
+from netspec.graph.options import BuildOptions
 from netspec.pictures.nets import embedding_figure, filters_figure, maps_figure, saliency_figure
 from paths import GOLDEN
 
@@ -38,7 +39,13 @@ def linear(tmp_path: Path, channels: int = 3) -> tuple[ImageNet, np.ndarray]:
     net = netspec.load_net(tmp_path / "net.prototxt", seed=1)
     netspec.save_weights(net, tmp_path / "w.caffemodel")
     weights = net.params["ip"][0].detach().numpy().reshape(3, channels, 4, 5)
-    built = ImageNet(tmp_path / "net.prototxt", [tmp_path / "w.caffemodel"], "ip", "data", exact="none", passes=())
+    built = ImageNet(
+        tmp_path / "net.prototxt",
+        [tmp_path / "w.caffemodel"],
+        "ip",
+        "data",
+        options=BuildOptions(exact="none", passes=()),
+    )
     return built, weights
 
 

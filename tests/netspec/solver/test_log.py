@@ -3,6 +3,7 @@
 import logging
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -29,7 +30,7 @@ def test_the_speed_comes_from_the_clock_and_is_0_at_first(work_in: Callable[...,
     work_in("train/sgd_step")
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel")
     times = iter([100.0, 100.5, 102.5])
-    solver.clock = lambda: next(times)
+    solver.options = replace(solver.options, clock=lambda: next(times))
     solver.step(11)
     solver.close()
     paces = re.findall(r"\((\S+ iter/s, \S+ iters)\)", "\n".join(lines()))
@@ -42,7 +43,7 @@ def test_the_share_of_the_time_spent_waiting_for_data_is_there(
     work_in("train/sgd_step")
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel")
     times, waited = iter([100.0, 100.5, 102.5]), iter([1.0, 1.25, 1.3])
-    solver.clock = lambda: next(times)
+    solver.options = replace(solver.options, clock=lambda: next(times))
     monkeypatch.setattr(solver, "_seconds_waited", lambda: next(waited))
     solver.step(11)
     solver.close()
