@@ -32,7 +32,7 @@ def write_picture(
     Of a .caffemodel the net inside it is drawn. Returns what was drawn; its faults keep parts of the net from being
     built: the picture has no shapes there. Raises SpecError for a file that cannot be read.
     """
-    diagram = diagram_of(*_net_of(path, options.given_shapes), phases, options)
+    diagram = diagram_of(*_net_of(path, options), phases, options)
     picture = picture_of(diagram)
     if out.suffix == ".png":
         from netspec.draw.png import png_of
@@ -47,9 +47,9 @@ def write_picture(
     return diagram
 
 
-def _net_of(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParameter, SourceMap]:
+def _net_of(path: str | Path, options: BuildOptions) -> tuple[NetParameter, SourceMap]:
     if is_net_binary(path):
-        return recover_net(path, shapes)
+        return recover_net(path, options.given_shapes)
     try:
         return parse_net(path)
     except SpecError:

@@ -165,7 +165,7 @@ def test_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_net_on_a_gpu(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch, filled: list[int]) -> None:
     """The device is the CPU, which says that it has what a GPU has."""
-    monkeypatch.setattr("netspec.net.net.limit_on", lambda device, limit: 20 * MIB)
+    monkeypatch.setattr("netspec.net.assembly.limit_on", lambda device, limit: 20 * MIB)
     with pytest.raises(SpecError, match="the limit is 20 MiB"):
         net_of(DUMMY)
     assert sum(filled) == 0

@@ -115,3 +115,12 @@ def test_the_value_of_the_only_input_needs_no_name(net_of: Callable[..., Net]) -
         net(values, values)
     with pytest.raises(SpecError, match=r"found a value without a name; give inputs by name: a=..., b=..."):
         net_of(TWO)(values)
+
+
+def test_an_input_may_be_called_self(net_of: Callable[..., Net]) -> None:
+    net = net_of(TEXT.replace("Odd", "ReLU").replace('"data"', '"self"'))
+    values = torch.randn(2, 3)
+    expected = net(values)["odd"]
+    assert torch.equal(net(**{"self": values})["odd"], expected)
+    assert torch.equal(net.forward(**{"self": values})["odd"], expected)
+    assert torch.equal(net.forward_loss(**{"self": values})[1]["odd"], expected)

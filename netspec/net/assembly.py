@@ -1,0 +1,251 @@
+"""The layers of a plan made one after the other, their parameters shared, and what a net has to know of them.
+
+Caffe: Net::Init (src/caffe/net.cpp); the sites in the log calls are the lines of that file that print the same.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+
+from netspec.errors import Report, SpecError, Where
+from netspec.files.limits import amount, is_out_of_memory
+from netspec.files.limits import memory as memory_of_machine
+from netspec.graph.options import BuildOptions
+from netspec.graph.plan import Backward, Node, Param, Plan, plan_backward
+from netspec.layers import class_of, unknown_type
+from netspec.layers.base import Context, Layer, Random, Shape, shape_string
+from netspec.net.ignored_fields import unused_fields
+from netspec.net.need import BYTES, Need, limit_on, limit_text
+from netspec.run.eager import last_uses
+from netspec.terminal import log
+
+MUCH = 8  # a net that takes more than this part of the limit is first looked at as a whole
+
+
+@dataclass(frozen=True)
+class Learnable:
+    """A parameter as the solver sees it: once, with the place of its owner and its multipliers."""
+
+    parameter: torch.nn.Parameter
+    lr_mult: float
+    decay_mult: float
+    layer: str
+    index: int
+
+
+class Assembly:
+    """The layers of a plan, ``layers[i]`` of its node i; those with errors are missing, if errors are collected.
+
+    ``shapes`` are those of the blobs, ``loss_weights[i][j]`` is the weight of layer i's top j; ``backward`` says what
+    needs backward computation, None where a layer is missing.
+    """
+
+    def __init__(self, plan: Plan, options: BuildOptions) -> None:
+        self._plan, self._options, self._report = plan, options, plan.source.report
+        self.layers: dict[int, Layer] = {}
+        self.shapes: dict[str, Shape] = {}
+        self.loss_weights: list[list[float]] = []
+        self.learnable: list[Learnable] = []
+        self.need = Need(plan, last_uses(plan))
+        self.backward: Backward | None = None
+        self.random = Random(int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed)
+        self._device = torch.device(options.device)
+        self._values: dict[int, Shape] = {}
+        self._memory = 0  # as Caffe counts it
+        self._surveyed, self._too_much = False, None  # whether the whole net was looked at, and what was found
+        for i in range(len(plan.nodes)):
+            if layer := self._made(i):
+                self._set_up(i, layer)
+        if self._device.type != "meta" and (fault := self.need.fault(limit_on(self._device, options.limit))):
+            self._report(fault)
+        if len(self.layers) == len(plan.nodes):
+            self.backward = self._finish(list(self.layers.values()))
+
+    def _made(self, i: int) -> Layer | None:
+        """Return layer ``i``; None where it has a fault, which is reported, or one before it had."""
+        node, param = self._plan.nodes[i], self._plan.net.layer[i]
+        tie = _Tie(self._plan, i, partial(self._take, i))
+        log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
+        cls = class_of(param, self._options.allow_python)
+        if cls is None:
+            self._report(SpecError(unknown_type(node.type), tie.at("type")))
+            return None
+        if any(v not in self._values for v in node.bottoms):
+            return None  # an error upstream was reported
+        phase = self._plan.net.state.phase
+        context = Context(phase, self._options, self.random, tie.at, self._report, tie.created, tie.take)
+        try:
+            layer = cls(param, [self._values[v] for v in node.bottoms], context)
+        except SpecError as fault:
+            self._report(fault)
+            return None
+        except (MemoryError, RuntimeError) as fault:
+            if not is_out_of_memory(fault):
+                raise
+            there = f"this machine has {amount(memory_of_machine())}"
+            raise SpecError(f"its blobs need more memory than there is: {there}", tie.at()) from None
+        tie.take_from = None
+        return layer
+
+    def _set_up(self, i: int, layer: Layer) -> None:
+        """Note and log what layer ``i`` makes; connect its parameters."""
+        node = self._plan.nodes[i]
+        weights = _loss_weights(layer, self._report)
+        self.layers[i] = layer
+        self.loss_weights.append(weights)
+        for v, shape in zip(node.tops, layer.top_shapes, strict=False):
+            self._values[v] = shape
+            self.shapes[self._plan.blobs[v]] = shape
+        log.info("net.cpp:124", f"Setting up {node.name}")
+        for shape, weight in zip(layer.top_shapes, weights, strict=True):
+            self._memory += math.prod(shape) * 4
+            log.info("net.cpp:131", "Top shape: " + shape_string(shape))
+            if weight:
+                log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
+        log.info("net.cpp:139", f"Memory required for data: {self._memory}")
+        owned = len(self.learnable)
+        self._adopt_params(i, layer)
+        self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
+
+    def _take(self, i: int, size: int) -> None:
+        """Let layer ``i`` take memory, in bytes, while the net is built.
+
+        Raises SpecError where that, or what the whole net needs, is too much. Only a net that takes much is looked at
+        as a whole.
+        """
+        if (
+            self._device.type == "meta"
+            or self.need.total + size <= (limit := limit_on(self._device, self._options.limit)) // MUCH
+        ):
+            return
+        if not self._surveyed:
+            self._surveyed, self._too_much = True, self._survey().fault(limit)
+        if self._too_much:
+            raise self._too_much
+        if self.need.parameters + size > limit:
+            raise SpecError(
+                f"needs {amount(size)} of memory beside {self.need}; {limit_text(limit)}", _Tie(self._plan, i).at()
+            )
+
+    def _survey(self) -> Need:
+        """Return what the net needs, from the shapes that are known so far, without memory, data or Python layers."""
+        seen = replace(
+            self._options,
+            device="meta",
+            open_data=False,
+            write_files=False,
+            given_shapes={**self._options.given_shapes, **self.shapes},
+            allow_python=False,
+        )
+        silent = replace(self._plan, source=self._plan.source.telling(lambda fault: None))
+        with log.silent():
+            return Assembly(silent, seen).need
+
+    def _adopt_params(self, i: int, layer: Layer) -> None:
+        """Connect the shared parameters of layer ``i`` to their owners; list the others as learnable."""
+        node = self._plan.nodes[i]
+        if len(node.params) > len(layer.blobs):
+            message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one per blob"
+            self._report(layer.error(message, "param", len(layer.blobs)))
+        for j in range(len(layer.blobs)):
+            spec = _spec(node, layer, j)
+            if spec.owner is None:
+                parameter = layer.blobs[j]
+                parameter.requires_grad_(spec.lr_mult != 0 or self._plan.net.force_backward)
+                self.learnable.append(Learnable(parameter, spec.lr_mult, spec.decay_mult, node.name, j))
+                continue
+            owner_index, owner_blob = spec.owner
+            if owner_index not in self.layers:
+                continue  # an error in the owner was reported
+            owner = self.layers[owner_index]
+            if owner_blob >= len(owner.blobs):
+                continue  # the owner has too many param { }, which was reported
+            here, there = layer.blob_shapes[j], owner.blob_shapes[owner_blob]
+            owner_name = self._plan.nodes[owner_index].name
+            fits = math.prod(here) == math.prod(there) if spec.permissive else here == there
+            if not fits:
+                rule = "equal counts" if spec.permissive else "equal shapes (share_mode: STRICT)"
+                message = (
+                    f'cannot share param "{spec.name}" owned by layer "{owner_name}", param index {owner_blob}: '
+                    f"found shape {shape_string(here)} here and {shape_string(there)} there, expected {rule}"
+                )
+                self._report(layer.error(message, "param", j))
+                continue
+            layer.blobs[j] = owner.blobs[owner_blob]
+            place = f"owned by layer '{owner_name}', param index {owner_blob}"
+            log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {place}")
+
+    def _finish(self, layers: list[Layer]) -> Backward:
+        """Return and log which layers need backward computation, as decided by Caffe, and the outputs."""
+        learns = []
+        for node, layer in zip(self._plan.nodes, layers, strict=True):
+            learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
+        has_loss = [[bool(w) for w in weights] for weights in self.loss_weights]
+        backward = plan_backward(self._plan, learns, has_loss, [layer.label_bottoms for layer in layers])
+        for node, needs in zip(reversed(self._plan.nodes), reversed(backward.layers), strict=True):
+            if needs:
+                log.info("net.cpp:200", f"{node.name} needs backward computation.")
+            else:
+                log.info("net.cpp:202", f"{node.name} does not need backward computation.")
+        for name in self._plan.outputs:
+            log.info("net.cpp:244", f"This network produces output {name}")
+        log.info("net.cpp:257", "Network initialization done.")
+        for line in unused_fields(self._plan, layers):
+            log.warning("net.cpp:257", line)
+        return backward
+
+
+class _Tie:
+    """What layer ``i`` knows of its net; ``take_from`` counts the memory that it takes, while the net is built.
+
+    It has slots and does not keep the net alive, because of nets of very many layers.
+    """
+
+    __slots__ = ("_i", "_plan", "take_from")
+
+    def __init__(self, plan: Plan, i: int, take_from: Callable[[int], None] | None = None) -> None:
+        self._plan, self._i, self.take_from = plan, i, take_from
+
+    def at(self, *path: str | int) -> Where:
+        """Return the place in the prototxt of a field of the layer."""
+        node = self._plan.nodes[self._i]
+        return self._plan.source.at(self._i, *path, layer=node.name, type=node.type)
+
+    def take(self, size: int) -> None:
+        if self.take_from:
+            self.take_from(size)
+
+    def created(self) -> None:
+        """Log what the layer reads and writes."""
+        node, blobs = self._plan.nodes[self._i], self._plan.blobs
+        log.info("net.cpp:86", f"Creating Layer {node.name}")
+        for v in node.bottoms:
+            log.info("net.cpp:408", f"{node.name} <- {blobs[v]}")
+        for v, in_place in zip(node.tops, node.in_place, strict=True):
+            if in_place:
+                log.info("net.cpp:369", f"{node.name} -> {blobs[v]} (in-place)")
+            else:
+                log.info("net.cpp:382", f"{node.name} -> {blobs[v]}")
+
+
+def _spec(node: Node, layer: Layer, j: int) -> Param:
+    """Return the settings of learnable blob ``j``, from the prototxt or the layer."""
+    spec = node.params[j] if j < len(node.params) else Param("", layer.default_param_lr, 1.0, False, None)
+    return replace(spec, lr_mult=0.0, decay_mult=0.0) if j in layer.not_learned else spec
+
+
+def _loss_weights(layer: Layer, report: Report) -> list[float]:
+    """Return the loss weight of each top (Caffe: Layer::SetLossWeights, LossLayer::LayerSetUp)."""
+    given = list(layer.param.loss_weight)
+    if given:
+        if len(given) == layer.num_tops:
+            return given
+        message = f"found {len(given)} loss_weight, expected none or one per top blob ({layer.num_tops})"
+        report(layer.error(message, "loss_weight"))
+    return [1.0 if layer.is_loss and j == 0 else 0.0 for j in range(layer.num_tops)]
