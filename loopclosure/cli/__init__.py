@@ -6,10 +6,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from loopclosure.cli import close, compare, detect, evaluate, similarity
+from loopclosure.cli import close, compare, detect, evaluate, map, similarity
 from netspec.terminal.commands import Commands, program, run
 
-_COMMANDS = (evaluate, compare, detect, close, similarity)
+_COMMANDS = (evaluate, compare, detect, close, map, similarity)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

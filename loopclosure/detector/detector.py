@@ -13,7 +13,7 @@ the new one. Its cost grows with the number of frames; all other costs are const
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from loopclosure.descriptors.similarity import check_metric
-from loopclosure.detector.frames import Frames
+from loopclosure.detector.frames import Frames, Points, points_of
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.index.index import Index, open_index
 from netspec.errors import SpecError
-from netspec.files.arrays import from_json, read_npz
+from netspec.files.arrays import check_array, from_json, read_npz
 from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
@@ -212,7 +212,8 @@ class LoopDetector:
     def begin_session(self) -> None:
         """Go on with the frames of another drive: all earlier ones are its candidates, however recent."""
         self._frames.settle(len(self))
-        self._sessions.append(len(self))
+        if len(self) > self._sessions[-1]:
+            self._sessions.append(len(self))
         self._runs = []
 
     @property
@@ -235,7 +236,7 @@ class LoopDetector:
             "loops": [asdict(loop) for loop in self.loops],
             "sessions": self._sessions,
         }
-        arrays = self._frames.arrays(self.check is not None)
+        arrays = {"rows": self._frames.rows(), **self._frames.arrays(self.check is not None)}
         with whole_file(path) as unfinished, unfinished.open("wb") as stream:
             np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
@@ -254,7 +255,7 @@ class LoopDetector:
             if about["check"] is not None:  # files from before a setting was added do not have it
                 check = from_json(GeometricCheck, {**asdict(GeometricCheck()), **about["check"]})
             detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check, index=index)
-            detector._frames.take(arrays, check is not None)
+            detector._take(arrays)
             detector._sessions = _starts(about.get("sessions", [0]), len(detector))
             detector._steps = detector._all_steps()
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
@@ -265,6 +266,30 @@ class LoopDetector:
             reason = " ".join(str(error).split())
             raise InputError(f"cannot be read ({reason}); expected {SAVED}", path) from None
         return detector
+
+    def _take(self, arrays: dict[str, np.ndarray]) -> None:
+        count, frames = len(arrays["rows"]), self._frames
+        check_array(arrays, "rows", "f", (count, arrays["rows"].size // count if count else 0))
+        frames.take(arrays, None if self.check is None else points_of(arrays, count))
+        if frames.count != count:
+            raise ValueError(f"{count} rows and {frames.count} stamps")
+        if count:
+            frames.waiting.extend(arrays["rows"].reshape(count, self.settings.views, -1))
+
+    def take_session(self, blocks: Iterable[np.ndarray], arrays: dict[str, np.ndarray], points: Points | None) -> None:
+        """Add the frames of a session that is over, without looking them up.
+
+        blocks  their descriptors, (N, views D) each, if the index has none of them yet
+        arrays  their ``stamps`` (N,) and ``poses`` (N, 7), NaN where not known
+        points  for a geometric check
+        """
+        self.begin_session()
+        frames, views = self._frames, self.settings.views
+        for block in blocks:
+            frames.index.add(block.astype(np.float32).reshape(len(block) * views, -1))
+        frames.take(arrays, points)
+        if len(self):
+            self._last = frames.index.rows((len(self) - 1) * views, len(self) * views)
 
     def _row(self, descriptor: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the row that is kept, (views, D): of unit length for cosine."""

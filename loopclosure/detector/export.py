@@ -54,14 +54,21 @@ def write_loops_csv(
     loops: Sequence[LoopResult],
     stamps: np.ndarray | None = None,
     names: Sequence[str] | None = None,
+    match_stamps: np.ndarray | None = None,
+    match_names: Sequence[str] | None = None,
 ) -> None:
-    """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known."""
+    """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known.
+
+    ``match_stamps`` and ``match_names`` (M): those of another drive's frames, in which the queries were found.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
         whole_file(path) as unfinished,
         unfinished.open("w", newline="", encoding="utf-8", errors="surrogateescape") as stream,
     ):
+        every = (stamps, stamps if match_names is None else match_stamps)
+        all_names = (names, names if match_names is None else match_names)
         writer = csv.writer(stream)
         writer.writerow(
             ["query_id", "match_id", "score", "inliers", "query_stamp", "match_stamp", "query_name", "match_name"]
@@ -69,8 +76,8 @@ def write_loops_csv(
         for loop in loops:
             assert loop.accepted is not None
             ends = (loop.query_id, loop.accepted)
-            times = ["" if stamps is None or np.isnan(stamps[i]) else f"{stamps[i]:.6f}" for i in ends]
-            names_of_ends = ["" if names is None else names[i] for i in ends]
+            times = ["" if of is None or np.isnan(of[i]) else f"{of[i]:.6f}" for of, i in zip(every, ends, strict=True)]
+            names_of_ends = ["" if of is None else of[i] for of, i in zip(all_names, ends, strict=True)]
             inliers = "" if loop.inliers is None else loop.inliers
             writer.writerow([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends])
 

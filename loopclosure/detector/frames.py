@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +13,63 @@ from netspec.files.arrays import check_array
 
 FIRST_CAPACITY = 256  # frames; doubled when full
 NO_ROWS = np.zeros((0, 0), np.float32)
+
+
+@dataclass(frozen=True)
+class Points:
+    """The local features of N frames one after the other, in arrays that may lie on disk.
+
+    sizes        (N, 2) width and height of the images
+    ends         (N,) where the points of each frame end
+    points       (P, 2) float32;  descriptors  (P, 128) uint8
+    """
+
+    sizes: np.ndarray
+    ends: np.ndarray
+    points: np.ndarray
+    descriptors: np.ndarray
+
+    def of(self, frame: int) -> LocalFeatures:
+        """Return those of one frame."""
+        part = slice(int(self.ends[frame - 1]) if frame else 0, int(self.ends[frame]))
+        width, height = self.sizes[frame].tolist()
+        return LocalFeatures(self.points[part], self.descriptors[part], (width, height))
+
+
+class Local:
+    """The local features of all frames: of sessions in files, and of the frames since."""
+
+    def __init__(self) -> None:
+        self._parts: list[Points | list[LocalFeatures]] = []
+        self._starts: list[int] = []
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, frame: int) -> LocalFeatures:
+        number = bisect_right(self._starts, frame) - 1
+        part, frame = self._parts[number], frame - self._starts[number]
+        return part.of(frame) if isinstance(part, Points) else part[frame]
+
+    def append(self, features: LocalFeatures) -> None:
+        """Add those of the next frame."""
+        if not self._parts or isinstance(self._parts[-1], Points):
+            self._begin([])
+        part = self._parts[-1]
+        assert isinstance(part, list)
+        part.append(features)
+        self._count += 1
+
+    def extend(self, points: Points) -> None:
+        """Add those of many frames."""
+        if len(points.ends):
+            self._begin(points)
+            self._count += len(points.ends)
+
+    def _begin(self, part: Points | list[LocalFeatures]) -> None:
+        self._parts.append(part)
+        self._starts.append(self._count)
 
 
 @dataclass
@@ -28,7 +86,7 @@ class Frames:
     stamps: np.ndarray = field(default_factory=lambda: np.zeros(0))
     poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     waiting: list[np.ndarray] = field(default_factory=list)
-    local: list[LocalFeatures] = field(default_factory=list)
+    local: Local = field(default_factory=Local)
 
     def append(self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None) -> None:
         """Add a frame with a descriptor (views, D)."""
@@ -63,47 +121,44 @@ class Frames:
         parts = [self.index.rows(0, self.settled * self.views)] if self.settled else []
         return np.concatenate([*parts, *self.waiting]).reshape(self.count, -1)
 
-    def arrays(self, checked: bool) -> dict[str, np.ndarray]:
-        """Return what a file has of the frames; ``checked``: their points too."""
-        found = {"rows": self.rows(), "stamps": self.stamps[: self.count], "poses": self.poses[: self.count]}
+    def arrays(self, checked: bool, start: int = 0) -> dict[str, np.ndarray]:
+        """Return what a file has of the frames from ``start`` on, but their descriptors; ``checked``: points too."""
+        found = {"stamps": self.stamps[start : self.count], "poses": self.poses[start : self.count]}
         if checked:
-            found["sizes"] = np.array([local.size for local in self.local], np.int64).reshape(-1, 2)
-            found["points_of_frame"] = np.array([len(local.points) for local in self.local], np.int64)
-            found["points"] = np.concatenate([np.zeros((0, 2), np.float32), *(f.points for f in self.local)])
-            found["descriptors"] = np.concatenate([np.zeros((0, 128), np.uint8), *(f.descriptors for f in self.local)])
+            local = [self.local[i] for i in range(start, self.count)]
+            found["sizes"] = np.array([f.size for f in local], np.int64).reshape(-1, 2)
+            found["points_of_frame"] = np.array([len(f.points) for f in local], np.int64)
+            found["points"] = np.concatenate([np.zeros((0, 2), np.float32), *(f.points for f in local)])
+            found["descriptors"] = np.concatenate([np.zeros((0, 128), np.uint8), *(f.descriptors for f in local)])
         return found
 
-    def take(self, arrays: dict[str, np.ndarray], checked: bool) -> None:
-        """Add the frames of a file. Raises ValueError or LookupError where its arrays do not fit together."""
-        count = len(arrays["rows"])
-        check_array(arrays, "rows", "f", (count, arrays["rows"].size // count if count else 0))
+    def take(self, arrays: dict[str, np.ndarray], points: Points | None) -> None:
+        """Add frames of a file; the index, or ``waiting``, has or gets their descriptors.
+
+        Raises ValueError or LookupError where the arrays do not fit together.
+        """
+        count = len(arrays["stamps"])
         check_array(arrays, "stamps", "f", (count,), finite=False)
         check_array(arrays, "poses", "f", (count, 7), finite=False)
-        local = _local_features(arrays, count) if checked else []
-        if not count:
-            return
-        rows = arrays["rows"].astype(np.float32).reshape(count, self.views, -1)
-        if self.waiting and rows[0].shape != self.waiting[-1].shape:
-            raise ValueError(f"descriptors of {rows[0].size} dimensions, those before {self.waiting[-1].size}")
-        self.waiting.extend(rows)
         self.stamps = np.concatenate([self.stamps[: self.count], arrays["stamps"]])
         self.poses = np.concatenate([self.poses[: self.count], arrays["poses"]])
-        self.local.extend(local)
+        if points is not None:
+            self.local.extend(points)
         self.count += count
 
 
-def _local_features(arrays: dict[str, np.ndarray], count: int) -> list[LocalFeatures]:
+def points_of(arrays: dict[str, np.ndarray], count: int, finite: bool = True) -> Points:
+    """Return the points of ``count`` frames of a file; ``finite``: read them all, and check that each is a number.
+
+    Raises ValueError where the arrays do not fit together.
+    """
     check_array(arrays, "points_of_frame", "i", (count,))
-    ends = np.cumsum(arrays["points_of_frame"])
-    points = int(ends[-1]) if count else 0
     if min(arrays["points_of_frame"], default=0) < 0:
         raise ValueError('"points_of_frame" has a negative number')
-    check_array(arrays, "points", "f", (points, 2))
-    check_array(arrays, "descriptors", "u", (points, 128))
+    ends = np.cumsum(arrays["points_of_frame"])
+    points = int(ends[-1]) if count else 0
+    check_array(arrays, "points", "f", (points, 2), finite)
+    check_array(arrays, "descriptors", "u", (points, 128), finite)
     sizes = arrays.get("sizes", np.tile(LocalFeatures.size, (count, 1)))  # files from before it do not have it
     check_array({"sizes": sizes}, "sizes", "i", (count, 2))
-    pieces = zip(np.split(arrays["points"], ends), np.split(arrays["descriptors"], ends), strict=True)
-    return [
-        LocalFeatures(*parts, (int(width), int(height)))
-        for parts, (width, height) in zip(list(pieces)[:count], sizes, strict=True)
-    ]
+    return Points(sizes, ends, arrays["points"], arrays["descriptors"])

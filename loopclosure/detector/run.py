@@ -18,6 +18,7 @@ from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.whitening import Whitening
 from loopclosure.detector.detector import Describe, LoopDetector, LoopResult
 from loopclosure.detector.export import RelativePose, relative_pose
+from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
 from loopclosure.places.frames import (
     ALL_FRAMES,
@@ -33,6 +34,7 @@ from loopclosure.places.trajectory import Poses
 from loopclosure.progress import Progress, silent
 
 DESCRIBERS = "loopclosure.describers"  # the group of entry points: name -> function that makes a describer
+NAME = r"[\w-]+"  # of such an entry point
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
 
 
@@ -94,7 +96,7 @@ def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Rec
 
 
 def run_detector(
-    detector: LoopDetector,
+    detector: LoopDetector | Visitor,
     recording: Recording,
     features: Features | None = None,
     progress: Progress = silent,
@@ -158,7 +160,7 @@ def load_describe(specification: str, options: dict[str, str] | None = None) -> 
     given.
     """
     options = options or {}
-    if re.fullmatch(r"[\w-]+", specification):
+    if re.fullmatch(NAME, specification):
         return _called(_entry_point(specification), specification, options)
     module_name, colon, name = specification.rpartition(":")
     if not colon or not name or not module_name:

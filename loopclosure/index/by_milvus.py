@@ -18,7 +18,7 @@ AT_ONCE = 1000  # rows of an insertion or of an answer
 class MilvusIndex:
     """See :class:`loopclosure.index.index.Index`; it may hold descriptors of earlier sessions already."""
 
-    def __init__(self, uri: str, metric: str) -> None:
+    def __init__(self, uri: str, metric: str, first: int | None = None) -> None:
         self._uri, self._metric = uri, metric
         client = import_module("pymilvus").MilvusClient  # optional
         self._client: Any = self._asked(lambda: client(uri))
@@ -26,7 +26,7 @@ class MilvusIndex:
         if self._asked(lambda: self._client.has_collection(COLLECTION)):
             self._asked(lambda: self._client.load_collection(COLLECTION))
             found = self._asked(lambda: self._query("", ["count(*)"]))
-            self._count = int(found[0]["count(*)"])
+            self._count = min(int(found[0]["count(*)"]), 1 << 62 if first is None else first)
 
     def __len__(self) -> int:
         return self._count
@@ -39,14 +39,16 @@ class MilvusIndex:
         for start in range(0, len(rows), AT_ONCE):
             first = self._count
             data = [{"id": first + i, "vector": row.tolist()} for i, row in enumerate(rows[start : start + AT_ONCE])]
-            self._asked(lambda data=data: self._client.insert(COLLECTION, data))
+            self._asked(lambda data=data: self._client.upsert(COLLECTION, data))
             self._count += len(data)
 
     def search(self, row: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         """See :class:`~loopclosure.index.index.Index`."""
         k = min(k, self._count)
         found = self._asked(
-            lambda: self._client.search(COLLECTION, [row.tolist()], limit=k, consistency_level="Strong")
+            lambda: self._client.search(
+                COLLECTION, [row.tolist()], filter=f"id < {self._count}", limit=k, consistency_level="Strong"
+            )
         )[0]
         values = np.array([hit["distance"] for hit in found])
         scores = values if self._metric == "cosine" else -np.sqrt(np.maximum(values, 0))

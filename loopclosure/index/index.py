@@ -35,8 +35,10 @@ class Index(Protocol):
         ...
 
 
-def open_index(name: str, metric: str) -> Index:
-    """Return an empty index: "exact", "faiss", or a collection of Milvus, ``FILE.db`` or ``http://HOST:PORT``.
+def open_index(name: str, metric: str, first: int | None = None) -> Index:
+    """Return an index: "exact" or "faiss", empty, or one in Milvus, ``FILE.db`` or ``http://HOST:PORT``.
+
+    ``first``: of what is in Milvus, so many descriptors are used at most, and new ones follow them; None: all.
 
     Raises InputError for another name, and where what it needs is not installed.
     """
@@ -54,7 +56,7 @@ def open_index(name: str, metric: str) -> Index:
         _need("pymilvus", "milvus")
         from loopclosure.index.by_milvus import MilvusIndex
 
-        return MilvusIndex(name, metric)
+        return MilvusIndex(name, metric, first)
     raise InputError(f'there is no index "{name}"; expected {", ".join(INDEXES)}, or Milvus: FILE.db or http://HOST')
 
 

@@ -60,6 +60,20 @@ def read_npy(path: str | Path, expected: str) -> np.ndarray:
         raise _fault(error, path, expected) from None
 
 
+def map_npy(path: str | Path, expected: str) -> np.ndarray:
+    """Return the array of an .npy file as :func:`read_npy`, but each part read from disk only when it is used."""
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            shape, by_columns, dtype = _header(stream, os.fstat(stream.fileno()).st_size)
+            if not math.prod(shape):
+                return np.zeros(shape, dtype)
+            order = "F" if by_columns else "C"
+            return np.asarray(np.memmap(stream, dtype, "r", stream.tell(), shape, order))
+    except _FAULTS as error:
+        raise _fault(error, path, expected) from None
+
+
 def read_lists(path: str | Path) -> list[Any] | None:
     """Return the lists in an .npy file whose elements are lists or arrays of integers; None for a plain array.
 
@@ -166,8 +180,8 @@ def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
         return arrays
 
 
-def _read(stream: IO[bytes], size: int) -> np.ndarray:
-    """Return the array in the format .npy, of ``size`` bytes, that a stream holds."""
+def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, order by columns, and dtype of an array in the format .npy, of ``size`` bytes in a stream."""
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"an array of format {version}")
@@ -175,9 +189,15 @@ def _read(stream: IO[bytes], size: int) -> np.ndarray:
     shape, by_columns, dtype = read_header(stream)
     if dtype.hasobject:
         raise ValueError("an array of Python objects")
-    count = math.prod(shape)
-    if min(shape, default=0) < 0 or count * dtype.itemsize > size:
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > size:
         raise ValueError(f"an array of shape {shape}, {dtype}, in {size} bytes")
+    return shape, by_columns, dtype
+
+
+def _read(stream: IO[bytes], size: int) -> np.ndarray:
+    """Return the array in the format .npy, of ``size`` bytes, that a stream holds."""
+    shape, by_columns, dtype = _header(stream, size)
+    count = math.prod(shape)
     data = stream.read(count * dtype.itemsize)
     values = np.frombuffer(data, dtype, count).copy() if dtype.itemsize else np.zeros(count, dtype)
     if dtype.kind == "U" and np.any(values.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder)) > sys.maxunicode):

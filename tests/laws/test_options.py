@@ -87,6 +87,9 @@ WAYS = {
         "detect walk/walk_1 --features walk.npz --threshold -1 --exclude-recent 1 --out found",
         "close walk/walk_1 --loops loops.csv --drift 2 --out closed",
         "close --graph loops.g2o --out closed",
+        "map build new walk/walk_1,limit=2",
+        "map add map walk/walk_1,limit=2",
+        "map query map walk/walk_1,limit=2 --out found",
         "similarity features.npz --out s.npz",
     ),
 }
@@ -156,6 +159,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
         np.savez("walk.npz", features=np.random.default_rng(0).random((20, 4), np.float32), names=names)
         known = ["walk/walk_1", "--describe", THUMBNAILS, "--exclude-recent", "3", "--out", "."]
         assert loopclosure_main(["detect", *known]) == 0
+        assert loopclosure_main(["map", "build", "map", "walk/walk_1,limit=2"]) == 0
         again = ["walk/walk_1", "--method", "thumbnails", "--exclude-frames", "3"]
         assert loopclosure_main(["evaluate", *again, "--out", "report"]) == 0
     finally:

@@ -1,0 +1,87 @@
+"""``loopclosure map``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from loopclosure.cli.data_set import typed
+from loopclosure.cli.run import show_progress, warn
+from loopclosure.detector import run
+from loopclosure.detector.detector import Describe, LoopResult
+from loopclosure.detector.export import write_loops_csv
+from loopclosure.detector.map import Map, checked_name
+from loopclosure.detector.visitor import Visitor
+from loopclosure.places.bags import is_bag
+from loopclosure.places.extraction import extract
+from loopclosure.places.source import FRAMES, TOPICS
+from netspec.terminal.commands import Commands, WrongUsage
+
+INDEX = "exact, faiss, or Milvus: FILE.db or http://HOST:PORT (default: exact)"
+
+
+def add_to(commands: Commands) -> None:
+    """Add the commands."""
+    summary = "keep a map of several drives on disk: build it, add to it, query it"
+    commands = Commands(commands.group("map", summary), quiet=True)
+    p = commands.add("build", _build, "make a map of one or several drives")
+    _add_common(p, "+")
+    p.add_argument("--describe", default="default", metavar="NAME", help="the net: default or small (default: default)")
+    p = commands.add("add", _add, "add drives to a map, and find the loops between all of its drives")
+    _add_common(p, "+")
+    p = commands.add("query", _query, "find the frames of a drive in a map, and add nothing to it")
+    _add_common(p, None)
+    p.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv goes")
+
+
+def _add_common(p: argparse.ArgumentParser, count: str | None) -> None:
+    p.add_argument("map", metavar="MAP", help="the map's folder")
+    p.add_argument("source", nargs=count, metavar="SOURCE", help="frames, as those of detect")
+    p.add_argument("--index", default="exact", metavar="NAME", help=INDEX)
+
+
+def _build(a: argparse.Namespace) -> None:
+    describe = run.load_describe(checked_name(a.describe))
+    _add_all(Map.create(a.map, a.describe), describe, a)
+
+
+def _add(a: argparse.Namespace) -> None:
+    into = Map(a.map)
+    _add_all(into, run.load_describe(into.describer), a)
+
+
+def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
+    for text in a.source:
+        before, number = len(into), len(into.sessions)
+        results = into.add(_recording(text, Path(a.map) / "frames"), describe, a.index, show_progress)
+        loops = [result.accepted for result in results if result.accepted is not None]
+        between = sum(frame < before for frame in loops)
+        said = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
+        print(f"session {number:06d}: {said}: {into.folder / f'{number:06d}' / 'loops.csv'}")
+    print(f"{len(into)} frames in {len(into.sessions)} sessions: {into.folder}")
+
+
+def _query(a: argparse.Namespace) -> None:
+    known, out = Map(a.map), Path(a.out)
+    recording = _recording(a.source, out / "frames")
+    detector = known.detector(run.load_describe(known.describer), a.index)
+    results: Sequence[LoopResult] = run.run_detector(Visitor(detector), recording, progress=show_progress)
+    found = [result for result in results if result]
+    write_loops_csv(out / "loops.csv", found, recording.stamps, recording.names, detector.stamps, known.names)
+    print(run.verdicts_said(results))
+    print(f"{len(found)} of {len(results)} frames are in the map: {out / 'loops.csv'}")
+
+
+def _recording(text: str, frames: Path) -> run.Recording:
+    source = typed(text, {"": (*FRAMES, *TOPICS)})
+    path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
+    if is_bag(path):
+        path, said = extract(path, frames / path.stem, topic, pose_topic, show_progress)
+        print(said)
+    elif topic or pose_topic:
+        raise WrongUsage(f"{source}: topics belong to bags")
+    recording = run.open_recording(path, source.selection())
+    for doubt in recording.doubts:
+        warn(doubt)
+    return recording

@@ -1,0 +1,225 @@
+"""A map on disk: a folder of sessions, each with the descriptors and points of its frames, written whole or not at all.
+
+``map.json`` says which net describes the frames. A session is a folder ``000000``, ``000001``, ... that appears when it
+is complete and never changes: whoever reads a map meanwhile reads the sessions before. ``projection.npz`` has the
+principal directions of all sessions, by which long descriptors are shortened when the map is opened.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.descriptors.whitening import Whitening, learn_whitening
+from loopclosure.detector.detector import Describe, LoopDetector, LoopResult
+from loopclosure.detector.export import write_loops_csv
+from loopclosure.detector.frames import Points, points_of
+from loopclosure.detector.run import NAME, Recording, run_detector, views_of
+from loopclosure.detector.verification import GeometricCheck
+from loopclosure.errors import InputError
+from loopclosure.index.index import INDEXES, open_index
+from loopclosure.progress import Progress, silent
+from netspec.files.arrays import check_array, map_npy, read_npz
+from netspec.files.whole_file import only_one, whole_file, whole_folder
+
+FORMAT = 1
+SESSION = "a session of a map that loopclosure map wrote"
+METRIC = "euclidean"
+COMPONENTS = 256  # of a projected descriptor
+LEARNED_FROM = 2048  # frames, evenly spread; fewer are compared as they are
+BLOCK = 4096  # frames that are read at a time
+MAPPED = ("rows", "points", "descriptors")  # arrays in files of their own, read where they are used
+
+
+@dataclass(frozen=True)
+class Session:
+    """N frames of a map: their names, and what its files have of them."""
+
+    folder: Path
+    names: list[str]
+    arrays: dict[str, np.ndarray]
+    points: Points
+
+    def blocks(self, start: int = 0) -> Iterator[np.ndarray]:
+        """Yield the descriptors (n, views D) float32 from frame ``start`` on."""
+        for first in range(start, len(self.names), BLOCK):
+            rows = self.arrays["rows"][first : first + BLOCK].astype(np.float32)
+            if not np.all(np.isfinite(rows)):
+                raise InputError(f"has a number that is not finite; expected {SESSION}", self.folder / "rows.npy")
+            yield rows
+
+
+class Map:
+    """A map; ``describer`` is the name of what describes its frames."""
+
+    def __init__(self, folder: str | Path) -> None:
+        """Open a map to read it. Raises InputError for what is none."""
+        self.folder = Path(folder)
+        path = self.folder / "map.json"
+        try:
+            about = json.loads(path.read_text(encoding="utf-8"))
+            if about["format"] != FORMAT:
+                raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
+            self.describer = checked_name(about["describer"])
+        except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError("is no map; loopclosure map build makes one", self.folder) from None
+        self.sessions: list[Session] = []
+        self._read_sessions()
+
+    def _read_sessions(self) -> None:
+        while (self.folder / f"{len(self.sessions):06d}").is_dir():
+            self.sessions.append(_read_session(self.folder / f"{len(self.sessions):06d}"))
+
+    @classmethod
+    def create(cls, folder: str | Path, describer: str) -> Map:
+        """Make an empty map. Raises InputError where there is one already."""
+        folder, describer = Path(folder), checked_name(describer)
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError("is there already; loopclosure map add adds to a map", folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole_file(folder / "map.json") as unfinished:
+            unfinished.write_text(json.dumps({"format": FORMAT, "describer": describer}) + "\n", encoding="utf-8")
+        return cls(folder)
+
+    def __len__(self) -> int:
+        return sum(len(session.names) for session in self.sessions)
+
+    @property
+    def names(self) -> list[str]:
+        """The names of all frames, SESSION/NAME."""
+        return [f"{session.folder.name}/{name}" for session in self.sessions for name in session.names]
+
+    def detector(self, describe: Describe, index: str = "exact") -> LoopDetector:
+        """Return a detector that has all frames, checks candidates by their geometry, and describes frames as the map.
+
+        index  for :func:`loopclosure.index.index.open_index`; a database keeps what it has of the map already
+
+        Raises InputError where descriptors of the net and of the map do not have the same size.
+        """
+        return self._detector(_Described(describe, self._projection(index)), index)
+
+    def _detector(self, described: _Described, index: str) -> LoopDetector:
+        views = described.views
+        opened = open_index(index, METRIC, len(self) * views)
+        there = len(opened) // views
+        detector = LoopDetector(described, check=GeometricCheck(), index=opened, metric=METRIC, views=views)
+        for session in self.sessions:
+            skipped = min(there, len(session.names))
+            there -= skipped
+            blocks = (described.shortened(rows) for rows in session.blocks(skipped))
+            detector.take_session(blocks, session.arrays, session.points)
+        detector.begin_session()
+        return detector
+
+    def add(
+        self, recording: Recording, describe: Describe, index: str = "exact", progress: Progress = silent
+    ) -> list[LoopResult]:
+        """Add a recording as a session; return what each of its frames found, in all sessions and in its own.
+
+        Its loops are in ``loops.csv`` of its folder. Raises InputError, and adds nothing, where another process is
+        adding.
+        """
+        with only_one(self.folder / ".lock", "wait until it has ended"):
+            self._read_sessions()  # what others have added
+            described = _Described(describe, self._projection(index))
+            detector = self._detector(described, index)
+            before = len(detector)
+            results = run_detector(detector, recording, progress=progress)
+            rows = np.array(described.kept)
+            folder = self.folder / f"{len(self.sessions):06d}"
+            arrays = detector._frames.arrays(True, before)
+            with whole_folder(folder) as unfinished:
+                np.save(unfinished / "rows.npy", rows)
+                np.save(unfinished / "points.npy", arrays.pop("points"))
+                np.save(unfinished / "descriptors.npy", arrays.pop("descriptors"))
+                names = np.array(recording.names)
+                np.savez(unfinished / "frames.npz", names=names, source=np.array(str(recording.source)), **arrays)
+                every = [*self.names, *(f"{folder.name}/{name}" for name in recording.names)]
+                write_loops_csv(unfinished / "loops.csv", [r for r in results if r], detector.stamps, every)
+            self.sessions.append(_read_session(folder))
+            self._learn_projection(described.views)
+        return results
+
+    def _projection(self, index: str) -> Whitening | None:
+        """Return the projection for an index in memory; a database keeps the descriptors as they are."""
+        path = self.folder / "projection.npz"
+        if index not in INDEXES or not path.exists():
+            return None
+        arrays = read_npz(path, "the projection of a map")
+        try:
+            size = len(arrays["mean"])
+            check_array(arrays, "mean", "f", (size,))
+            check_array(arrays, "projection", "f", (size, COMPONENTS))
+        except (ValueError, LookupError, TypeError) as error:
+            raise InputError(f"{error}; remove it, and loopclosure map add makes it again", path) from None
+        return Whitening(arrays["mean"], arrays["projection"], 0, 0, str(path))
+
+    def _learn_projection(self, views: int) -> None:
+        count, size = len(self), self.sessions[-1].arrays["rows"].shape[1] // views
+        if count < LEARNED_FROM or size <= COMPONENTS:
+            return
+        wanted = np.linspace(0, count - 1, LEARNED_FROM).round().astype(int)
+        parts, first = [], 0
+        for session in self.sessions:
+            inside = wanted[(wanted >= first) & (wanted < first + len(session.names))] - first
+            parts.append(session.arrays["rows"][inside].astype(np.float32))
+            first += len(session.names)
+        rows = np.concatenate(parts)
+        learned = learn_whitening(rows.reshape(len(rows) * views, -1)[::views], COMPONENTS, 0.0)
+        if learned.projection.shape[1] < COMPONENTS:
+            return
+        with whole_file(self.folder / "projection.npz") as unfinished, unfinished.open("wb") as stream:
+            np.savez(stream, mean=learned.mean, projection=learned.projection)
+
+
+class _Described:
+    """Describes images for a map: ``kept`` has what the net said, in half precision, as files keep it."""
+
+    def __init__(self, describe: Describe, projection: Whitening | None) -> None:
+        self.views = views_of(describe, None)
+        self.kept: list[np.ndarray] = []
+        self._describe, self._projection = describe, projection
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            row = np.asarray(self._describe(image), np.float32).reshape(1, -1).astype(np.float16)
+        if not np.all(np.isfinite(row)):
+            raise InputError("a descriptor has a number that is not finite in half precision, which ends at 65,504")
+        self.kept.append(row[0])
+        return self.shortened(row.astype(np.float32))[0]
+
+    def shortened(self, rows: np.ndarray) -> np.ndarray:
+        """Return descriptors (n, views D) projected, each view by itself: (n, views 256)."""
+        if self._projection is None:
+            return rows
+        if rows.shape[1] % self.views:
+            raise InputError(f"descriptors of {rows.shape[1]} numbers are not of {self.views} views")
+        return np.hstack([self._projection.project(view) for view in np.split(rows, self.views, axis=1)])
+
+
+def checked_name(describer: str) -> str:
+    """Check that a describer is a name: a map is no reason to run a file that it mentions."""
+    if not re.fullmatch(NAME, describer):
+        raise InputError(f'"{describer}" is no name of a net; a map needs default, small or another that is installed')
+    return describer
+
+
+def _read_session(folder: Path) -> Session:
+    arrays = read_npz(folder / "frames.npz", SESSION)
+    arrays |= {name: map_npy(folder / f"{name}.npy", SESSION) for name in MAPPED}
+    try:
+        names = [str(name) for name in arrays["names"].reshape(-1)]
+        count = len(names)
+        check_array(arrays, "rows", "f", (count, arrays["rows"].size // count), finite=False)
+        check_array(arrays, "stamps", "f", (count,), finite=False)
+        check_array(arrays, "poses", "f", (count, 7), finite=False)
+        return Session(folder, names, arrays, points_of(arrays, count, finite=False))
+    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
+        raise InputError(f"cannot be read ({error}); expected {SESSION}", folder) from None

@@ -1,0 +1,190 @@
+"""Maps on disk: loops between sessions; a query changes nothing; a run that is killed leaves the map as it was."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from loopclosure.cli import main
+from loopclosure.descriptors.thumbnails import Thumbnailer
+from loopclosure.detector import map as maps
+from loopclosure.detector.map import Map
+from loopclosure.detector.run import open_recording
+from loopclosure.detector.visitor import Visitor
+from loopclosure.errors import InputError
+from netspec.errors import SpecError
+from netspec.files.whole_file import only_one
+
+PLACES = 10
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three drives past the same places: a and b past all of them, c past the last half and some others."""
+    folder = tmp_path_factory.mktemp("drives")
+    for drive, places in (("a", range(PLACES)), ("b", range(PLACES)), ("c", range(PLACES // 2, 2 * PLACES))):
+        (folder / drive).mkdir()
+        for number, place in enumerate(places):
+            wall = np.random.default_rng(place).integers(0, 256, (15, 20, 3)).astype(np.uint8)
+            image = cv2.resize(wall, (160, 120), interpolation=cv2.INTER_NEAREST)
+            moved = np.roll(image, (ord(drive) - ord("a"), number % 3), (0, 1))
+            cv2.imwrite(str(folder / drive / f"{number:03d}.png"), moved)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def thumbnails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("loopclosure.detector.run._entry_point", lambda name: Thumbnailer)
+
+
+def loops(path: Path) -> list[tuple[str, str]]:
+    with path.open() as stream:
+        return [(row["query_name"], row["match_name"]) for row in csv.DictReader(stream)]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def first(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of drive a."""
+    folder = tmp_path_factory.mktemp("maps") / "first"
+    Map.create(folder, "thumbnails").add(open_recording(drives / "a"), Thumbnailer())
+    return folder
+
+
+@pytest.fixture
+def a_map(first: Path, tmp_path: Path) -> Map:
+    return Map(shutil.copytree(first, tmp_path / "M"))
+
+
+INDEXES = ["exact"] + ["faiss"] * (find_spec("faiss") is not None) + ["p.db"] * (find_spec("milvus_lite") is not None)
+
+
+@pytest.mark.parametrize("index", INDEXES)
+def test_build_add_and_query(
+    index: str, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    more = ["--index", index]
+    assert main(["map", "build", "M", str(drives / "a"), *more]) == 0
+    assert main(["map", "add", "M", str(drives / "b"), *more]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "session 000000: 10 frames, 0 loops, 0 to earlier sessions: M/000000/loops.csv"
+    assert said[2:] == [
+        "session 000001: 10 frames, 10 loops, 10 to earlier sessions: M/000001/loops.csv",
+        "20 frames in 2 sessions: M",
+    ]
+    expected = [(f"000001/{i:03d}.png", f"000000/{i:03d}.png") for i in range(PLACES)]
+    assert loops(tmp_path / "M" / "000001" / "loops.csv") == expected
+    before = contents(tmp_path / "M")
+    assert main(["map", "query", "M", str(drives / "c"), *more, "--out", "found"]) == 0
+    assert contents(tmp_path / "M") == before
+    assert "5 of 15 frames are in the map: found/loops.csv" in capsys.readouterr().out
+    found = loops(tmp_path / "found" / "loops.csv")
+    assert [(query, match.partition("/")[2]) for query, match in found] == [
+        (f"{i:03d}.png", f"{i + 5:03d}.png") for i in range(5)
+    ]
+
+
+def test_long_descriptors_are_projected(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps, "LEARNED_FROM", 9)
+    monkeypatch.setattr(maps, "COMPONENTS", 8)
+    opened = Map.create(tmp_path / "M", "thumbnails")
+    opened.add(open_recording(drives / "a"), Thumbnailer())
+    assert (tmp_path / "M" / "projection.npz").is_file()
+    for again in (opened, Map(tmp_path / "M")):
+        detector = again.detector(Thumbnailer())
+        assert detector.descriptors.shape == (10, 8)
+        visitor = Visitor(detector)
+        found = [visitor.add(image).accepted for image, _ in open_recording(drives / "b").frames()]
+        assert found == list(range(PLACES))
+    results = opened.add(open_recording(drives / "b"), Thumbnailer())
+    assert [result.accepted for result in results] == list(range(PLACES))
+
+
+DYING = """
+import os, signal, sys
+import numpy as np
+from loopclosure.descriptors.thumbnails import Thumbnailer
+from loopclosure.detector.map import Map
+from loopclosure.detector.run import open_recording
+save = np.savez
+def dying(*arrays, **named):
+    save(*arrays, **named)
+    os.kill(os.getpid(), signal.SIGKILL)
+np.savez = dying
+Map(sys.argv[1]).add(open_recording(sys.argv[2]), Thumbnailer())
+"""
+
+
+def test_a_run_that_is_killed_leaves_the_map_as_it_was(a_map: Map, drives: Path, tmp_path: Path) -> None:
+    before = contents(tmp_path / "M")
+    words = [sys.executable, "-c", DYING, str(tmp_path / "M"), str(drives / "b")]
+    assert subprocess.run(words, check=False).returncode == -signal.SIGKILL
+    left = contents(tmp_path / "M")
+    assert {key: value for key, value in left.items() if key in before} == before
+    assert any("rows.npy" in key for key in left.keys() - before.keys())
+    assert all(".unfinished" in key or key == ".lock" for key in left.keys() - before.keys())
+    assert len(Map(tmp_path / "M")) == PLACES
+    a_map.add(open_recording(drives / "b"), Thumbnailer())
+    assert len(Map(tmp_path / "M")) == 2 * PLACES
+
+
+def test_one_adds_at_a_time_and_others_read(a_map: Map, drives: Path, tmp_path: Path) -> None:
+    other = Map(tmp_path / "M")
+    with only_one(tmp_path / "M" / ".lock", ""):
+        with pytest.raises(SpecError, match="held by another run"):
+            a_map.add(open_recording(drives / "b"), Thumbnailer())
+        assert len(Map(tmp_path / "M").detector(Thumbnailer())) == PLACES
+    other.add(open_recording(drives / "b"), Thumbnailer())
+    a_map.add(open_recording(drives / "c"), Thumbnailer())  # sees what the other has added
+    assert [len(session.names) for session in a_map.sessions] == [10, 10, 15]
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (lambda m: (m / "map.json").write_text("{"), "M: is no map; loopclosure map build makes one"),
+        (lambda m: (m / "map.json").write_text(json.dumps({"format": 9, "describer": "x"})), "has format 9"),
+        (lambda m: (m / "map.json").write_text('{"format": 1, "describer": "./x.py:f"}'), "no name of a net"),
+        (lambda m: (m / "000000" / "rows.npy").write_bytes(b"x"), "rows.npy: cannot be read"),
+        (lambda m: os.truncate(m / "000000" / "rows.npy", 900), "rows.npy: cannot be read"),
+        (lambda m: (m / "000000" / "points.npy").unlink(), "points.npy: no such file"),
+        (lambda m: np.save(m / "000000" / "points.npy", np.zeros((3, 2), np.float32)), '"points" has shape'),
+        (lambda m: np.savez(m / "000000" / "frames.npz", names=np.array(["a"])), '"rows" has shape|stamps'),
+        (lambda m: np.save(m / "000000" / "rows.npy", np.full((10, 8), np.nan)), "a number that is not finite"),
+        (lambda m: np.savez(m / "projection.npz", mean=np.zeros(3)), "loopclosure map add makes it again"),
+    ],
+)
+def test_damage_is_one_line(damage, sentence: str, a_map: Map, tmp_path: Path) -> None:
+    damage(tmp_path / "M")
+    with pytest.raises(InputError, match=sentence):
+        Map(tmp_path / "M").detector(Thumbnailer())
+
+
+def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is there already; loopclosure map add adds to a map"):
+        Map.create(tmp_path / "M", "default")
+    with pytest.raises(InputError, match="is no map"):
+        Map(drives)
+    with pytest.raises(InputError, match="no name of a net"):
+        Map.create(tmp_path / "N", "here.py:describe")
+    assert not (tmp_path / "N").exists()
+    with pytest.raises(InputError, match="ends at 65,504"):
+        a_map.add(open_recording(drives / "b"), lambda image: np.full(768, 1e5, np.float32))
+    with pytest.raises(InputError, match="5 dimensions, those before 768"):
+        a_map.add(open_recording(drives / "b"), lambda image: np.ones(5))
+    assert len(Map(tmp_path / "M")) == PLACES
+    shutil.rmtree(tmp_path / "M" / "000000")
+    assert len(Map(tmp_path / "M").detector(Thumbnailer())) == 0
