@@ -32,7 +32,7 @@ from netspec.dialects._boxes import (
 )
 from netspec.layers.base import Layer, Shape
 from netspec.layers.loss.base import BATCH_SIZE, FULL, VALID, Floor, normalization_mode
-from netspec.layers.loss.losses import FLT_MIN
+from netspec.layers.loss.scores import FLT_MIN
 from netspec.proto.schema import value
 
 # ssd.py: enums of MultiBoxLossParameter

@@ -1,10 +1,9 @@
-"""Layers that reduce each window of a map to one number: Pooling, and SPP, a pyramid of it."""
+"""Pooling and SPP."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,7 +11,6 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact.sums import Copies
-from netspec.exact.switch import is_recorded
 from netspec.layers.base import Layer, Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.preparing import Kernel, Preparation, finished
@@ -20,142 +18,21 @@ from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.training import Kernels, Learning, recorded
 from netspec.layers.vision.layout import channels_side_by_side
+from netspec.layers.vision.windows import (
+    CEIL,
+    LOWEST,
+    SMALLEST,
+    Pair,
+    Windows,
+    average_pool,
+    max_pool,
+    sampled_pool,
+    weighted_pool,
+)
 from netspec.proto.schema import TRAIN
 
 MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
-CEIL, FLOOR = 0, 1  # caffe.proto: enum PoolingParameter.RoundMode
-LOWEST = torch.finfo(torch.float32).min  # what a maximum starts from: Caffe's -FLT_MAX
 HIGHEST_PYRAMID = 16  # levels: 4^16 / 3 windows
-SMALLEST = torch.finfo(torch.float32).tiny  # Caffe's FLT_MIN
-
-Pair = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class Windows:
-    """Where the windows of a map lie; every pair is (vertical, horizontal), in pixels."""
-
-    size: Pair  # of the map
-    kernel: Pair
-    stride: Pair
-    pad: Pair
-    round_mode: int = CEIL
-
-    @property
-    def count(self) -> Pair:
-        """Return how many windows there are, down and across.
-
-        Rounded up, so the last window may reach past the map; it is dropped if it would begin past the map's end, but
-        only where either axis is padded. Unpadded, a stride longer than the kernel can leave it without a pixel.
-        """
-        counts = []
-        for size, kernel, stride, pad in self._axes():
-            room = size + 2 * pad - kernel
-            count = (room // stride if self.round_mode == FLOOR else -(-room // stride)) + 1
-            if any(self.pad) and (count - 1) * stride >= size + pad:
-                count -= 1
-            counts.append(count)
-        return counts[0], counts[1]
-
-    @property
-    def known_to_torch(self) -> bool:
-        """Whether torch's pooling has these windows: none empty, none padded by more than half a kernel."""
-        axes = zip(self._axes(), self.count, strict=True)
-        return all(2 * p <= k and (n - 1) * s < size + p for (size, k, s, p), n in axes)
-
-    def padded(self, maps: torch.Tensor, value: float) -> torch.Tensor:
-        """Return the maps framed by ``value`` such that every window is full."""
-        frame: list[int] = []
-        for (size, kernel, stride, pad), count in zip(self._axes(), self.count, strict=True):
-            frame = [pad, (count - 1) * stride + kernel - pad - size, *frame]
-        return F.pad(maps, frame, value=value)
-
-    def areas(self, like: torch.Tensor) -> torch.Tensor:
-        """Return what an average divides by, (count down, count across): padding counts, up to ``pad`` past the map."""
-        lengths = []
-        for (size, kernel, stride, pad), count in zip(self._axes(), self.count, strict=True):
-            starts = torch.arange(count, dtype=like.dtype, device=like.device) * stride - pad
-            lengths.append((starts + kernel).clamp(max=size + pad) - starts)
-        return torch.outer(lengths[0], lengths[1])
-
-    def _axes(self) -> zip[tuple[int, int, int, int]]:
-        return zip(self.size, self.kernel, self.stride, self.pad, strict=True)
-
-    @property
-    def reach(self) -> Pair:
-        """Return the padding after the map, vertical and horizontal, that brings Caffe's windows when rounding down.
-
-        With it, (size + pad + reach - kernel) // stride + 1 is ``count`` at every size: rounding up adds windows as
-        long as there is a pixel left, and where either axis is padded those that begin past the padded map are dropped.
-        """
-        reaches = []
-        for _, kernel, stride, pad in self._axes():
-            reach = pad if self.round_mode == FLOOR else pad + stride - 1
-            reaches.append(min(reach, kernel - 1) if any(self.pad) else reach)
-        return reaches[0], reaches[1]
-
-
-def max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the maximum of each window and the index, row * width + column, of the pixel it came from.
-
-    The first of equal pixels gets the gradient, padding and NaN never win, and a window without a pixel above
-    -FLT_MAX (all NaN, all -inf, or empty) yields -FLT_MAX, index -1 and no gradient.
-    """
-    if is_recorded():  # without the branch
-        values, indices = _native_max_pool(torch.where(maps > LOWEST, maps, LOWEST), windows)
-        return values, torch.where(values > LOWEST, indices, -1)
-    values, indices = _native_max_pool(maps, windows)
-    # torch lets NaN win, so the maxima betray whether any window needs Caffe's rule; maps without one pay only for
-    # this look at the smaller output.
-    if values.numel() and not bool(values.detach().amin() > LOWEST):
-        values, indices = _native_max_pool(torch.where(maps > LOWEST, maps, LOWEST), windows)
-        indices = torch.where(values > LOWEST, indices, -1)
-    return values, indices
-
-
-def _native_max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
-    kernel, stride, pad = windows.kernel, windows.stride, windows.pad
-    maps = channels_side_by_side(maps)
-    if windows.known_to_torch:
-        ceil = windows.round_mode == CEIL
-        return F.max_pool2d(maps, kernel, stride, pad, ceil_mode=ceil, return_indices=True)
-    framed = windows.padded(maps, LOWEST)
-    values, indices = F.max_pool2d(framed, kernel, stride, return_indices=True)
-    rows = indices.div(framed.shape[-1], rounding_mode="floor") - pad[0]
-    return values, rows * maps.shape[-1] + indices % framed.shape[-1] - pad[1]
-
-
-def average_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Return the mean of each window; padding counts as zeros.
-
-    A window without a pixel divides zero by what is left of its area, at times zero: NaN, as in Caffe.
-    """
-    if windows.known_to_torch and not is_recorded():  # torch 2.13 compiles its gradient wrong at the rim, in ceil mode
-        ceil = windows.round_mode == CEIL
-        return F.avg_pool2d(maps, windows.kernel, windows.stride, windows.pad, ceil_mode=ceil, count_include_pad=True)
-    return _sum_pool(maps, windows) / windows.areas(maps)
-
-
-def _sum_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
-    return F.avg_pool2d(windows.padded(maps, 0.0), windows.kernel, windows.stride, divisor_override=1)
-
-
-def weighted_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Return the mean of each window's pixels, each weighted by itself: stochastic pooling in the test phase."""
-    return _sum_pool(maps * maps, windows) / (_sum_pool(maps, windows) + SMALLEST)
-
-
-def sampled_pool(maps: torch.Tensor, windows: Windows, generator: torch.Generator) -> torch.Tensor:
-    """Return one pixel of each window, drawn with a probability proportional to its value (not negative)."""
-    (kernel_h, kernel_w), (down, across) = windows.kernel, windows.count
-    columns = F.unfold(windows.padded(maps, 0.0), windows.kernel, stride=windows.stride)
-    pixels = columns.view(*maps.shape[:2], kernel_h * kernel_w, down, across)
-    with torch.no_grad():
-        sums = pixels.cumsum(dim=2)
-        shape = (*maps.shape[:2], 1, down, across)
-        drawn = 1 - torch.rand(shape, generator=generator, device=maps.device, dtype=maps.dtype)  # never 0
-        chosen = (sums >= drawn * sums[:, :, -1:]).byte().argmax(dim=2, keepdim=True)  # the first that reaches it
-    return pixels.gather(2, chosen).squeeze(2)
 
 
 class _PoolingBase(Layer):

@@ -1,0 +1,188 @@
+"""Powers, exponentials and logarithms of scale x + shift, and the absolute value."""
+
+from __future__ import annotations
+
+import torch
+from typing_extensions import override
+
+from netspec.exact import libm
+from netspec.layers.activation import Activation, Rounded, scaled_and_shifted, torch_scaled_and_shifted
+from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
+
+
+@register("AbsVal")
+class AbsVal(Activation):
+    """|x|; the gradient at 0 is 0.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Caffe: src/caffe/layers/absval_layer.cpp
+    """
+
+    @override
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x.abs()
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Abs", *bottoms)
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.abs({x})", x=bottoms[0])
+
+
+@register("Power", "power_param")
+class Power(Rounded):
+    """(shift + scale x) ^ power; the constant shift ^ power where scale or power is 0, whatever x is.
+
+    Where shift is 0, Caffe's gradient divides by x and is NaN at x = 0; this one is the derivative there too.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Caffe: src/caffe/layers/power_layer.cpp
+    """
+
+    gradient_reads = frozenset({"bottom", "top"})
+    fresh = False
+
+    @override
+    def setup(self) -> None:
+        p = self.param.power_param
+        self.power: float = p.power
+        self.scale: float = p.scale
+        self.shift: float = p.shift
+
+    @override
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        if self.power * self.scale == 0:
+            return torch.full_like(x, self.shift).pow(self.power)
+        inner = self._inner(x)
+        return inner if self.power == 1 else inner.pow(self.power)
+
+    @override
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        inner = torch.full_like(x, self.shift) if self.power * self.scale == 0 else self._inner(x)
+        return inner.clone() if self.power == 1 else libm.power(inner, self.power)
+
+    def _inner(self, x: torch.Tensor) -> torch.Tensor:
+        if self.scale != 1:
+            x = x * self.scale
+        return x + self.shift if self.shift != 0 else x
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        slope = self.power * self.scale
+        if slope == 0 or self.power == 1:
+            return diff * slope
+        if self.power == 2:
+            derivative = slope * self.scale * bottom
+            return diff * (derivative + slope * self.shift if self.shift != 0 else derivative)
+        if self.shift != 0:
+            return diff * (top / self._inner(bottom) * slope)
+        at_zero = slope * bottom.pow(self.power - 1)
+        return diff * torch.where(bottom == 0, at_zero, top / bottom * self.power)
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.power * self.scale == 0:
+            return graph.node("Expand", graph.constant(self.shift**self.power), graph.shape_of(bottoms[0]))
+        value = scaled_and_shifted(graph, bottoms[0], self.scale, self.shift)
+        return value if self.power == 1 else graph.node("Pow", value, graph.constant(self.power))
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.power * self.scale == 0:
+            return code.call("torch.full_like({x}, {value})", x=bottoms[0], value=self.shift**self.power)
+        value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
+        return value if self.power == 1 else code.call("torch.pow({x}, {power})", x=value, power=self.power)
+
+
+def _log(base: float) -> float:
+    """Return the logarithm of a base, a float as Caffe's."""
+    return libm.log(torch.tensor(base)).item()
+
+
+@register("Exp", "exp_param")
+class Exp(Rounded):
+    """base ^ (shift + scale x); base -1, the default, stands for e.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Caffe: src/caffe/layers/exp_layer.cpp
+    """
+
+    gradient_reads = frozenset({"top"})
+
+    @override
+    def setup(self) -> None:
+        """Read scale, shift and the base, which must be positive or -1."""
+        p = self.param.exp_param
+        if p.base <= 0 and p.base != -1:
+            raise self.error(f"found base {p.base:g}, expected a positive one, or -1 for e", "exp_param", "base")
+        log_base = 1.0 if p.base == -1 else _log(p.base)
+        self.scale = log_base * p.scale
+        self.shift = log_base * p.shift
+
+    @override
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.exp(x * self.scale + self.shift)
+
+    @override
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        p = self.param.exp_param
+        if p.shift == 0:
+            return libm.exp(x * self.scale)
+        factor = libm.exp(x.new_tensor(p.shift)) if p.base == -1 else libm.power(x.new_tensor(p.base), p.shift)
+        # Caffe makes 0 * infinity of what a large shift would bring back to a number.
+        return libm.exp(x * self.scale) * factor if factor.isfinite() else self.as_torch(x)
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        return diff * top * self.scale
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node("Exp", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.exp({x})", x=torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift))
+
+
+@register("Log", "log_param")
+class Log(Rounded):
+    """Logarithm of (shift + scale x) to a base; base -1, the default, stands for e.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Caffe: src/caffe/layers/log_layer.cpp
+    """
+
+    gradient_reads = frozenset({"bottom"})
+
+    @override
+    def setup(self) -> None:
+        """Read scale, shift and the base, which must be -1, or positive and not 1."""
+        p = self.param.log_param
+        if (p.base <= 0 and p.base != -1) or p.base == 1:
+            raise self.error(
+                f"found base {p.base:g}, expected a positive one other than 1, or -1 for e", "log_param", "base"
+            )
+        log_base = 1.0 if p.base == -1 else _log(p.base)
+        self.base_scale = 1 / log_base
+        self.slope = p.scale / log_base
+        self.scale: float = p.scale
+        self.shift: float = p.shift
+
+    @override
+    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.log(x * self.scale + self.shift) * self.base_scale
+
+    @override
+    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
+        return libm.log(x * self.scale + self.shift) * self.base_scale
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        return diff * (libm.power(bottom * self.scale + self.shift, -1) * self.slope)
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        logarithm = graph.node("Log", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
+        return scaled_and_shifted(graph, logarithm, self.base_scale, 0)
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
+        return torch_scaled_and_shifted(code, code.call("torch.log({x})", x=value), self.base_scale, 0)

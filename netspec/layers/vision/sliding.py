@@ -1,0 +1,209 @@
+"""Layers that slide a filter over a map: the filter's geometry, and Im2col."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import chain
+from typing import Any, ClassVar
+
+import torch
+from torch.nn import functional as F
+from typing_extensions import override
+
+from netspec.exact.products import (
+    Columns,
+    Filter,
+)
+from netspec.layers.base import Layer, Shape
+from netspec.layers.exporting import refusal
+from netspec.layers.registry import register
+from netspec.layers.targets import OnnxGraph, TorchCode
+
+
+def _by(sizes: Shape) -> str:
+    return " x ".join(map(str, sizes))
+
+
+class SlidingFilter(Layer):
+    """Base of the layers described by a ConvolutionParameter: the filter's geometry, one number per spatial axis."""
+
+    kernel: Shape
+    stride: Shape
+    pad: Shape
+    dilation: Shape
+
+    def read_geometry(self) -> None:
+        """Read ``axis`` and the filter's kernel, stride, pad and dilation for the first bottom's axes."""
+        param, shape = self.param.convolution_param, self.bottom_shapes[0]
+        self.channel_axis = self.canonical_axis(param.axis, shape, "convolution_param", "axis")
+        self.spatial_axes = len(shape) - self.channel_axis - 1
+        given = param.kernel_size or param.HasField("kernel_h") or param.HasField("kernel_w")
+        if self.spatial_axes and not given:
+            raise self.error("kernel_size (or kernel_h and kernel_w) is missing", "convolution_param")
+        self.kernel = self._read("kernel_size", "kernel_h", "kernel_w", default=1, least=1)
+        self.stride = self._read("stride", "stride_h", "stride_w", default=1, least=1)
+        self.pad = self._read("pad", "pad_h", "pad_w", default=0, least=0)
+        self.dilation = self._read("dilation", None, None, default=1, least=1)
+
+    def _read(self, name: str, name_h: str | None, name_w: str | None, default: int, least: int) -> Shape:
+        param, axes, field = self.param.convolution_param, self.spatial_axes, "convolution_param"
+        given = tuple(getattr(param, name))
+        pair = [n for n in (name_h, name_w) if n is not None and param.HasField(n)]
+        if pair:
+            if given:
+                raise self.error(f"found both {name} and {pair[0]}; give one of them", field, pair[0])
+            if axes != 2:
+                raise self.error(f"{pair[0]} is for 2 spatial axes, the bottom has {axes}; use {name}", field, pair[0])
+            given = (getattr(param, str(name_h)), getattr(param, str(name_w)))
+        elif len(given) <= 1:
+            given = (given or (default,)) * axes
+        elif len(given) != axes:
+            message = f"found {name} {len(given)} times, expected once or once for each of {axes} spatial axes"
+            raise self.error(message, field, name, axes)
+        if any(v < least for v in given):
+            names = f"{name_h} and {name_w}" if pair else name
+            raise self.error(f"{names} must be at least {least}, found {_by(given)}", field, pair[0] if pair else name)
+        return given
+
+    @property
+    def extent(self) -> Shape:
+        """The pixels that a dilated filter spans."""
+        return tuple(d * (k - 1) + 1 for k, d in zip(self.kernel, self.dilation, strict=True))
+
+    def slide(self, shape: Shape) -> Shape:
+        """Return how often the filter fits, along each spatial axis of a bottom of ``shape``."""
+        axes = zip(shape[self.channel_axis + 1 :], self.pad, self.extent, self.stride, strict=True)
+        # C++ rounds a quotient toward zero: a filter too long by less than a stride still fits once, over zeros.
+        fits = tuple(int((size + 2 * p - e) / s) + 1 for size, p, e, s in axes)
+        self.check_output(fits, shape)
+        return fits
+
+    def check_output(self, spatial: Shape, shape: Shape) -> None:
+        """Refuse tops without a single pixel."""
+        if any(size < 1 for size in spatial):
+            raise self.error(
+                f"the filter does not fit: a bottom of shape {shape} would give a map of {_by(spatial)} (kernel "
+                f"{_by(self.kernel)}, stride {_by(self.stride)}, pad {_by(self.pad)}, dilation {_by(self.dilation)})",
+                "convolution_param",
+            )
+
+    def check_axes(self, bottom_shapes: Sequence[Shape], channels: int) -> None:
+        """Refuse bottoms that the filters, made for those seen first, do not suit; all must have one shape."""
+        shape = bottom_shapes[0]
+        if len(shape) != self.channel_axis + 1 + self.spatial_axes or shape[self.channel_axis] != channels:
+            raise self.error(
+                f"bottom of shape {shape} does not fit the filters, made for {channels} channels at axis "
+                f"{self.channel_axis} and {self.spatial_axes} spatial axes",
+                "bottom",
+            )
+        for i, other in enumerate(bottom_shapes):
+            if other != shape:
+                raise self.error(f"all bottoms must have one shape, found {shape} and {other}", "bottom", i)
+
+    def overhang(self, shape: Shape) -> list[int]:
+        """Return, in the order of F.pad, the zeros to append where the filter is longer than the padded map."""
+        axes = zip(shape[self.channel_axis + 1 :], self.pad, self.extent, strict=True)
+        short = [max(0, e - size - 2 * p) for size, p, e in axes]
+        return list(chain.from_iterable((0, n) for n in reversed(short)))
+
+    def onnx_geometry(self) -> dict[str, Any]:
+        """Return the attributes of ONNX's Conv and ConvTranspose."""
+        if not self.kernel:
+            return {"kernel_shape": [1]}
+        return {
+            "kernel_shape": list(self.kernel),
+            "strides": list(self.stride),
+            "dilations": list(self.dilation),
+            "pads": [*self.pad, *self.pad],
+        }
+
+    onnx_op: ClassVar[str] = "Conv"
+
+    def onnx_convolved(
+        self, graph: OnnxGraph, maps: str, weights: Sequence[str], group: int, geometry: dict[str, Any]
+    ) -> str:
+        """Return the product with the filters. A filter of one pixel is padded before: OpenCV 5.0 does it wrong."""
+        pads = geometry.get("pads", [])
+        if self.onnx_op == "Conv" and set(self.kernel) == {1} and any(pads):
+            before, after = pads[: len(self.pad)], pads[len(self.pad) :]
+            maps = graph.node("Pad", maps, graph.constant([0, 0, *before, 0, 0, *after]))
+            geometry = {**geometry, "pads": [0] * len(pads)}
+        return graph.node(self.onnx_op, maps, *weights, group=group, **geometry)
+
+    def torch_geometry(self) -> dict[str, Any]:
+        """Return kernel, stride, padding and dilation as torch takes them: one number where all axes have the same."""
+        given = {"kernel_size": self.kernel, "stride": self.stride, "padding": self.pad, "dilation": self.dilation}
+        return {name: values[0] if len(set(values)) == 1 else values for name, values in given.items()}
+
+
+TORCH_USUAL = {"stride": 1, "padding": 0, "dilation": 1, "groups": 1}
+
+
+@register("Im2col", "convolution_param")
+class Im2col(SlidingFilter):
+    """Lay the pixels under each position of a filter side by side, as channels.
+
+    bottom[0]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: any number, at least one)
+    top[0]     (N, C kernel_h kernel_w, H', W'),  H' as Convolution's; zero where the filter leaves the map
+    Caffe: src/caffe/layers/im2col_layer.cpp
+    """
+
+    ignores = frozenset(
+        f"convolution_param.{name}" for name in ("num_output", "bias_term", "group", "weight_filler", "bias_filler")
+    )
+
+    @override
+    def setup(self) -> None:
+        self.read_geometry()
+        if self.spatial_axes < 1:
+            raise self.error("the bottom has no spatial axis after its channels", "bottom")
+        self.channels = self.bottom_shapes[0][self.channel_axis]
+
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape with a channel for each pixel of the filter, and the filter's positions."""
+        self.check_axes(bottom_shapes, self.channels)
+        shape = bottom_shapes[0]
+        return [(*shape[: self.channel_axis], self.channels * math.prod(self.kernel), *self.slide(shape))]
+
+    @override
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        overhang = self.overhang(self.bottom_shapes[0])
+        if self.is_exact(data):
+            maps = F.pad(data, overhang).flatten(0, self.channel_axis - 1) if self.channel_axis else data[None]
+            sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
+            return Columns.apply(maps, sliding).reshape(self.top_shapes[0])
+        padding = chain.from_iterable((p, p) for p in reversed(self.pad))
+        windows = F.pad(data, [p + n for p, n in zip(padding, overhang, strict=True)])
+        first = self.channel_axis + 1
+        geometry = zip(self.extent, self.stride, self.dilation, strict=True)
+        for axis, (extent, stride, dilation) in enumerate(geometry, start=first):
+            windows = windows.unfold(axis, extent, stride)[..., ::dilation]  # the filter's pixels, as a last axis
+        last = first + self.spatial_axes
+        order = (*range(first), *range(last, windows.dim()), *range(first, last))
+        return windows.permute(order).reshape(self.top_shapes[0])
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.channel_axis != 1 or self.spatial_axes > 3 or any(self.overhang(self.bottom_shapes[0])):
+            raise refusal(self, "ONNX", "it is exported for (N, C, spatial axes) and filters that fit")
+        pixels = math.prod(self.kernel)
+        picks = (
+            torch.eye(pixels).reshape(pixels, 1, *self.kernel).repeat(self.channels, *(1,) * (1 + self.spatial_axes))
+        )
+        return self.onnx_convolved(graph, bottoms[0], [graph.constant(picks)], self.channels, self.onnx_geometry())
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.channel_axis != 1 or self.spatial_axes != 2 or any(self.overhang(self.bottom_shapes[0])):
+            raise refusal(self, "PyTorch", "it is exported for (N, C, H, W) and filters that fit")
+        numbers = self.torch_geometry()
+        options = ", ".join(f"{name}={{{name}}}" for name, value in numbers.items() if value != TORCH_USUAL.get(name))
+        rows = self.top_shapes[0][2]
+        code.size(0, 2, "the rows of windows are counted beforehand")
+        template = f"{code.function(lay_out_windows)}({{x}}, {{rows}}, {options})"
+        return code.call(template, x=bottoms[0], rows=rows, **numbers)
+
+
+def lay_out_windows(x, rows, **geometry):
+    """Return the pixels under each position of a filter as channels (N, C K, H, W)."""
+    return F.unfold(x, **geometry).unflatten(2, (rows, -1))
