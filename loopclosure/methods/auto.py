@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from loopclosure.detector.verification import LEAST_MATCHES, Agreement, GeometricCheck, Pairs
+from loopclosure.detector.verification import DOUBTLESS, LEAST_MATCHES, SURE, Agreement, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
-from loopclosure.methods.decoys import Found, best_setting
+from loopclosure.methods.decoys import Found, best_setting, threshold
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
@@ -25,6 +25,8 @@ PRECISION = 0.99
 SAMPLE = 40  # matches, and unlike pairs, that tell whether verification works
 # The share of what sequences accept, or without sequences the number of matches, that verification must find.
 LEAST_SHARE, LEAST_FOUND = 0.5, 3
+# Where at most this share of unlike pairs are verified, a verified match beside a loop is one as well.
+RARELY = 0.05
 WINDOW = 5  # references beside a line, and at least so many queries along it, that a verified pair vouches for
 
 Agree = Callable[[int, int], Agreement]
@@ -79,13 +81,16 @@ def answer(
     """
     if not 0 < precision < 1:
         raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
-    known = np.where(allowed & np.isfinite(scores), scores, -np.inf)
+    allowed = allowed & np.isfinite(scores)
+    if not two:
+        allowed &= earlier(len(scores), _visit(scores, allowed))
+    known = np.where(allowed, scores, -np.inf)
     single = known.argmax(axis=1)
     score = known.max(axis=1)
     there = np.isfinite(score)
     match = np.where(there, single, -1)
     accepted = np.zeros(len(match), bool)
-    found = best_setting(scores, np.isfinite(known), two, precision)
+    found = best_setting(scores, allowed, two, precision)
     reasons = [_sequences_said(found, precision)]
     if found is not None:
         match, score, accepted = found.match.copy(), found.targets, found.accepted(precision)
@@ -96,30 +101,59 @@ def answer(
     if check is None or agree is None:
         reasons += ["verification: not tried, there are no images", _total_said(accepted, there)]
         return Answer(match, score, verdicts.tolist(), inliers, 0, reasons)
-    works, said = _verification_works(known, match, score, accepted, check, agree)
+    unlike, said = _verification_works(known, match, score, accepted, check, agree)
     reasons.append(said)
-    if works:
+    if unlike is not None:
         few = np.zeros(len(match), bool)
+        evidence = np.zeros(len(match))
         for query in progress(np.flatnonzero(there), "verification", int(np.count_nonzero(there))):
             for reference in dict.fromkeys((int(match[query]), int(single[query]))):
                 agreement = agree(int(query), reference)
                 inliers[query] = check.enough(agreement)
+                evidence[query] = check.evidence(agreement)
                 few[query] = agreement.matches < LEAST_MATCHES
                 if inliers[query]:
                     match[query] = reference
                     break
         unverifiable = int(np.count_nonzero(few & there & (inliers <= 0)))
         verified = inliers > 0
-        supported = _supported(match, verified, found)
-        verdicts[accepted & ~supported] = "not verified"
-        verdicts[there & ~accepted & ~supported] = "not verified" if found is None else "below threshold"
-        verdicts[verified | (accepted & supported)] = "accepted"
+        # What verification alone finds must be better than what it finds in pairs that are no loop.
+        least = max(SURE, threshold(evidence, unlike, precision))
+        if np.count_nonzero(unlike >= DOUBTLESS) <= LEAST_SHARE * len(unlike):
+            least = min(least, DOUBTLESS)
+        sure = evidence >= least
+        if np.count_nonzero(unlike >= 1) > LEAST_SHARE * len(unlike):
+            verified = sure | accepted
+        kept = sure | (accepted & _between(match, verified, found))
+        rare = np.count_nonzero(unlike >= 1) <= RARELY * len(unlike)
+        while rare and np.any(more := verified & np.any(_beside(match, kept, found), axis=0) & ~kept):
+            kept |= more
+        verdicts[accepted & ~kept] = "not verified"
+        verdicts[there & ~accepted & ~kept] = "not verified" if found is None else "below threshold"
+        verdicts[kept] = "accepted"
         accepted = verdicts == "accepted"
         if found is not None:
             score = np.where(there, found.scores[np.arange(len(match)), match], -np.inf)
             score = np.where(np.isnan(score), -np.inf, score)
     reasons.append(_total_said(accepted, there))
     return Answer(match, score, verdicts.tolist(), inliers, unverifiable, reasons)
+
+
+def _visit(scores: np.ndarray, allowed: np.ndarray) -> int:
+    """Return how many frames a visit to a place takes in one drive: so many are as unlike as different places are.
+
+    A camera that stands, or a straight road, is like itself for long; that is no loop.
+    """
+    lags = [(k, np.median(known)) for k in range(1, len(scores)) if len(known := _finite(np.diagonal(scores, -k)))]
+    visit, before = 0, -1
+    while visit > before and np.any(apart := allowed & earlier(len(scores), visit)):
+        different = np.median(scores[apart])
+        visit, before = next((k - 1 for k, alike in lags if alike <= different), visit), visit
+    return visit
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return values[np.isfinite(values)]
 
 
 def _sequences_said(found: Found | None, precision: float) -> str:
@@ -140,49 +174,62 @@ def _total_said(accepted: np.ndarray, there: np.ndarray) -> str:
 
 def _verification_works(
     known: np.ndarray, match: np.ndarray, score: np.ndarray, accepted: np.ndarray, check: GeometricCheck, agree: Agree
-) -> tuple[bool, str]:
-    """Try matches and unlike pairs; return whether verification tells them apart, and a sentence."""
+) -> tuple[np.ndarray | None, str]:
+    """Try matches and unlike pairs; return the evidence of these if verification tells them apart, and a sentence."""
     likely = np.flatnonzero(accepted) if accepted.any() else np.argsort(-score, kind="stable")[:SAMPLE]
     likely = likely[match[likely] >= 0]
     if not len(likely):
-        return False, "verification: not tried, no query has a candidate"
+        return None, "verification: not tried, no query has a candidate"
     likely = likely[np.unique(np.linspace(0, len(likely) - 1, SAMPLE).round().astype(int))]
     same = sum(check.enough(agree(int(query), int(match[query]))) > 0 for query in likely)
     wide = np.flatnonzero(np.count_nonzero(np.isfinite(known), axis=1) >= 8)
     wide = wide[np.unique(np.linspace(0, len(wide) - 1, SAMPLE).round().astype(int))] if len(wide) else wide
-    unlike = 0
-    for query in wide:
+    against = np.zeros(len(wide))
+    for number, query in enumerate(wide):
         order = np.argsort(known[query], kind="stable")
         candidates = order[np.isfinite(known[query, order])]
         # One of the least alike quarter, another quarter of them each time.
         reference = candidates[int(query) % max(1, len(candidates) // 4)]
-        unlike += check.enough(agree(int(query), int(reference))) > 0
+        against[number] = check.evidence(agree(int(query), int(reference)))
+    unlike = np.count_nonzero(against >= 1)
     tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(wide)} unlike pairs"
-    # Some unlike pairs of a small place, a desk, do show the same things; a dashboard is in nearly all.
-    if unlike > LEAST_SHARE * len(wide):
-        return False, f"{tried}: something is the same in all images, so that it is not used"
     if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
-        return False, f"{tried}: these images cannot be verified, so that nothing is rejected for it"
-    return True, f"{tried}: what is verified is a loop, and what has no verified pair near it is none"
+        return None, f"{tried}: these images cannot be verified, so that nothing is rejected for it"
+    # Unlike pairs of a small place, a desk, do show the same things, and so does a dashboard in all images.
+    if unlike > LEAST_SHARE * len(wide):
+        return (
+            against,
+            f"{tried}: something is the same in all images, so that only what has far more in common is verified",
+        )
+    return against, f"{tried}: what is verified is a loop, and what has no verified pair near it is none"
 
 
-def _supported(match: np.ndarray, verified: np.ndarray, found: Found | None) -> np.ndarray:
-    """Return the queries (Q,) that are verified or, of sequences, have a verified match on the line through their own.
+def _between(match: np.ndarray, verified: np.ndarray, found: Found | None) -> np.ndarray:
+    """Return the queries (Q,) that are verified or, of sequences, lie between two that are, on the line through them.
+
+    Past the last verified match a loop has ended, though the line through it goes on.
+    """
+    near = _beside(match, verified, found)
+    return verified | (near[0] & near[1])
+
+
+def _beside(match: np.ndarray, which: np.ndarray, found: Found | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the queries that have one of ``which`` (Q,) before them, and after, on the line through their match.
 
     The line has the length and the velocities of the sequences, and is ``WINDOW`` references wide to each side.
     """
-    supported = verified.copy()
+    before, after = np.zeros_like(which), np.zeros_like(which)
     if found is None:
-        return supported
+        return before, after
     sequence, numbers = found.setting.sequence, np.arange(len(match))
     for step in range(1, max(WINDOW, sequence.length // 2) + 1):
-        for sign in (-1, 1):
+        for sign, side in ((-1, before), (1, after)):
             other = numbers + sign * step
             inside = np.flatnonzero((other >= 0) & (other < len(match)))
             moved = (match[other[inside]] - match[inside]) * sign
             low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW
-            supported[inside[(moved >= low) & (moved <= high) & verified[other[inside]]]] = True
-    return supported
+            side[inside[(moved >= low) & (moved <= high) & which[other[inside]]]] = True
+    return before, after
 
 
 @dataclass

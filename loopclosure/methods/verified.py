@@ -1,9 +1,10 @@
 """Geometric verification of another method's best matches: ``verified+METHOD`` on the command line.
 
 The best k references of each query are compared by local features and a fundamental matrix (an essential matrix, where
-the camera is known). What is verified comes before all that is not; within both the inner method's order stays. So
-verification can only put right matches before wrong ones, and where images are too small, too dark or too different to
-be verified, the inner method's answer is passed through. On top of SeqSLAM a sequence is verified, not a single image:
+the camera is known). What is verified comes before all that is not; within both the inner method's order stays. Where
+images are too small, too dark or too different to be verified, the inner method's answer is passed through. To come
+before a better score takes half as many inliers again as rule out chance: two views of other parts of one corridor have
+just enough. On top of SeqSLAM a sequence is verified, not a single image:
 a pair is verified if any pair on one of its trajectories is.
 """
 
@@ -98,7 +99,7 @@ class Verified:
                 best = np.argsort(-candidates[query], kind="stable")[: self.k]
                 for reference in best[~np.isneginf(candidates[query, best])]:
                     found = self.pairs.agreement(self.check, images.queries[query], references[reference])
-                    inliers[query, reference] = self.check.enough(found)
+                    inliers[query, reference] = self.check.sure(found)
         return inliers
 
 

@@ -107,6 +107,55 @@ def test_what_is_verified_is_a_loop_and_a_sequence_without_it_is_none():
     assert np.count_nonzero(everywhere.accepted) > 0.9 * 150
 
 
+def test_a_loop_ends_with_its_last_verified_match():
+    """The line through a loop goes on where the loop has ended."""
+    road = drive(150, 6)
+    other = drive(60, 16)
+    scores = alike(np.concatenate([again(road[:90], 1.0, 7), other]), road)
+    points = Agreement(60, 50, 20), Agreement(40, 9, 20)
+    found = answer(
+        scores, everything(scores), True, 0.99, GeometricCheck(), lambda q, r: points[q >= 90 or abs(q - r) > 3]
+    )
+    assert np.count_nonzero(found.accepted[:90]) > 80
+    assert not found.accepted[90:].any()
+
+
+@pytest.mark.parametrize("inliers", [20, 28])
+def test_a_facade_whose_windows_repeat_is_no_loop(inliers):
+    scores = alike(drive(150, 1), drive(120, 101))
+    found = answer(
+        scores, everything(scores), True, 0.99, GeometricCheck(), lambda q, r: Agreement(40, inliers * (q % 2), 20)
+    )
+    assert not found.accepted.any()
+
+
+def test_a_desk_of_which_all_images_show_something():
+    """Unlike pairs are verified as well; what has three times the points is a loop."""
+    rng = np.random.default_rng(3)
+    rows = again(drive(5, 9)[rng.integers(0, 5, 200)], 0.3, 10)
+    found = answer(
+        alike(rows, rows),
+        np.tri(200, k=-6, dtype=bool),
+        False,
+        0.99,
+        GeometricCheck(),
+        lambda q, r: Agreement(90, 70 if rows[q] @ rows[r] > 0.7 else 25, 20),
+    )
+    assert "something is the same in all images" in found.reasons[1]
+    alike_ones = rows[np.arange(200)] @ rows.T > 0.7
+    assert alike_ones[np.arange(200), found.match][found.accepted].all()
+    assert np.count_nonzero(found.accepted) > 150
+
+
+def test_a_camera_that_moves_slowly_closes_no_loop():
+    """Frames 31 apart are alike, and so are the next ones: a line, forwards only."""
+    steps = np.random.default_rng(4).normal(size=(500, SIZE))
+    rows = np.cumsum(steps, axis=0)
+    rows = rows[100:] - rows[:-100]
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    assert not answer(alike(rows, rows), np.tri(400, k=-31, dtype=bool), False).accepted.any()
+
+
 def test_single_images_are_verified_where_sequences_tell_nothing():
     """A camera that looks at five things in random order."""
     rng = np.random.default_rng(8)

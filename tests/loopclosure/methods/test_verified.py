@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from loopclosure.detector.verification import GeometricCheck
+from loopclosure.detector.verification import Agreement, GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
 from loopclosure.methods.seqslam import SeqSlam, SequenceSettings
@@ -90,6 +90,16 @@ def test_images_that_cannot_be_verified_pass_through(walls):
     result = Verified(Fixed(given)).score(Images([blank] * 6, walls[:6]), silent)
     np.testing.assert_array_equal(result.scores, given)
     assert result.notes[-1].startswith("these images cannot be verified")
+
+
+@pytest.mark.parametrize(("inliers", "best"), [(17, 0), (26, 1)])
+def test_just_more_inliers_than_chance_do_not_overrule_a_score(walls, inliers, best):
+    given = np.array([[0.9, 0.5, 0.1]])
+    method = Verified(Fixed(given), k=3)
+    images = Images(walls[:1], walls[1:4])
+    for reference, found in zip(walls[1:4], ((7, 0), (26, inliers), (5, 0)), strict=True):
+        method.pairs._found[method.check, walls[0], reference] = Agreement(*found, 17)
+    assert np.nanargmax(method.score(images, silent).scores) == best
 
 
 def test_another_method_of_the_run_finds_nothing_again(walls, monkeypatch):
