@@ -17,7 +17,7 @@ from netspec.errors import SpecError
 ROOT = Path(__file__).resolve().parents[1]
 PAPER = [f"siamese_{n}" for n in ("8", "128", "resnet27_256", "resnet27_512")]
 SMALL = [f"small/{name}" for name in PAPER]
-CATALOGUE = [*PAPER, *SMALL, *ZOO]
+CATALOG = [*PAPER, *SMALL, *ZOO]
 RATE, MOMENTUM, DECAY = 1e-4, 0.9, 5e-4  # of trainings: small, so that numbers stay usual ones however long it takes
 
 
@@ -60,7 +60,7 @@ class Case:
 def forward_case(
     name: str, batch: int, weights: str | None = None, twin: str | None = None, onnx: bool = True
 ) -> Iterator[Case]:
-    """Write what forward passes of a net need; ``name`` is one of the catalogue, or the path of a prototxt.
+    """Write what forward passes of a net need; ``name`` is one of the catalog, or the path of a prototxt.
 
     Without ``weights`` they are random. Raises SpecError for faults of the files.
     """
@@ -69,7 +69,7 @@ def forward_case(
     from netspec.proto.text import write_text
 
     with TemporaryDirectory(prefix="bench-") as folder:
-        case = Case(name, batch, Path(folder), name if name in CATALOGUE else twin)
+        case = Case(name, batch, Path(folder), name if name in CATALOG else twin)
         case.prototxt.write_text(write_text(_with_batch(_deploy(name), batch)))
         net = netspec.load_net(case.prototxt, "TEST", weights, seed=0)
         if weights is None:
@@ -87,15 +87,15 @@ def forward_case(
 
 @contextmanager
 def training_case(name: str, batch: int) -> Iterator[Case]:
-    """Write what the training of a net of the catalogue needs: a database that has one batch."""
+    """Write what the training of a net of the catalog needs: a database that has one batch."""
     import netspec
     from netspec.data.database import Writer
     from netspec.data.datum import array_to_datum
     from netspec.proto.schema import SolverParameter
     from netspec.proto.text import write_text
 
-    if name not in CATALOGUE:
-        raise SpecError(f'no training of "{name}"; there are: {", ".join(CATALOGUE)}')
+    if name not in CATALOG:
+        raise SpecError(f'no training of "{name}"; there are: {", ".join(CATALOG)}')
     with TemporaryDirectory(prefix="bench-") as folder:
         case = Case(name, batch, Path(folder), name)
         source = str(case.folder / "records")
@@ -129,11 +129,11 @@ def _deploy(name: str) -> Any:
 
     if name in ZOO:
         return deploy(name)
-    return read_net(ROOT / "prototxt" / name / "deploy.prototxt" if name in CATALOGUE else name)
+    return read_net(ROOT / "prototxt" / name / "deploy.prototxt" if name in CATALOG else name)
 
 
 def training_net(name: str, source: str, batch: int) -> Any:
-    """Return the NetParameter with which a net of the catalogue is trained on the LMDB ``source``."""
+    """Return the NetParameter with which a net of the catalog is trained on the LMDB ``source``."""
     from netspec.proto.text import read_net
 
     if name in ZOO:

@@ -29,13 +29,13 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="tools/bench", description=__doc__, allow_abbrev=False)
     commands = _Quiet(made)
     p = commands.add("forward", _forward, "time forward passes beside those of other programs")
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list), or a prototxt")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
     p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-    p.add_argument("--twin", help="the net of the catalogue whose PyTorch twin the prototxt has")
+    p.add_argument("--twin", help="the net of the catalog whose PyTorch twin the prototxt has")
     _add_common(p, FORWARD, (*ENGINES, "pytorch", "opencv4"))
     p.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
     p = commands.add("train", _train, "time training iterations: forward, backward, update")
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
     _add_common(p, TRAINING, ("netspec", "pytorch"))
     p.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
     p.add_argument("--device", default="cpu", help="torch's name of it, for netspec and pytorch (default: cpu)")
@@ -44,13 +44,13 @@ def parser() -> argparse.ArgumentParser:
     _add_common(p, WAYS_OF_SMALL, WAYS_OF_SMALL)
     p.set_defaults(batch=[1, 4, 16, 64])
     p = commands.add("start", _start, "time processes that load a net and describe one image")
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list), or a prototxt")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
     p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
     _add_ways(p, (*ENGINES, "opencv4"), (*ENGINES[:3], "opencv4"))
     p = commands.add(
         "waiting", _waiting, "time two trainings side by side, as their OpenMP threads wait in several ways"
     )
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
     p.add_argument(
         "--waits", nargs="+", default=["", "OMP_WAIT_POLICY=PASSIVE", "GOMP_SPINCOUNT=2000"], metavar="VARIABLE=VALUE"
     )
@@ -64,10 +64,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
     p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
     p = commands.add("feeding", _feeding, "how long trainings wait for data from databases and image files")
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalogue (see list)")
+    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
     p.add_argument("--batch", type=int, default=4, help="items of a batch (default: 4)")
     p.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
-    commands.add("list", _list, "list the nets of the catalogue")
+    commands.add("list", _list, "list the nets of the catalog")
     return made
 
 
@@ -104,9 +104,9 @@ def _add_ways(p: argparse.ArgumentParser, known: Sequence[str], default: Sequenc
 
 
 def _list(arguments: argparse.Namespace) -> None:
-    from benchmarks.case import CATALOGUE
+    from benchmarks.case import CATALOG
 
-    print("\n".join(CATALOGUE))
+    print("\n".join(CATALOG))
 
 
 def _forward(arguments: argparse.Namespace) -> None:

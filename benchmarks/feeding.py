@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.case import CATALOGUE, record, training_net
+from benchmarks.case import CATALOG, record, training_net
 from netspec.errors import SpecError
 from netspec.layers.reading import waited
 
@@ -32,8 +32,8 @@ def measure(names: list[str], batch: int, threads: int, say: Say) -> None:
     torch.set_num_threads(threads)
     say("| net | data | ms per iteration | waiting for data |\n|---|---|---|---|")
     for name in names:
-        if name not in CATALOGUE:
-            raise SpecError(f'no training of "{name}"; there are: {", ".join(CATALOGUE)}')
+        if name not in CATALOG:
+            raise SpecError(f'no training of "{name}"; there are: {", ".join(CATALOG)}')
         channels = record(name)[0][0]
         for kind, prepare in SOURCES.items():
             if kind != "LMDB of pixels" and channels != 3:

@@ -370,7 +370,7 @@ class Classified(nn.Module):
 
 
 def net(name: str) -> nn.Module:
-    """Return the twin of a net of the catalogue: scores for a classifier, descriptors for ``[small/]siamese*_N``."""
+    """Return the twin of a net of the catalog: scores for a classifier, descriptors for ``[small/]siamese*_N``."""
     if name in CLASSIFIERS:
         return CLASSIFIERS[name]()
     tower, _, neurons = name.rpartition("/")[2].rpartition("_")

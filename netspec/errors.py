@@ -80,7 +80,7 @@ Report = Callable[[SpecError], None]  # takes an error; it may raise it, or coll
 
 
 def raise_fault(fault: SpecError) -> None:
-    """Raise the error: what is done with errors unless somebody collects them."""
+    """Raise the error, the default where errors are not collected."""
     raise fault
 
 

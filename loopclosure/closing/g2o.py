@@ -45,7 +45,7 @@ class PoseGraph:
 
 
 def read_pose_graph(path: Path) -> PoseGraph:
-    """Read a g2o file. Raises InputError (file:line) for what is no pose graph."""
+    """Read a g2o file. Raises InputError (file:line) for what is not a pose graph."""
     vertices: dict[int, Array] = {}
     edges: list[tuple[int, int, int, Array, Array]] = []  # line, ids, pose, information
     fixed: list[tuple[int, int]] = []  # line, id

@@ -16,13 +16,13 @@ from scipy.sparse.linalg import splu
 
 Array = NDArray[np.float64]
 
-DAMPING = 1e-12  # of the diagonal: only a guard against what no edge tells
+DAMPING = 1e-12  # of the diagonal: only a guard against directions that no edge constrains
 
 
 def least_squares_step(derivatives: sparse.csr_matrix, errors: Array, gtsam: bool | None = None) -> Array:
     """Return the x (6 U,) with the least \\|derivatives x + errors\\|; rows (6 E) in blocks of six, one to an edge.
 
-    ``gtsam``: whether GTSAM factors; None: where it is installed. Steps along what no edge tells are 0.
+    ``gtsam``: whether GTSAM factors; None: where it is installed. Steps along directions that no edge constrains are 0.
     """
     if find_spec("gtsam") is not None if gtsam is None else gtsam:
         try:

@@ -419,7 +419,7 @@ def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | Non
 
 
 def _starts(found: Any, count: int) -> list[int]:
-    """Return where the sessions of ``count`` frames begin. Raises ValueError or TypeError for what is no such list."""
+    """Return where the sessions of ``count`` frames begin. Raises ValueError or TypeError for anything else."""
     starts = [int(start) for start in found]
     if starts[:1] != [0] or sorted(starts) != starts or starts[-1] > count:
         raise ValueError(f"sessions that begin at {starts} of {count} frames")

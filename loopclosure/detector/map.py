@@ -205,7 +205,7 @@ class _Described:
 
 
 def checked_name(describer: str) -> str:
-    """Check that a describer is a name: a map is no reason to run a file that it mentions."""
+    """Check that a describer is a name: opening a map must not run a file that it mentions."""
     if not re.fullmatch(NAME, describer):
         raise InputError(f'"{describer}" is no name of a net; a map needs default, small or another that is installed')
     return describer

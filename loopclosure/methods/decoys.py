@@ -1,4 +1,4 @@
-"""Which matches are loops, told from the scores alone: sequences against the same sequences backwards.
+"""Which matches are loops, found by the scores alone: sequences against the same sequences backwards.
 
 A match that repeats a stretch of road lies on a line of similar pairs, in the direction in which time runs. Searched
 for with the references in reverse order, the same matrix has lines too, as similar as different places get on this
@@ -25,7 +25,7 @@ LENGTHS = (10, 30, 60)
 EVEN, UNEVEN = (0.8, 1.2, 0.1), (0.5, 2.0, 0.1875)
 TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so many:
 LEAST_TAIL = 5
-# Fewer matches than this are not told from one chance sequence.
+# Fewer matches than this cannot be told apart from one chance sequence.
 LEAST_ACCEPTED = 10
 # A shorter sequence is preferred to a longer one that accepts only this much more: it ends nearer to where a loop ends.
 NEARLY = 0.95
@@ -50,7 +50,7 @@ class Setting:
 class Found:
     """What a search found.
 
-    scores   (Q, R) of the line through each pair, higher = more alike; NaN for what is no candidate
+    scores   (Q, R) of the line through each pair, higher = more alike; NaN where a pair is not a candidate
     match    (Q,) each query's best reference, -1 without one
     targets  (Q,) its score, -inf without one
     decoys   (Q,) the best score of a reverse line, -inf without one

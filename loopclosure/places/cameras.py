@@ -27,7 +27,7 @@ CAMERAS = ("all", "left", "right", "both", "joined")
 def images_of_places(camera: str, images: int) -> NDArray[np.intp]:
     """Return the image numbers of each place: (places, 1), or of "joined" (places, 2), left and right.
 
-    Raises InputError for an unknown camera, or where ``images`` are no pairs of a left and a right one.
+    Raises InputError for an unknown camera, or where ``images`` are not pairs of a left and a right one.
     """
     if camera not in CAMERAS:
         raise InputError(f'unknown camera "{camera}"; known: {", ".join(CAMERAS)}')

@@ -64,7 +64,7 @@ class DataSet:
 
     @property
     def soft_truth(self) -> Truth | None:
-        """The truth by which a match of overlapping views is no mistake; None where the overlap is not known."""
+        """The truth by which a match of overlapping views is not a mistake; None where the overlap is not known."""
         if self.overlap is None:
             return None
         description = f"{self.truth.description}; no mistake where views overlap: {self.overlap_rule}"
@@ -106,7 +106,7 @@ def load_sequence(
 
     references    another sequence, with poses in the same frame of reference: each query against all its frames;
                   ``selection`` applies to the queries only, and no pair is excluded
-    view_overlap  which other views are no mistake in the soft zone
+    view_overlap  which other views are not a mistake in the soft zone
     """
     hard_m = MAX_DISTANCE_M if max_distance_m is None else max_distance_m
     hard_deg = MAX_ANGLE_DEG if max_angle_deg is None else max_angle_deg

@@ -34,7 +34,7 @@ POSE_FORM_HELP = (
 
 
 def is_recording(source: Path) -> bool:
-    """Return whether a source is a bag or a video, whose frames are no files."""
+    """Return whether a source is a bag or a video, whose frames are not files."""
     return is_bag(source) or source.suffix.lower() in VIDEO_SUFFIXES
 
 

@@ -62,5 +62,5 @@ def _main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.path.pop(0)  # the folder of this file, which is none of modules
+    sys.path.pop(0)  # the folder of this file: modules must not be found there
     _main(sys.argv[1])

@@ -119,7 +119,7 @@ def pose_form(text: str) -> PoseForm:
 def read_poses(path: str | os.PathLike[str], form: PoseForm = PoseForm()) -> PoseFile:
     """Read a file of poses, in the order of time where it has one.
 
-    Raises InputError (file:line:column) for a line of another form, and for a rotation that is none.
+    Raises InputError (file:line:column) for a line of another form, and for numbers that are not a rotation.
     """
     kind = form.form or _form_of(path)
     order = form.order or ("w-first" if kind == "euroc" else "w-last")

@@ -94,7 +94,7 @@ def _unknown_layers(net: NetParameter, source: SourceMap, options: BuildOptions)
 
 
 def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
-    """Return how far into a file a reader came: further as a net or as a solver tells which of them it is."""
+    """Return how far into a file a reader came; the file is a net or a solver, whichever is read further."""
     where = faults[-1].where
     return (where.line, where.column) if where else (0, 0)
 

@@ -90,7 +90,7 @@ def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 @rule("bias-before-batchnorm", PLAN)
 def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """BatchNorm subtracts the mean, and with it any bias added before: such a bias is learned in vain."""
+    """BatchNorm subtracts the mean, and with it any bias added before: such a bias has no effect."""
     makers = {v: i for i, node in enumerate(plan.nodes) for v in node.tops}
     for node in plan.nodes if _is_training(plan) else ():
         i = makers.get(node.bottoms[0], -1) if node.type == "BatchNorm" and node.bottoms else -1

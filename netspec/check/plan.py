@@ -13,7 +13,7 @@ KINDS = {
     "packed": "by oneDNN, weights laid out in advance, channels side by side",
     "exact": "sums in Caffe's order (--exact)",
     "prepared": "by torch's kernels",
-    "as is": "like a layer in training: somebody may write to its parameters",
+    "as is": "like a layer in training: its parameters may be written to",
     "by value": "like a layer in training: the shapes follow from values",
 }
 

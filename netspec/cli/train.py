@@ -83,7 +83,7 @@ def _train(arguments: argparse.Namespace) -> int:
         except FaultOfAll:
             if processes.is_root:
                 raise
-            with suppress(Lost):  # the root tells it; torchrun ends all processes as soon as one has ended
+            with suppress(Lost):  # the root reports it; torchrun ends all processes as soon as one has ended
                 processes.gather(None)
             return FAULT
     processes.leave()
@@ -98,7 +98,7 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
     from netspec.solver.processes import Lost
 
     if arguments.tensorboard and processes.is_root:
-        writer_class()  # a missing package is told before the log of the nets
+        writer_class()  # a missing package is reported before the log of the nets
 
     effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: "stop"}
     if hasattr(signal, "SIGHUP"):  # Windows has none
@@ -115,7 +115,7 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
             try:
                 with board:
                     solver.solve()
-            except Lost as fault:  # told here: torchrun ends this process as soon as signals work again
+            except Lost as fault:  # reported here: torchrun ends this process as soon as signals work again
                 kept = (
                     f"the last snapshot is {solver.last_snapshot}" if solver.last_snapshot else "no snapshot was taken"
                 )
@@ -155,7 +155,7 @@ def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | N
 
 
 def _newest(solver: str) -> Path | None:
-    """Return the newest whole snapshot of a solver, or None, which is said."""
+    """Return the newest whole snapshot of a solver; None, with a line in the log, where there is none."""
     from netspec.proto.text import read_solver
     from netspec.solver.extra import newest_pair
 

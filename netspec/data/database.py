@@ -55,7 +55,7 @@ class Reader(ABC):
 
 
 # Two nets (training and test, for example) that use one database share what is known of it. A forked process opens it
-# anew, and so does a net that is built after another program has written to it.
+# again, and so does a net that is built after another program has written to it.
 _open_readers: weakref.WeakValueDictionary[tuple[int, int, int], Reader] = weakref.WeakValueDictionary()
 _open_lock = threading.Lock()
 

@@ -16,7 +16,7 @@ from netspec.files.limits import amount
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
 _MOST_FAULTS = 100  # that are kept by name; all are counted
-_SORTED = 100  # so many records in the order of their labels are no accident
+_SORTED = 100  # so many records in the order of their labels are not by chance
 
 
 @dataclass

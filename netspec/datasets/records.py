@@ -28,7 +28,7 @@ class Records(Dataset[tuple[torch.Tensor, ...]]):
 
     An item is what Caffe's Data layer makes of a record: the image (C, H, W) float32, transformed, and its label, a
     float32 scalar. ``transform`` is what a prototxt has between the braces of ``transform_param { }``; ``phase`` says
-    whether crops are random. Mirrors and crops are drawn anew in each epoch: tell it by :meth:`set_epoch`. Of HDF5
+    whether crops are random. Mirrors and crops are drawn again in each epoch, which :meth:`set_epoch` sets. Of HDF5
     files, which Caffe does not transform, an item has a row of each of the datasets ``tops``. A layer "data" of a net
     with the same ``seed`` draws the same. Raises SpecError for faults of the files.
     """

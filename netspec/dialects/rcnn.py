@@ -100,7 +100,7 @@ class _RegionPooling(Layer):
     bottoms = (2, 2)
 
     def check_regions(self, bottom_shapes: Sequence[Shape]) -> int:
-        """Return how many regions there are; refuse bottoms that are no map and regions."""
+        """Return how many regions there are; refuse other bottoms than a map and regions."""
         maps, regions = bottom_shapes
         if len(maps) != 4:
             raise self.error(f"found a map of shape {maps}, expected 4 axes (N, C, H, W)", "bottom", 0)

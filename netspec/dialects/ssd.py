@@ -641,7 +641,7 @@ class DetectionOutput(Layer):
         least = graph.constant([param.confidence_threshold]) if param.HasField("confidence_threshold") else lowest
         overlap = graph.constant([min(nms.nms_threshold, 1.0)])
         found = graph.node("NonMaxSuppression", boxes, candidates, every, overlap, least)
-        # One more row that is no detection, so that there is always one: OpenCV 5.0 dies of empty tensors.
+        # One more row that is not a detection, so that there is always one: OpenCV 5.0 dies of empty tensors.
         found = graph.node("Concat", found, graph.constant([[0, 0, 0]]), axis=0)
         if param.keep_top_k > -1:
             found = self._onnx_best(graph, bottoms[0], scores, found, param.keep_top_k)

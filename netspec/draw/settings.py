@@ -9,7 +9,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 
 from netspec.proto.schema import fields_of
 
-MOST = 6  # settings that are told
+MOST = 6  # settings that are shown
 OWN = "_param"  # how the names of the fields end that hold a layer's own settings
 COMMON = ("loss_param", "transform_param")  # and of those, these belong to many layers
 SILENT = ("engine", "bias_term", "axis", "source", "backend", "root_folder", "mean_file", "prefetch", "rand_skip")

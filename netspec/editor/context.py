@@ -84,7 +84,7 @@ def _field(message: Any, name: str) -> Field | None:
 
 
 def _tokens(text: str) -> Sequence[Token]:
-    """Return the tokens up to the first thing that is none, such as a string that has no end yet."""
+    """Return the tokens up to the first text that is not a token, such as a string without its closing quote."""
     tokens: list[Token] = []
     with suppress(SpecError):
         tokens.extend(token for token in Lexer(text, "") if token.kind != END)

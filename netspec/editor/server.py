@@ -21,7 +21,7 @@ from netspec.proto.format import format_text
 from netspec.terminal import log
 
 NAME = "netspec"
-MOST_CHARACTERS = 1 << 20  # of a document: more is no prototxt that a person edits
+MOST_CHARACTERS = 1 << 20  # of a document: nobody edits a larger prototxt by hand
 TOO_LARGE = "the document has more than a megabyte: it is not looked at"
 SEVERITIES = {
     ERROR: lsp.DiagnosticSeverity.Error,

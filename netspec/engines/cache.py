@@ -61,7 +61,7 @@ class Cache:
                 raise
 
     def _remove(self, place: Path) -> None:
-        """Remove an entry at once: nobody sees a part of it."""
+        """Remove an entry in one step: no reader finds a part of it."""
         aside = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=self.folder))
         with suppress(FileNotFoundError):
             place.rename(aside / place.name)

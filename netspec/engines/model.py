@@ -31,7 +31,7 @@ class Origin:
 
 
 class Model:
-    """A net in an engine. ``origin`` None: it cannot be told what it is made of, and it is not kept.
+    """A net in an engine. ``origin`` None: what it is made of is not known, and it is not kept.
 
     ``export`` is called where the cache has no such model; what it warns of is warned of again at each later opening.
     Raises Unable for what the engine cannot run, and SpecError for a file that cannot be read.
@@ -47,7 +47,7 @@ class Model:
     def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
         """Return the outputs, float32 by name, for inputs by name.
 
-        Raises Unable where the library fails. In bf16 the first pass tells how far the outputs are from those in fp32.
+        Raises Unable where the library fails. In bf16 the first pass measures how far outputs are from those in fp32.
         """
         found = _run(self._runner, inputs)
         if not self._told:

@@ -103,8 +103,8 @@ class Engine:
 
     ``origin`` says of which files it is made, None where its parameters are random; ``write`` exports it. Outputs carry
     no gradient; a pass whose input asks for one is torch's, and so is every pass once the engine turned out to be
-    unable. Where parameters were changed the net is exported anew; as long as somebody holds memory through which they
-    could change unseen (``.data``, an array), torch runs the net.
+    unable. Where parameters were changed the net is exported again. While an alias of a parameter is alive
+    (``.data``, an array), a change might go unnoticed, so torch runs the net.
     """
 
     def __init__(self, net: Net, choice: Choice, origin: Origin | None, write: Write) -> None:
@@ -134,7 +134,7 @@ class Engine:
             return None
 
     def _are_lent(self) -> bool:
-        """Return whether the parameters may change unseen; say so once."""
+        """Return whether an alias could change the parameters; warn once."""
         lent = any(is_lent(blob) for layer in self._layers for blob in layer.blobs)
         if lent and not self._told:
             self._told = True
@@ -185,7 +185,7 @@ class Engine:
         return self._model
 
     def _origin(self, blobs: tuple[str, ...]) -> Origin | None:
-        """Return what the net is made of; None where its parameters are no longer, or never were, those of files."""
+        """Return what the net is made of; None where its parameters are not those of files, or no longer."""
         self._exported = self._stamps()
         if self._exported != self._as_loaded or (self._from is None and self._exported):
             return None

@@ -65,7 +65,7 @@ def gemm(
 ) -> None:
     """C = A B, or C += A B; ``a_t`` and ``b_t`` take the transposes of what is stored (caffe_cpu_gemm).
 
-    All three are matrices, stored row by row without gaps. To BLAS, which goes by columns, they are their transposes.
+    All three are matrices, stored row by row without gaps. BLAS stores by columns, so it sees their transposes.
     Stacks of matrices (N, rows, columns) are multiplied one after the other, as Caffe goes from image to image. There a
     single matrix stands for N times itself; as C it sums up the products, with ``add``.
     """

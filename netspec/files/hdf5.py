@@ -179,7 +179,7 @@ def hdf5_in(unfinished: Path) -> Iterator[h5py.File]:
 
 
 class _Patient(io.FileIO):
-    """A file to read and write whose first error is kept: the library is told that all went well."""
+    """A file to read and write whose first error is kept: the library gets no error."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "w+b")

@@ -96,7 +96,7 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 def only_one(path: str | Path, advice: str) -> Iterator[None]:
     """Hold the lock file ``path`` within the block; it is released whichever way the process ends.
 
-    A lock that a killed run left is taken; a file that is no lock is left as it is. Where the system or the file system
+    A lock that a killed run left is taken; any other file stays as it is. Where the system or the file system
     has no locks, nothing is locked. Raises SpecError, which ends with ``advice``, if another process holds it or it
     cannot be made.
     """

@@ -41,7 +41,7 @@ class Chain:
 
 
 def origins(plan: Plan, passes_on: Sequence[bool]) -> tuple[int, ...]:
-    """Return of each value the one that it is, by other names: what a Split or a Dropout in testing hands on."""
+    """Return, by value, the one that it is by another name: a Split's top, or a Dropout's in testing, is its bottom."""
     found = list(range(len(plan.blobs)))
     for node, passes in zip(plan.nodes, passes_on, strict=True):
         if passes:

@@ -57,7 +57,7 @@ class Random:
         self.restart(seed)
 
     def restart(self, seed: int) -> None:
-        """Begin anew, from another seed."""
+        """Begin again, from another seed."""
         self.seed = seed
         self._part: str | None = None
         self._generators: dict[str, torch.Generator] = {}
@@ -99,7 +99,7 @@ class Context:
     random: Random = field(default_factory=lambda: Random(0))
     at: Callable[..., Where] = nowhere
     report: Report = raise_fault
-    created: Callable[[], None] = lambda: None  # called when ``construct`` has run: Caffe's log goes by it
+    created: Callable[[], None] = lambda: None  # called when ``construct`` has run: for the order of the log
     take: Callable[[int], None] = lambda size: None  # called before memory is taken, in bytes: it may refuse
 
     @property

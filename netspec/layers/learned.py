@@ -1,4 +1,4 @@
-"""A layer's learned blobs, which say when somebody may have written to them.
+"""A layer's learned blobs, which record when their memory was handed out.
 
 Torch counts the writes to a tensor, but not those to what ``data`` and ``detach`` hand out, nor those of numpy. What a
 net keeps of its weights in another form, folded or laid out for a kernel, must follow all of them.
@@ -61,7 +61,7 @@ def stamp(blob: torch.Tensor) -> Stamp:
 
 
 def is_lent(blob: torch.Tensor) -> bool:
-    """Return whether something else may write to a blob's memory unseen: an alias of it is alive, or might be."""
+    """Return whether an alias of a blob's memory is alive, or might be, through which it could be changed."""
     if not isinstance(blob, Learned):
         return True
     if blob.handed_out == 0:

@@ -404,9 +404,9 @@ class _Standardize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rows: torch.Tensor, eps: float) -> torch.Tensor:
-        centred = rows - rows.mean(dim=1, keepdim=True)
-        deviation = centred.square().mean(dim=1, keepdim=True).sqrt() + eps
-        top = centred / deviation
+        centered = rows - rows.mean(dim=1, keepdim=True)
+        deviation = centered.square().mean(dim=1, keepdim=True).sqrt() + eps
+        top = centered / deviation
         ctx.save_for_backward(top, deviation)
         return top
 

@@ -22,7 +22,7 @@ from netspec.layers.base import Layer
 def _has(cls: type[Layer], name: str) -> bool:
     """Return whether a class has an attribute that was defined for the forward pass of this class.
 
-    A subclass that replaces ``forward`` does not inherit what was said of the one that it replaces.
+    A subclass that replaces ``forward`` does not inherit what its base class offers for the old one.
     """
     owner = next((each for each in cls.__mro__ if name in vars(each)), None)
     return owner is not None and getattr(owner, "forward", Layer.forward) in (cls.forward, Layer.forward)

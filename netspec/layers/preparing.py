@@ -48,7 +48,7 @@ class Prepares(Protocol):
         """Return what computes ``forward`` and then ``how.finish``, for bottoms of the present shapes.
 
         Only this kernel uses the layer from now on, at these shapes. It may keep the blobs in another form, copied:
-        whoever writes to them has the layer prepared anew. No kernel may keep an alias of them. None: there is nothing
+        after a write to them the layer is prepared again. No kernel may keep an alias of them. None: there is nothing
         better at these shapes.
         """
         ...

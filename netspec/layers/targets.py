@@ -45,7 +45,7 @@ class OnnxGraph(Protocol):
         ...
 
     def size(self, bottom: int, axis: int, why: str) -> int:
-        """Return the size of an axis of a bottom; if it was free, it is fixed, and ``why`` is told to the user."""
+        """Return the size of an axis of a bottom; if it was free, it is fixed, and the user sees ``why``."""
         ...
 
     def shape_of(self, value: str, start: int = 0, end: int | None = None) -> str:
@@ -111,7 +111,7 @@ class TorchCode(Protocol):
         ...
 
     def size(self, bottom: int, axis: int, why: str) -> int:
-        """Return the size of an axis of a bottom; if it was free, it is fixed, and ``why`` is told to the user."""
+        """Return the size of an axis of a bottom; if it was free, it is fixed, and the user sees ``why``."""
         ...
 
     def reshape_to_top(self, value: str, bottom: int = 0, top: int = 0) -> str:

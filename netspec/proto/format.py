@@ -1,7 +1,7 @@
 """Protobuf text in one form: two spaces a level, one field per line, comments kept.
 
-A message that was written on one line stays there if it fits. The values are spelled as they were. What the text says
-is not looked at, so fields that nobody knows do no harm.
+A message that was written on one line stays there if it fits. The values are spelled as they were. Only the
+syntax is checked, so unknown fields do no harm.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ class Eager:
         return run
 
     def _chains_to(self, i: int, kept: frozenset[int]) -> list[int]:
-        """Return the layers that may run with layer ``i``: nobody looks at what lies between."""
+        """Return the layers that may run with layer ``i``: nothing else reads what lies between."""
         row = self.chains[i]
         seen = next((n for n, k in enumerate(row) if self._plan.nodes[k].bottoms[0] in kept), len(row))
         return row[:seen]

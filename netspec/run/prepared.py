@@ -1,9 +1,8 @@
-"""Runs of a net without gradients: each layer prepared once for the shapes at hand, then called without ceremony.
+"""Runs of a net without gradients: each layer is prepared once for the shapes at hand.
 
 A program is the line of kernels for one set of input shapes and of blobs to keep. Programs keep weights in other forms,
-folded or laid out for a kernel; before each run they look whether somebody has written to a learned blob since, or
-holds memory through which that could happen unseen. Layers with such blobs run from the blobs as they are, until they
-have stayed the same for a run.
+folded or laid out for a kernel. Before each run, a program checks whether a learned blob was written to, or could be
+through an alias that is still alive. Layers with such blobs read them directly until they have not changed for a run.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class Program:
     need: int  # bytes of the values that are alive at one time, at most
 
     def is_current(self) -> bool:
-        """Return whether no learned blob was written to or replaced, and none that was has come to rest."""
+        """Return whether no blob was written to or replaced since, and every blob that was changing still is."""
         for owner, name, blob, before in self.frozen:
             if owner[name] is not blob or stamp(blob) != before:
                 return False
@@ -218,7 +217,7 @@ class Prepared:
         return kernel, "as is" if as_is else "packed" if len(uses) > bool(step.chain) else "prepared"
 
     def _changing(self) -> set[int]:
-        """Return which learned blobs somebody may be writing to: those that changed, and those that are lent."""
+        """Return which learned blobs may change between runs: those that did, and those with a live alias."""
         found = set()
         for layer in self._layers:
             for blob in layer.blobs:

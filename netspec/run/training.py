@@ -179,7 +179,7 @@ class TrainingStep:
         """Make the kernels for data of these shapes; let every learned blob have a gradient."""
         plan = self._plan
         shapes = {v: tuple(x.shape) for v, x in enumerate(values) if x is not None}
-        needs: set[int] = set()  # values whose gradient somebody reads
+        needs: set[int] = set()  # values whose gradient is used
         blobs = self._blobs()
         for blob in blobs:
             if blob.requires_grad and blob.grad is None:

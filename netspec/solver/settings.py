@@ -1,6 +1,6 @@
 """What the numbers of a training follow from, besides its weights and data: kept in ``X.solverstate.extra``.
 
-Who resumes a training in another way is told what is other than it was.
+A training that is resumed with other settings warns of each.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _fields(message: Any, aside: frozenset[str] | set[str]) -> Iterator[tuple[st
 
 
 def changes(before: Settings, now: Settings) -> str:
-    """Return what is other than it was, in words; "" where nothing is. Nets that only one side has are left out."""
+    """Return what has changed, in words; "" where nothing is. Nets that only one side has are left out."""
     found = []
     for part in now:
         if part in before:

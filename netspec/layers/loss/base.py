@@ -94,7 +94,7 @@ class Classified(Layer):
         return graph.cast(valid, "float32"), graph.node("Mul", labels, valid)
 
     def valid(self, labels: torch.Tensor, ignore_label: int | None) -> torch.Tensor | None:
-        """Return which labels count (None: all of them); refuse one that is no class."""
+        """Return which labels count (None: all of them). Raises SpecError for a label that is not a class."""
         valid = None if ignore_label is None else labels != ignore_label
         counted = labels if valid is None else labels[valid]
         if counted.numel():

@@ -1,8 +1,8 @@
 """Blobs as pycaffe shows them: ``data`` and ``diff`` are numpy views of memory that lives on from pass to pass.
 
-A piece of memory grows and never shrinks: a blob of a smaller shape uses its front. A view that somebody holds shows
-what the next pass writes. As copying every blob to where views look would slow down each pass, a tensor that a layer
-returns is kept as it is, and copied, or made the memory itself, when somebody looks.
+A piece of memory grows and never shrinks: a blob of a smaller shape uses its front. A view shows what the
+next pass writes. Copying every blob into that memory would slow down each pass, so a tensor that a layer returns is
+kept as it is, and copied, or made the memory itself, when a view is asked for.
 
 Caffe: include/caffe/blob.hpp, src/caffe/syncedmem.cpp, python/caffe/_caffe.cpp
 """
@@ -37,7 +37,7 @@ class Memory:
         self.capacity = 0
         self.device = device
         self.dtype = torch.float32
-        self._fresh: torch.Tensor | None = None  # what a layer has put here since somebody looked
+        self._fresh: torch.Tensor | None = None  # what a layer has put here since a view was last asked for
         self._flat: torch.Tensor | None = None  # what views show, one axis, in main memory
         self._seen: Callable[[], np.ndarray | None] = _nobody  # the array that all views are views of, while any lives
         self._uploaded: torch.Tensor | None = None  # ``_flat`` on the GPU
@@ -92,12 +92,12 @@ class Memory:
                 self._flat = None
 
     def leave_views(self) -> None:
-        """Go on in other memory, with the same content, where somebody holds views: they change no more."""
+        """Go on in other memory with the same content, if there are views; they no longer change."""
         if self.is_watched() and self._flat is not None:
             self._flat, self._seen = self._flat.clone(), _nobody
 
     def is_watched(self) -> bool:
-        """Return whether somebody holds a view that is to show what layers compute."""
+        """Return whether there is a view, which must show what layers compute."""
         return self.device.type == "cpu" and self._seen() is not None
 
     def cast(self, dtype: torch.dtype) -> None:
