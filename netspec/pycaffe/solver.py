@@ -14,6 +14,7 @@ import torch
 from typing_extensions import override
 
 from netspec.graph.options import BuildOptions
+from netspec.layers.utility.python import Python
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
 from netspec.pycaffe import mode
@@ -30,11 +31,19 @@ Outputs = dict[str, torch.Tensor]
 
 
 class _Training(core_solver.Solver):
-    """A training whose passes go through the memory of the nets' blobs."""
+    """A training whose passes go through the memory of the nets' blobs, as far as somebody can look at it.
+
+    ``is_watched``: blobs are filled in every iteration, for functions of a script or Python layers may look at them,
+    or a pass reads what a script wrote to them.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
+        self.is_watched = bool(self.net.inputs) or any(
+            isinstance(layer, Python) or any(top is not None for top in layer.filled_once())
+            for layer in self.net.layers
+        )
 
     @override
     def build(self, described: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
@@ -55,6 +64,10 @@ class _Training(core_solver.Solver):
 
     @override
     def train_pass(self) -> tuple[torch.Tensor, Outputs]:
+        """Run forward and backward; only the last pass of several, and one that somebody watches, fills the blobs."""
+        seen = self.is_watched or self.param.debug_info or not self.to_come
+        if not seen and (passed := self.net.train_pass()):
+            return passed
         loss, outputs = self.test_pass(self.net)
         self.shown[self.net].passes.backward(len(self.net.layers) - 1, 0)
         return loss, outputs
@@ -172,6 +185,7 @@ class Solver:
 
         An object that has ``on_start`` and ``on_gradients_ready`` may stand for both, as a :class:`NCCL` does.
         """
+        self._training.is_watched = True
         whole = on_gradients_ready is None
         self._callbacks.append(
             (on_start.on_start, on_start.on_gradients_ready) if whole else (on_start, on_gradients_ready)

@@ -154,7 +154,7 @@ class Solver(Tested):
         self.losses_before = ()
         self._displayed = (self.options.clock(), self.iteration)
         self._waited = self._seconds_waited()
-        for _ in range(iterations):
+        for self.to_come in reversed(range(iterations)):
             if self.is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
                 self.test_all()
                 if self.stopped:

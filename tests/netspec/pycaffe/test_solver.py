@@ -99,6 +99,45 @@ def test_blobs_show_each_iteration(solver: caffe.SGDSolver) -> None:
     assert len(set(seen)) == 5
 
 
+MEMORY = """
+layer { name: "data" type: "MemoryData" top: "data" top: "label"
+        memory_data_param { batch_size: 4 channels: 2 height: 6 width: 6 } }
+layer { name: "filters" type: "Convolution" bottom: "data" top: "maps"
+        convolution_param { num_output: 3 kernel_size: 3 weight_filler { type: "xavier" } } }
+layer { name: "relu" type: "ReLU" bottom: "maps" top: "maps" }
+layer { name: "drop" type: "Dropout" bottom: "maps" top: "maps" }
+layer { name: "scores" type: "InnerProduct" bottom: "maps" top: "scores"
+        inner_product_param { num_output: 5 weight_filler { type: "xavier" } } }
+layer { name: "loss" type: "SoftmaxWithLoss" bottom: "scores" bottom: "label" top: "loss" }
+"""
+
+
+@pytest.mark.parametrize("net", [SMALL, MEMORY], ids=["constant labels", "data in memory"])
+def test_steps_at_once_leave_what_single_steps_leave(net: str, write: Callable[..., str]) -> None:
+    """Within a call only its last pass fills the blobs, unless somebody can look at them, or has written to one."""
+    write(net)
+    rng = np.random.default_rng(0)
+    data, labels = rng.random((12, 2, 6, 6), np.float32), rng.integers(5, size=12).astype(np.float32)
+    settings = SETTINGS.replace("test_iter: 10 test_interval: 10", "") + " random_seed: 3"
+    found, seen = [], []
+    for steps in ([1] * 7, [2, 5], [7], [7]):
+        solver = caffe.SGDSolver(write(settings, "solver.prototxt"))
+        if net == MEMORY:
+            solver.net.set_input_arrays(data, labels)
+        else:
+            solver.net.blobs["label"].data[...] = [1, 2, 3, 0]
+        if len(found) == 3:
+            loss = solver.net.blobs[solver.net.outputs[0]]
+            solver.add_callback(lambda: None, lambda loss=loss: seen.append(loss.data.item()))
+        for count in steps:
+            solver.step(count)
+        blobs = [*solver.net.blobs.values(), *(blob for blobs in solver.net.params.values() for blob in blobs)]
+        found.append([array.copy() for blob in blobs for array in (blob.data, blob.diff)])
+    for arrays in found[1:]:
+        assert [np.array_equal(a, b) for a, b in zip(arrays, found[0], strict=True)] == [True] * len(arrays)
+    assert len(set(seen)) == 7
+
+
 def test_test_nets_share_the_weights_from_the_first_test_on(solver: caffe.SGDSolver) -> None:
     mine, theirs = solver.net.params["scores"][0], solver.test_nets[0].params["scores"][0]
     assert not np.array_equal(mine.data, theirs.data)
