@@ -14,6 +14,7 @@ import torch
 from typing_extensions import override
 
 from netspec.graph.options import BuildOptions
+from netspec.layers.reading import Constant
 from netspec.layers.utility.python import Python
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
@@ -41,7 +42,8 @@ class _Training(core_solver.Solver):
         super().__init__(*arguments, **options)
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
         self.is_watched = bool(self.net.inputs) or any(
-            isinstance(layer, Python) or any(top is not None for top in layer.filled_once())
+            isinstance(layer, Python)
+            or (isinstance(layer, Constant) and any(top is not None for top in layer.filled_once()))
             for layer in self.net.layers
         )
 
