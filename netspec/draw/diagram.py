@@ -162,14 +162,14 @@ def _merged(net: NetParameter, source: SourceMap, seen: Sequence[_Seen], faults:
         box = Box(
             layer.name,
             layer.type,
-            _kind(layer.type),
+            kind_of(layer.type),
             settings_text(layer),
             phases(number),
             source.at(number, layer=layer.name, type=layer.type),
             "".join(_text(net.layer[m]) for m in (number, *inside)),
             "\n".join(f"{phases(m)}{_without_names(net.layer[m])}" for m in (number, *inside)),
             attached=tuple(
-                Attached(other.name, other.type, _kind(other.type), settings_text(other), phases(m))
+                Attached(other.name, other.type, kind_of(other.type), settings_text(other), phases(m))
                 for m in inside
                 for other in [net.layer[m]]
             ),
@@ -234,7 +234,7 @@ def _one_shape(sizes: Sequence[object]) -> str:
     return "×".join(map(str, sizes)) or "scalar"
 
 
-def _kind(type_name: str) -> str:
+def kind_of(type_name: str) -> str:
     """Return the room of netspec.layers that has a type, e.g. "vision.convolution"; "dialect"; or empty."""
     cls = layer_class(type_name)
     if cls is None:

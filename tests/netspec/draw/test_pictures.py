@@ -14,14 +14,15 @@ from drawn_coordinates import SCREEN, faults, texts_of
 from each import each, last_parts
 from netspec.cli import main
 from netspec.draw.blocks import find_blocks
-from netspec.draw.diagram import Box, Diagram, diagram_of
+from netspec.draw.diagram import Box, Diagram, diagram_of, kind_of
 from netspec.draw.html import html_of
 from netspec.draw.marks import Rect
-from netspec.draw.picture import picture_of
+from netspec.draw.picture import COLORS, color_of, picture_of
 from netspec.draw.settings import settings_text
 from netspec.draw.svg import svg_of
 from netspec.errors import SpecError, Where
 from netspec.graph.options import BuildOptions
+from netspec.layers import layer_types
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_net_text
 from paths import ROOT, SHARED
@@ -136,6 +137,10 @@ def test_boxes_say_what_the_net_has() -> None:
     words = [text.text for text in texts_of(picture_of(read(text)).marks())]
     assert {"small", "Convolution 3×3, 8, pad 1", "ReLU · r", "1×8×9×9", "TEST"} <= set(words)
     assert "46.7 k mult-adds · 584 weights" in words
+
+
+def test_every_layer_type_has_a_color() -> None:
+    assert [name for name in layer_types() if color_of(kind_of(name)) == COLORS[""]] == []
 
 
 def test_a_layer_in_place_on_what_others_read_too_is_a_box_of_its_own() -> None:
