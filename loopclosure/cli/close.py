@@ -16,9 +16,11 @@ from loopclosure.closing.g2o import summary as graph_summary
 from loopclosure.closing.measure import measure, read_loops
 from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
+from loopclosure.places.frames import read_bgr
 from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.sequences import ImageSequence
 from loopclosure.places.source import FRAMES, POSES, TOPICS
+from loopclosure.report.rerun_file import check_rerun, write_closed_paths
 from netspec.terminal.commands import Commands, WrongUsage
 from netspec.terminal.options import seed
 
@@ -30,6 +32,7 @@ OF_FRAMES = (
     "odometry_form",
     "seed",
     "camera",
+    "rerun",
 )
 
 
@@ -53,6 +56,7 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--odometry-form", metavar="WORDS", help="how --odometry is written, as pose-form")
     p.add_argument("--seed", type=seed, metavar="N", help="of --drift (default: 1)")
     p.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source does not say")
+    p.add_argument("--rerun", metavar="F.rrd", help="write images, both paths and loops for the viewer of rerun.io")
     p.add_argument("--out", required=True, metavar="FOLDER", help="where closed.g2o, closed.txt and paths.png go")
 
 
@@ -67,6 +71,8 @@ def _close(a: argparse.Namespace) -> None:
         raise WrongUsage("one of the arguments --odometry --drift is required")
     if a.odometry_form and not a.odometry:
         raise WrongUsage("--odometry-form means nothing without --odometry")
+    if a.rerun:
+        check_rerun()
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed means nothing without --drift")
     source = typed(a.source, {"": (*FRAMES, *POSES, *TOPICS)})
@@ -83,6 +89,10 @@ def _close(a: argparse.Namespace) -> None:
     from loopclosure.report.paths import draw_paths
 
     draw_paths(out / "paths.png", closed)
+    if a.rerun:
+        stamps = frames.stamps
+        images = ((i, None if stamps is None else stamps[i], read_bgr(p)) for i, p in enumerate(frames.images))
+        write_closed_paths(Path(a.rerun), closed, images)
     print("\n".join(summary(closed)))
     print(f"{out / 'closed.g2o'}, {out / 'closed.txt'}, {out / 'paths.png'}")
 

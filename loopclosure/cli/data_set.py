@@ -6,8 +6,10 @@ import argparse
 from pathlib import Path
 
 from loopclosure.cli.run import show_progress, warn
+from loopclosure.detector.run import Recording, open_recording
 from loopclosure.errors import InputError
 from loopclosure.places import datasets
+from loopclosure.places.bags import is_bag
 from loopclosure.places.cameras import CAMERAS
 from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
 from loopclosure.places.overlap import FOV_DEG, ViewOverlap
@@ -163,3 +165,18 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
 
 def _layout(source: Source, path: Path) -> str:
     return layout_of(path, "images" if "poses" in source.settings else "tum")
+
+
+def recording_of(text: str, frames: Path) -> Recording:
+    """Open the frames of a source for the detector; those of a bag go to a folder ``frames``."""
+    source = typed(text, {"": (*FRAMES, *TOPICS)})
+    path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
+    if is_bag(path):
+        path, said = extract(path, frames, topic, pose_topic, show_progress)
+        print(said)
+    elif topic or pose_topic:
+        raise WrongUsage(f"{source}: topics belong to bags")
+    recording = open_recording(path, source.selection())
+    for doubt in recording.doubts:
+        warn(doubt)
+    return recording

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from loopclosure.cli.data_set import typed
-from loopclosure.cli.run import show_progress, warn
+from loopclosure.cli.data_set import recording_of
+from loopclosure.cli.run import show_progress
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
-from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetector
+from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetector, LoopResult
 from loopclosure.detector.export import write_g2o, write_loops_csv
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import whole_drive
 from loopclosure.methods.features import WhitenBy
-from loopclosure.places.bags import is_bag
-from loopclosure.places.extraction import extract
+from loopclosure.places.live import live_frames
 from loopclosure.places.source import FRAMES, TOPICS
+from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
 from netspec.files.whole_file import whole_file
 from netspec.terminal.commands import Commands, WrongUsage
 
@@ -35,6 +36,7 @@ SETTINGS = (
     "consistency",
     "consistency_window",
 )
+RECENT_SECONDS = 10.0  # of --video: the place of now is not seen again
 # Settings of the search frame by frame.
 ONLINE = ("top_k", "consistency", "consistency_window")
 
@@ -44,9 +46,13 @@ def add_to(commands: Commands) -> None:
     p = commands.add("detect", _detect, "find the loops in a folder of images or a video")
     p.add_argument(
         "source",
+        nargs="?",
         metavar="SOURCE",
         help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag; with "
         f"{', '.join((*FRAMES, *TOPICS))} behind it, as in drive.bag,stride=2,topic=/cam0",
+    )
+    p.add_argument(
+        "--video", metavar="CAMERA|URL|FILE", help="decide as images come, of camera 0, rtsp://HOST/PATH or a file"
     )
     p.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv, and loops.g2o with poses, go")
     how = p.add_mutually_exclusive_group()
@@ -86,20 +92,12 @@ def add_to(commands: Commands) -> None:
     p.add_argument("--verify", action="store_true", help="verify candidates by SIFT matches and RANSAC")
     p.add_argument("--min-inliers", type=int, help=f"of --verify (default: {GeometricCheck().min_inliers})")
     p.add_argument("--save", metavar="F.npz", help="write the detector, to continue with --resume")
+    p.add_argument("--rerun", metavar="F.rrd", help="write images, scores and loops for the viewer of rerun.io")
 
 
 def _detect(a: argparse.Namespace) -> None:
     options = _checked_options(a)
-    source = typed(a.source, {"": (*FRAMES, *TOPICS)})
-    path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
-    if is_bag(path):
-        path, said = extract(path, Path(a.out) / "frames", topic, pose_topic, show_progress)
-        print(said)
-    elif topic or pose_topic:
-        raise WrongUsage(f"{source}: topics belong to bags")
-    recording = run.open_recording(path, source.selection())
-    for doubt in recording.doubts:
-        warn(doubt)
+    recording = None if a.video else recording_of(a.source, Path(a.out) / "frames")
     features = read_features(a.features) if a.features else None
     describe = run.load_describe(a.describe, options) if features is None else None
     views = run.views_of(describe, features)
@@ -109,15 +107,24 @@ def _detect(a: argparse.Namespace) -> None:
         features = None if features is None else features.whitened(whitening)
     detector = _detector(a, describe, views)
     # Frames of the run that is resumed have numbers but no names here.
-    names = [""] * len(detector) + recording.names
+    names, ended = [""] * len(detector), None
     out = Path(a.out)
-    if a.threshold is None and not a.resume:
+    out.mkdir(parents=True, exist_ok=True)
+    if recording is None:
+        results, ended = _watch(a, detector)
+        names += [f"frame {number}" for number in range(len(results))]
+        said = [run.verdicts_said(results)]
+    elif a.threshold is None and not a.resume:
         precision = PRECISION if a.precision is None else a.precision
         results, found = whole_drive(detector, recording, features, precision, show_progress)
         said = [*found.reasons, found.counts()]
     else:
         results = run.run_detector(detector, recording, features, show_progress)
         said = [run.verdicts_said(results)]
+    if recording is not None:
+        names += recording.names
+        if a.rerun:
+            write_detected(Path(a.rerun), recording, results, show_progress)
     write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names)
     with whole_file(out / "chosen.txt") as unfinished:
         unfinished.write_text("\n".join(said) + "\n", encoding="utf-8")
@@ -131,17 +138,42 @@ def _detect(a: argparse.Namespace) -> None:
         print(run.judged_by_poses(detector))
     if a.save:
         detector.save(a.save)
+    if ended is not None:
+        raise ended
+
+
+def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResult], KeyboardInterrupt | None]:
+    """Look at the images of a camera, a stream or a file until it ends, or Ctrl-C ends it."""
+    results: list[LoopResult] = []
+    with rerun_file(a.rerun) if a.rerun else nullcontext() as made:
+        try:
+            for stamp, image in live_frames(a.video):
+                results.append(detector.add(image, stamp))
+                if results[-1]:
+                    said = f"shows the place of frame {results[-1].accepted}"
+                    print(f"frame {results[-1].query_id}, {stamp:.1f} s: {said}", flush=True)
+                if made is not None:
+                    made.frame(results[-1].query_id, stamp, small_jpeg(image), results[-1])
+        except KeyboardInterrupt as end:
+            return results, end
+    return results, None
 
 
 def _checked_options(a: argparse.Namespace) -> dict[str, str]:
     """Return the keywords of --with; refuse options that do not go together."""
+    if bool(a.source) == bool(a.video):
+        raise WrongUsage("expected the frames, or --video")
+    if a.video and (a.features or a.precision is not None):
+        raise WrongUsage(f"--{'features' if a.features else 'precision'} is for a drive that is over, not for --video")
+    if a.rerun:
+        check_rerun()
     if a.resume and (_changes(a) or a.verify):
         raise WrongUsage("--resume continues with the settings of the saved detector; leave out others")
     if a.min_inliers is not None and not a.verify:
         raise WrongUsage("--min-inliers means nothing without --verify")
     given = [f"--{name.replace('_', '-')}" for name in ONLINE if getattr(a, name) is not None]
     given += ["--verify"] if a.verify else []
-    if given and a.threshold is None:
+    if given and a.threshold is None and not a.video:
         raise WrongUsage(f"{given[0]} means nothing without --threshold")
     if a.features and a.options:
         raise WrongUsage("--with belongs to --describe; --features has descriptors already")
@@ -163,6 +195,9 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     if a.resume:
         return LoopDetector.load(a.resume, describe)
     check = None
-    if a.verify:
+    changes = _changes(a)
+    if a.video:
+        changes.setdefault("exclude_seconds", RECENT_SECONDS)
+    if a.verify or (a.video and a.threshold is None):
         check = GeometricCheck() if a.min_inliers is None else GeometricCheck(min_inliers=a.min_inliers)
-    return LoopDetector(describe, check=check, views=views, **_changes(a))
+    return LoopDetector(describe, check=check, views=views, **changes)

@@ -6,17 +6,14 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from loopclosure.cli.data_set import typed
-from loopclosure.cli.run import show_progress, warn
+from loopclosure.cli.data_set import recording_of
+from loopclosure.cli.run import show_progress
 from loopclosure.detector import run
 from loopclosure.detector.detector import Describe, LoopResult
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.map import Map, checked_name
 from loopclosure.detector.visitor import Visitor
-from loopclosure.places.bags import is_bag
-from loopclosure.places.extraction import extract
-from loopclosure.places.source import FRAMES, TOPICS
-from netspec.terminal.commands import Commands, WrongUsage
+from netspec.terminal.commands import Commands
 
 INDEX = "exact, faiss, or Milvus: FILE.db or http://HOST:PORT (default: exact)"
 
@@ -54,7 +51,9 @@ def _add(a: argparse.Namespace) -> None:
 def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
     for text in a.source:
         before, number = len(into), len(into.sessions)
-        results = into.add(_recording(text, Path(a.map) / "frames"), describe, a.index, show_progress)
+        results = into.add(
+            recording_of(text, Path(a.map) / "frames" / f"{number:06d}"), describe, a.index, show_progress
+        )
         loops = [result.accepted for result in results if result.accepted is not None]
         between = sum(frame < before for frame in loops)
         said = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
@@ -64,24 +63,10 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
 
 def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
-    recording = _recording(a.source, out / "frames")
+    recording = recording_of(a.source, out / "frames")
     detector = known.detector(run.load_describe(known.describer), a.index)
     results: Sequence[LoopResult] = run.run_detector(Visitor(detector), recording, progress=show_progress)
     found = [result for result in results if result]
     write_loops_csv(out / "loops.csv", found, recording.stamps, recording.names, detector.stamps, known.names)
     print(run.verdicts_said(results))
     print(f"{len(found)} of {len(results)} frames are in the map: {out / 'loops.csv'}")
-
-
-def _recording(text: str, frames: Path) -> run.Recording:
-    source = typed(text, {"": (*FRAMES, *TOPICS)})
-    path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
-    if is_bag(path):
-        path, said = extract(path, frames / path.stem, topic, pose_topic, show_progress)
-        print(said)
-    elif topic or pose_topic:
-        raise WrongUsage(f"{source}: topics belong to bags")
-    recording = run.open_recording(path, source.selection())
-    for doubt in recording.doubts:
-        warn(doubt)
-    return recording

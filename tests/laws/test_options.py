@@ -85,6 +85,7 @@ WAYS = {
         f"detect walk/walk_1 --describe {THUMBNAILS} --exclude-recent 3 --out found",
         f"detect walk/walk_1 --describe {THUMBNAILS} --threshold -1 --exclude-recent 3 --out found",
         "detect walk/walk_1 --features walk.npz --threshold -1 --exclude-recent 1 --out found",
+        f"detect --video walk.avi --describe {THUMBNAILS} --out found",
         "close walk/walk_1 --loops loops.csv --drift 2 --out closed",
         "close --graph loops.g2o --out closed",
         "map build new walk/walk_1,limit=2",
@@ -156,6 +157,10 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     try:
         assert lmdb_build_main(["walk", "walk", "--frames", "20", "--size", "40x32"]) == 0
         names = np.array([path.name for path in sorted(Path("walk/walk_1/rgb").iterdir())])
+        video = cv2.VideoWriter("walk.avi", cv2.VideoWriter.fourcc(*"MJPG"), 2, (40, 32))
+        for name in names:
+            video.write(np.array(cv2.imread(f"walk/walk_1/rgb/{name}")))
+        video.release()
         np.savez("walk.npz", features=np.random.default_rng(0).random((20, 4), np.float32), names=names)
         known = ["walk/walk_1", "--describe", THUMBNAILS, "--exclude-recent", "3", "--out", "."]
         assert loopclosure_main(["detect", *known]) == 0
