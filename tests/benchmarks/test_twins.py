@@ -8,7 +8,7 @@ import torch
 
 import netspec
 from benchmarks import twins
-from benchmarks.case import CATALOGUE, DECAY, MOMENTUM, PAPER, RATE, SMALL, forward_case, training_case
+from benchmarks.case import CATALOG, DECAY, MOMENTUM, PAPER, RATE, SMALL, forward_case, training_case
 from benchmarks.zoo import ZOO
 from paths import shared
 
@@ -94,7 +94,7 @@ def test_a_twin_learns_the_same(name: str) -> None:
         assert len(set(ours)) == 3, "it learns"
 
 
-def test_every_net_of_the_catalogue_has_a_twin() -> None:
+def test_every_net_of_the_catalog_has_a_twin() -> None:
     with torch.device("meta"):
-        for name in CATALOGUE:
+        for name in CATALOG:
             assert len(list(twins.net(name).parameters()))
