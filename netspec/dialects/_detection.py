@@ -21,9 +21,9 @@ from netspec.dialects._boxes import (
     suppress,
 )
 from netspec.layers import Layer
-from netspec.layers.base import Shape, rounded
+from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import value
 
 

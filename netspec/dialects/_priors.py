@@ -14,8 +14,8 @@ from netspec.dialects._boxes import (
     Array,
 )
 from netspec.layers import Layer
-from netspec.layers.base import Shape, rounded
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.base import Shape
+from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import value
 from netspec.terminal import log
 

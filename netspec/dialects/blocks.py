@@ -15,10 +15,10 @@ from typing_extensions import override
 
 from netspec.layers import Layer, register
 from netspec.layers.activation import Activation
-from netspec.layers.base import Shape, rounded
+from netspec.layers.base import Shape
 from netspec.layers.folding import Affine, blob_in_double
 from netspec.layers.normalization import onnx_normalized, torch_batch_norm
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.vision.convolution import Convolution
 from netspec.proto.schema import TRAIN, value
 

@@ -20,10 +20,10 @@ from netspec.dialects._boxes import as_array
 from netspec.dialects._faster import RATIOS, SCALES, AnchorTarget, ProposalTarget, RoIData, settings
 from netspec.dialects._proposals import all_anchors, base_anchors, moved, suppress
 from netspec.layers import Layer, common, register
-from netspec.layers.base import Shape, rounded
+from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.loss.base import BATCH_SIZE, Loss, onnx_normalized_sum
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TRAIN, value
 
 DECLARATIONS = """

@@ -17,8 +17,8 @@ from netspec.dialects._evaluate import DetectionEvaluate
 from netspec.dialects._multibox import MultiBoxLoss
 from netspec.dialects._priors import PriorBox
 from netspec.layers import Layer, register
-from netspec.layers.base import Shape, rounded
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.base import Shape
+from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import value
 
 DECLARATIONS = """

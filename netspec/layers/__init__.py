@@ -1,7 +1,8 @@
 """Caffe's layers; importing this package registers them all."""
 
 from netspec.layers import activation, common, normalization, powers, recurrent, scale  # noqa: F401
-from netspec.layers.base import Context, Layer, Random
+from netspec.layers.base import Layer
+from netspec.layers.context import Context, Random
 from netspec.layers.data import files, hdf5, memory  # noqa: F401
 from netspec.layers.loss import losses, scores  # noqa: F401
 from netspec.layers.registry import class_of, layer_class, layer_types, register, unknown_type

@@ -11,23 +11,19 @@ database in a layer's constructor, before it logs the layer's bottoms and tops, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from typing_extensions import override
 
 from netspec.data.blobs import Shape
-from netspec.data.random_words import derived
-from netspec.errors import Report, SpecError, Where, raise_fault
+from netspec.errors import SpecError
 from netspec.exact import switch
 from netspec.files.limits import amount, is_out_of_memory, memory
-from netspec.graph.options import BuildOptions
 from netspec.layers import fillers
+from netspec.layers.context import Context
 from netspec.layers.learned import Learned, values_of
-from netspec.proto.schema import TEST
 
 MOST_AXES = 32  # of a blob of Caffe's (kMaxBlobAxes)
 MOST = 2**31 - 1  # numbers that a blob of Caffe's can hold (Blob::Reshape)
@@ -36,81 +32,6 @@ MOST = 2**31 - 1  # numbers that a blob of Caffe's can hold (Blob::Reshape)
 def shape_string(shape: Sequence[int]) -> str:
     """Return a shape as Caffe prints it, ``64 20 24 24 (737280)`` (Caffe: Blob::shape_string)."""
     return "".join(f"{d} " for d in shape) + f"({math.prod(shape)})"
-
-
-def rounded(value: float) -> float:
-    """Return a number of a float32 field as it was written: the shortest that float32 rounds to it."""
-    return float(str(np.float32(value)))
-
-
-def copy_of(param: Any) -> Any:
-    """Return a copy of a LayerParameter."""
-    copy = type(param)()
-    copy.CopyFrom(param)
-    return copy
-
-
-class Random:
-    """The net's random draws, reproducible from one seed; one generator a device."""
-
-    def __init__(self, seed: int) -> None:
-        self.restart(seed)
-
-    def restart(self, seed: int) -> None:
-        """Begin again, from another seed."""
-        self.seed = seed
-        self._part: str | None = None
-        self._generators: dict[str, torch.Generator] = {}
-        self._begun: set[str] = set()  # the generators that draw for this part
-
-    def begin(self, what: str) -> None:
-        """Go on with draws that follow from the seed and the name of a part of a run, whatever was drawn before."""
-        self._part = what
-        self._begun.clear()
-
-    def on(self, device: torch.device | str = "cpu") -> torch.Generator:
-        """Return the generator of ``device`` (made at its first use)."""
-        key = str(device)
-        if key not in self._begun:
-            if key not in self._generators:
-                self._generators[key] = torch.Generator(device)
-            self._generators[key].manual_seed(self.seed if self._part is None else derived(self.seed, self._part))
-            self._begun.add(key)
-        return self._generators[key]
-
-
-def nowhere(*path: str | int) -> Where:
-    """Return the place of a layer that no file has."""
-    return Where("<layer>")
-
-
-@dataclass(frozen=True, slots=True)
-class Context:
-    """What a layer may know of the net around it: ``phase``, how it is built, ``random`` draws of its own.
-
-    Where ``options.open_data`` is false, a layer that reads files must not: its tops' shapes are in
-    ``options.given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``.
-    ``at(*path)`` is the place in the prototxt of a field of this layer; ``report`` gets the faults after which building
-    can go on (the default raises the first).
-    """
-
-    phase: int = TEST
-    options: BuildOptions = field(default_factory=BuildOptions)
-    random: Random = field(default_factory=lambda: Random(0))
-    at: Callable[..., Where] = nowhere
-    report: Report = raise_fault
-    created: Callable[[], None] = lambda: None  # called when ``construct`` has run: for the order of the log
-    take: Callable[[int], None] = lambda size: None  # called before memory is taken, in bytes: it may refuse
-
-    @property
-    def device(self) -> torch.device:
-        """Where blobs are made."""
-        return torch.device(self.options.device)
-
-    @property
-    def data_seed(self) -> int:
-        """From it follow the draws of layers that read records; it is the same for all ranks."""
-        return self.random.seed if self.options.data_seed is None else self.options.data_seed
 
 
 _PLAIN = frozenset({bool, int, float, str, tuple, list})

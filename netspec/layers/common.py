@@ -13,9 +13,9 @@ from netspec.exact import SMALL_PRODUCT
 from netspec.exact.bound import BoundVectors
 from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts, prepared_vectors
 from netspec.layers import fused
-from netspec.layers.base import Layer, Shape, copy_of
+from netspec.layers.base import Layer, Shape
 from netspec.layers.exporting import refusal
-from netspec.layers.folding import Absorbed, blob_like
+from netspec.layers.folding import Absorbed, blob_like, copy_of
 from netspec.layers.preparing import Kernel, Preparation, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode

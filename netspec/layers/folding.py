@@ -81,3 +81,10 @@ def blob_in_double(layer: Layer, index: int) -> torch.Tensor:
 def blob_like(layer: Layer, index: int, other: torch.Tensor) -> torch.Tensor:
     """Return a learned blob with the precision of another tensor, on its device."""
     return values_of(layer.blob(index)).to(other)
+
+
+def copy_of(param: Any) -> Any:
+    """Return a copy of a LayerParameter."""
+    copy = type(param)()
+    copy.CopyFrom(param)
+    return copy

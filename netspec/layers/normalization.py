@@ -13,11 +13,11 @@ from typing_extensions import override
 from netspec.exact import ALL, SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization, RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.base import MOST, Layer, Shape, rounded
+from netspec.layers.base import MOST, Layer, Shape
 from netspec.layers.folding import Affine, blob_in_double
 from netspec.layers.preparing import RELU, Kernel, Preparation, channel_factors, finished, finishing
 from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST
 
 ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion

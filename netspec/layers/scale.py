@@ -12,8 +12,8 @@ from typing_extensions import override
 from netspec.data.blobs import Shape
 from netspec.exact import SMALL_ITEM
 from netspec.exact.channels import ChannelProducts
-from netspec.layers.base import Layer, copy_of
-from netspec.layers.folding import Absorbed, Affine, blob_in_double
+from netspec.layers.base import Layer
+from netspec.layers.folding import Absorbed, Affine, blob_in_double, copy_of
 from netspec.layers.preparing import Kernel, Preparation, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 
 Sizes = tuple[int | None, ...]  # a shape; None where the size is known only when the exported net runs
@@ -121,3 +122,8 @@ class TorchCode(Protocol):
     def input(self, top: int) -> str:
         """Return a new argument of ``forward``, for a top that its caller gives."""
         ...
+
+
+def rounded(value: float) -> float:
+    """Return a number of a float32 field as it was written: the shortest that float32 rounds to it."""
+    return float(str(np.float32(value)))

@@ -19,7 +19,8 @@ from netspec.files.limits import memory as memory_of_machine
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Backward, Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
-from netspec.layers.base import Context, Layer, Random, Shape, shape_string
+from netspec.layers.base import Layer, Shape, shape_string
+from netspec.layers.context import Context, Random
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.run.eager import last_uses

@@ -12,7 +12,7 @@ import torch
 
 from netspec.exact import CHOICES, SMALL
 from netspec.graph.options import BuildOptions
-from netspec.layers.base import Random
+from netspec.layers.context import Random
 from netspec.terminal import log
 
 

@@ -14,7 +14,7 @@ from netspec.exact import libm
 from netspec.exact.blas import dots, sum_in_order
 from netspec.exact.losses import SigmoidCrossEntropy
 from netspec.exact.sums import RowMagnitudes, RowSquares
-from netspec.layers.base import Shape, rounded
+from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.loss.base import (
     BATCH_SIZE,
@@ -31,7 +31,7 @@ from netspec.layers.loss.base import (
     total,
 )
 from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.training import Kernels, Learning
 
 

@@ -23,9 +23,9 @@ from netspec.exact.products import (
 )
 from netspec.exact.switch import is_recorded
 from netspec.layers import fused
-from netspec.layers.base import Shape, copy_of
+from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
-from netspec.layers.folding import Absorbed, blob_like
+from netspec.layers.folding import Absorbed, blob_like, copy_of
 from netspec.layers.preparing import Kernel, Preparation, finished
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
