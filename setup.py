@@ -1,14 +1,16 @@
-"""What pyproject.toml cannot say: the nets of prototxt/ travel in the wheel, as netspec/prototxt."""
+"""What pyproject.toml cannot say: the nets of prototxt/ travel in the wheel; the README has whole addresses there."""
 
 import ast
+import re
 import shutil
 from pathlib import Path
 
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-NETS = Path(__file__).parent / "prototxt"
-SHIPPED = Path(__file__).parent / "netspec" / "features" / "shipped.py"
+HERE = Path(__file__).parent
+NETS = HERE / "prototxt"
+SHIPPED = HERE / "netspec" / "features" / "shipped.py"
 
 
 def files():
@@ -35,4 +37,15 @@ class BuildPy(build_py):
                 shutil.copyfile(NETS / path, target)
 
 
-setup(cmdclass={"build_py": BuildPy})
+def readme():
+    """Return README.md for a package index: each link to a file of the project is a whole address."""
+    source = re.search(r'^Source = "(.+?)"', (HERE / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)[1]
+
+    def whole(link):
+        kind = "raw" if link[1].startswith("!") else "blob"
+        return f"{link[1]}({source}/{kind}/main/{link[2]})"
+
+    return re.sub(r"(!?\[[^\]]*\])\((?!\w+://|#)([^)]*)\)", whole, (HERE / "README.md").read_text(encoding="utf-8"))
+
+
+setup(cmdclass={"build_py": BuildPy}, long_description=readme(), long_description_content_type="text/markdown")

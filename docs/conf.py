@@ -2,36 +2,49 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pygments.lexer import RegexLexer
-from pygments.token import Comment, Name, Text
+from pygments.token import Comment, Keyword, Name, Number, Punctuation, String, Text
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 sys.path.insert(0, str(HERE))
 
+PROJECT = (ROOT / "pyproject.toml").read_text()
 project = "netspec"
 author = "the netspec authors"
+release = version = re.findall(r'^version = "(.+?)"', PROJECT, re.M)[0]
+REPOSITORY = re.findall(r'^Source = "(.+?)"', PROJECT, re.M)[0]
 extensions = ["myst_parser", "reference"]
 exclude_patterns = ["_build"]
 highlight_language = "commands"
 html_theme = "furo"
-html_title = "netspec: the living Caffe"
+html_title = f"netspec {version}"
 html_copy_source = False
 html_show_copyright = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_theme_options = {"navigation_with_keys": True}
+html_js_files = ["copy.js", "tables.js"]
+html_theme_options = {
+    "navigation_with_keys": True,
+    "source_repository": REPOSITORY,
+    "source_branch": "main",
+    "source_directory": "docs/",
+    "top_of_page_buttons": ["edit"],
+}
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
 suppress_warnings = ["myst.header", "misc.highlighting_failure"]  # READMEs begin where they like; logs are no language
 
-# The README of each folder is a page too.
-ROOMS = {f"{name}/README.md": f"rooms/{name}.md" for name in ("netspec", "loopclosure", "prototxt", "benchmarks")}
+# The README of each folder is a page too, and so are these files.
+ROOMS = {f"{name}/README.md": f"rooms/{name}.md" for name in ("netspec", "loopclosure", "prototxt", "benchmarks")} | {
+    f"{name.upper()}.md": f"rooms/{name}.md" for name in ("changelog", "contributing", "architecture", "security")
+}
 LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]*)(#[^)]*)?\)")
 BLOCK = re.compile(r"^```([^\n`]*)\n.*?^```$", re.M | re.S)
 COMMENTED = re.compile(r"^([^\s#].*?) +(# .*)$", re.M)
@@ -42,6 +55,24 @@ class CommandLexer(RegexLexer):
 
     name = "commands"
     tokens: ClassVar = {"root": [(r"(?<!\S)#.*", Comment), (r"(?<!\S)--?\w[\w-]*", Name.Attribute), (r"\s+|\S+", Text)]}
+
+
+class PrototxtLexer(RegexLexer):
+    """Protobuf's text format: names of fields and messages, strings, numbers, words of an enumeration."""
+
+    name = "prototxt"
+    tokens: ClassVar = {
+        "root": [
+            (r"#.*", Comment),
+            (r"\w+(?=\s*\{)", Name.Class),
+            (r"\w+(?=\s*:)", Name.Attribute),
+            (r'"[^"\n]*"|\'[^\'\n]*\'', String),
+            (r"-?[\d.]+(?:e[-+]?\d+)?", Number),
+            (r"\w+", Keyword.Constant),
+            (r"[{}:;,<>\[\]]", Punctuation),
+            (r"\s+|.", Text),
+        ]
+    }
 
 
 def rewrite(text: str, folder: Path) -> str:
@@ -77,8 +108,25 @@ def _included(app: Any, relative_path: Path, parent: str, content: list[str]) ->
     content[0] = rewrite(content[0], (HERE / relative_path).resolve().parent)
 
 
+def _searched(app: Any, exception: Exception | None) -> None:
+    """Write what the search shows of each page where it cannot ask for the page: read from a disk (search.js)."""
+    if exception is None and app.builder.format == "html":
+        texts = {name: app.env.get_doctree(name).astext() for name in sorted(app.env.found_docs)}
+        made = Path(app.outdir, "_static", "texts.js")
+        made.write_text(f"const TEXTS = {json.dumps(texts)};\n")
+
+
+def _on_search_page(app: Any, pagename: str, *_: object) -> None:
+    if pagename == "search":
+        for name in ("texts.js", "search.js"):
+            app.add_js_file(name)
+
+
 def setup(app: Any) -> None:
-    """Have pages rewritten, and commands told from their comments."""
+    """Have pages rewritten, commands told from their comments, prototxt in colors, and a search that shows text."""
     app.add_lexer("commands", CommandLexer)
+    app.add_lexer("prototxt", PrototxtLexer)
+    app.connect("html-page-context", _on_search_page)
+    app.connect("build-finished", _searched)
     app.connect("source-read", _page)
     app.connect("include-read", _included)

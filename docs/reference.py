@@ -1,4 +1,4 @@
-"""Sphinx directives that write the reference from the code: ``commands``, ``layers``, ``fields``."""
+"""Sphinx directives that write the reference from the code: ``commands``, ``layers``, ``api``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import argparse
 import inspect
 import re
 from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,26 +34,42 @@ class FromCode(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Parse the text in place of the directive, at each build anew, since code may have changed."""
         self.env.note_reread()
-        return self.parse_text_to_nodes(self.markdown(self.arguments[0]), allow_section_headings=True)
+        return self.parse_text_to_nodes(
+            self.markdown(self.arguments[0] if self.arguments else ""), allow_section_headings=True
+        )
 
 
 class CommandReference(FromCode):
-    """All commands of a program, with what ``--help`` says of their arguments."""
+    """The commands of a program that stand under some headings of its help, or all, in the order of its help."""
+
+    final_argument_whitespace = True
 
     def markdown(self, name: str) -> str:
-        """Return a section for each command."""
-        from importlib import import_module
-
+        """Return a section for each command: what it is for, its usage, an example of a page, its options."""
+        name, _, headings = name.partition(" ")
         parser = import_module(f"{name.replace('-', '_')}.cli").parser()
+        groups = [part.partition(":\n") for part in (parser.epilog or "").split("\n\n")]
+        wanted = [
+            set(re.findall(r"^  (\S+)", below, re.M)) for title, _, below in groups if not headings or title in headings
+        ]
         lines = []
         for command, made in _commands(parser):
-            lines += [f"## {name} {command}", "", _prose(made.description or ""), ""]
+            if command.split()[0] not in set().union(*wanted):
+                continue
+            lines += [f"## {name} {command}", "", *_paragraphs(made.description or ""), ""]
+            usage = " ".join(made.format_usage().removeprefix("usage: ").split())
+            required = [word for word in re.findall(r"\[[^\]]*\]|\S+", usage) if not word.startswith("[")]
+            lines += ["```text", f"{' '.join(required)} [options]", "```", ""]
+            if example := _example(f"{name} {command}"):
+                lines += ["```", example, "```", ""]
             lines += ["| | |", "|---|---|", *_options(made), ""]
         return "\n".join(lines)
 
 
 class LayerReference(FromCode):
-    """All layer types, or those of a dialect, with their docstrings."""
+    """The layer types of the rooms of netspec.layers that are named."""
+
+    final_argument_whitespace = True
 
     def markdown(self, name: str) -> str:
         """Return a section for each layer type."""
@@ -59,6 +77,8 @@ class LayerReference(FromCode):
 
         lines = []
         for kind in layer_types():
+            if layer_class(kind).__module__.split(".")[2] not in name.split():
+                continue
             lines += [f"## {kind}", "", *_described(inspect.getdoc(layer_class(kind)) or ""), ""]
             if example := shapes.examples().get(kind):
                 lines += [f'<figure class="shapes">{shapes.picture(kind, example)}</figure>', ""]
@@ -69,12 +89,88 @@ class LayerReference(FromCode):
         return "\n".join(lines)
 
 
-class FieldReference(FromCode):
-    """The fields of a message of Caffe's schema."""
+class PythonReference(FromCode):
+    """Public names of Python, ``module:Name`` each on a line, with their docstrings and those of their methods."""
+
+    required_arguments = 0
+    has_content = True
 
     def markdown(self, name: str) -> str:
-        """Return a table."""
-        return _table(name)
+        """Return a section for each name."""
+        lines: list[str] = []
+        for line in self.content:
+            module, _, attribute = line.partition(":")
+            found = getattr(import_module(module), attribute)
+            lines += [f"## {attribute}", "", *_signed(f"{module}.{attribute}", found), ""]
+            for method in methods(found):
+                made = getattr(found, method)
+                shown = f".{method}" if isinstance(made, property) else f".{method}{_arguments(made)}"
+                lines += [f"**`{shown}`**", "", *docstring(made), ""]
+        return "\n".join(lines)
+
+
+def methods(found: Any) -> list[str]:
+    """Return the public methods and properties that a class itself defines and describes, in their order."""
+    if not inspect.isclass(found) or issubclass(found, Exception):
+        return []
+    return [
+        name
+        for base in reversed(found.__mro__)
+        if base.__module__.startswith(("netspec", "loopclosure"))
+        for name, made in vars(base).items()
+        if not name.startswith("_")
+        and getattr(made, "__doc__", None)
+        and (callable(made) or isinstance(made, property))
+    ]
+
+
+def _signed(name: str, found: Any) -> list[str]:
+    return ["```text", f"{name}{_arguments(found)}", "```", "", *docstring(found)]
+
+
+def _arguments(found: Any) -> str:
+    """Return the arguments of a function or class, without annotations; types stand in the docstrings."""
+    parameters = [p.replace(annotation=inspect.Parameter.empty) for p in inspect.signature(found).parameters.values()]
+    shown = [p.replace(default="...") if _is_long(p) else p for p in parameters if p.name != "self"]
+    return re.sub(r"='\.\.\.'", "=...", str(inspect.Signature(shown)))
+
+
+def _is_long(parameter: inspect.Parameter) -> bool:
+    return parameter.default is not parameter.empty and len(repr(parameter.default)) > 20
+
+
+def docstring(found: Any) -> list[str]:
+    """Return a docstring as Markdown: examples are Python, lines of two columns a table, roles code."""
+    lines: list[str] = []
+    rows: list[list[str]] = []
+    for line in [*(inspect.getdoc(found) or "").splitlines(), ""]:
+        if row := re.fullmatch(r"(\w+(?:, \w+)*)\s{2,}(\S.*)", line):
+            rows.append([row[1], row[2]])
+        elif rows and line.startswith("  "):
+            rows[-1][1] += f" {line.strip()}"
+        else:
+            if rows:
+                cells = (f"| `{name}` | {_words(text).replace('|', CELL)} |" for name, text in rows)
+                lines += ["", "| name | meaning |", "|---|---|", *cells, ""]
+                rows = []
+            code = line.startswith("    ")
+            lines.append(line if code or not line.strip() else _words(line))
+    blocks = re.sub(
+        r"((?:^    .*\n|^\n(?=    ))+)",
+        lambda b: f"```pycon\n{dedented(b[0])}```\n",
+        "\n".join(lines) + "\n",
+        flags=re.M,
+    )
+    return blocks.splitlines()
+
+
+def dedented(text: str) -> str:
+    """Return a block without its indent."""
+    return "".join(f"{line[4:]}\n" for line in text.splitlines() if line.strip())
+
+
+def _words(text: str) -> str:
+    return _prose(re.sub(r":\w+:`~?(?:[\w.]+\.)?([\w.]+)`", r"``\1``", text))
 
 
 def _described(text: str) -> list[str]:
@@ -110,9 +206,33 @@ def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.A
                 yield from ((f"{command} {name}", parser) for name, parser in inner) if inner else [(command, made)]
 
 
+@cache
+def _examples() -> list[str]:
+    """Return the commands that stand on the pages, where tests run them, each in one line."""
+    pages = [ROOT / "README.md", *ROOT.glob("*/README.md"), *sorted((ROOT / "docs").glob("*.md"))]
+    text = "\n".join(block for page in pages for block in re.findall(r"^```\n(.*?)^```", page.read_text(), re.M | re.S))
+    lines = re.sub(r"\s*\\\n\s*", " ", text).splitlines()
+    return [re.sub(r"\s+# .*", "", line) for line in lines]
+
+
+def _example(command: str) -> str:
+    """Return what a command of a page looks like: of those with options the shortest."""
+    found = [line for line in _examples() if f"{line} ".startswith(f"{command} ") and "$" not in line]
+    return min(found, key=lambda line: (" --" not in line, len(line)), default="")
+
+
+def _paragraphs(text: str) -> list[str]:
+    """Return a description as Markdown; a table in it, of lines with two columns, is a list."""
+    rows = re.sub(r"\n {6,}", " ", text)
+    return [re.sub(r"^(--\S+(?: \S+)?)\s{2,}", r"- `\1`: ", _prose(line)) for line in rows.splitlines()]
+
+
+SHARED = ("plugin", "limit", "verbose")  # options of every command, which come last
+
+
 def _options(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """Yield the rows of a table of a command's arguments."""
-    for action in parser._actions:
+    """Yield the rows of a table of a command's arguments: its own in their order, then those that all commands have."""
+    for action in sorted(parser._actions, key=lambda action: action.dest in SHARED):
         if isinstance(action, argparse._HelpAction) or action.help is argparse.SUPPRESS:
             continue
         words = [f"`{word}`" for word in action.option_strings if not word.startswith("--no")]
@@ -157,6 +277,6 @@ def _prose(text: str) -> str:
 def setup(app: Any) -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("commands", CommandReference)
+    app.add_directive("api", PythonReference)
     app.add_directive("layers", LayerReference)
-    app.add_directive("fields", FieldReference)
     return {"parallel_read_safe": True}

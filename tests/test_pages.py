@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(MISSING), reason=f"not i
 
 # What each page supposes to be there, of the files that playground.py makes.
 SUPPOSED = {
-    "README.md": "prototxt out data deploy.prototxt x.caffemodel solver.prototxt train_val.prototxt train_lmdb",
+    "README.md": "deploy.prototxt x.caffemodel solver.prototxt train_val.prototxt train_lmdb",
     "loopclosure/README.md": "prototxt FOLDER SEQUENCE OTHER_IMAGES others.npz odometry.txt corridor_loop "
     "train.txt rgbd_dataset_freiburg1_xyz",
     "netspec/README.md": "train_val.prototxt deploy.prototxt solver.prototxt a.prototxt b.prototxt x.caffemodel "
@@ -28,6 +28,9 @@ SUPPOSED = {
     "docs/closing.md": "prototxt drive.bag wheels.txt",
     "docs/coming-from-opencv.md": "deploy.prototxt face.caffemodel",
     "docs/datasets.md": "MH_01_easy dataset drive.bag drive.mp4 slam.txt Nordland",
+    "docs/gallery.md": "prototxt data train.log a.png b.png FOLDER",
+    "docs/how-to.md": "deploy.prototxt solver.prototxt train_val.prototxt x.caffemodel train_lmdb FOLDER prototxt tum",
+    "docs/index.md": "deploy.prototxt solver.prototxt train_val.prototxt x.caffemodel train_lmdb SEQUENCE",
     "docs/engines.md": "net.prototxt net.caffemodel deploy.prototxt train_lmdb photos",
     "docs/inference.md": "prototxt deploy.prototxt net.caffemodel",
     "docs/methods.md": "SEQUENCE net.pt2 A B",
@@ -41,7 +44,7 @@ SUPPOSED = {
 GIVEN = "import numpy, torch; images, image = torch.rand(2, 3, 32, 32), numpy.zeros((32, 32, 3), numpy.uint8)\n"
 # What stands in a page, and what runs in its place: the same on less.
 LESS = {
-    "README.md": {"--frames 400": "--frames 60", "step(100)": "step(2)"},
+    "README.md": {"--frames 400": "--frames 60"},
     "netspec/README.md": {"step(100)": "step(2)", "--iterations 50": "--iterations 2"},
     "prototxt/README.md": {
         "--train 30000 --val 6000 --test 6000": "--train 20 --val 8 --test 8",
@@ -61,6 +64,7 @@ LESS = {
         "--min-gap 10 --out": "--min-gap 10 --train 8 --val 0 --test 0 --out",
         "--train 2000 --val 400": "--train 4 --val 2",
     },
+    "docs/how-to.md": {"--train 2000 --val 400": "--train 8 --val 4"},
     "docs/growth.md": {
         "pairs 1000 10000 100000 1000000": "pairs 10 20",
         "frames 1000 10000 100000": "frames 10 20 --without-others",

@@ -64,21 +64,38 @@ def test_the_site_has_no_bad_link_and_loads_nothing_from_elsewhere(site: Path) -
         assert not re.search(r'<link[^>]*rel="stylesheet"[^>]*href="(?:https?:)?//', text)
 
 
+def text_of(site: Path, pages: str) -> str:
+    return "".join(page.read_text() for page in (site / "reference").glob(f"{pages}.html"))
+
+
+def test_pages_that_newcomers_look_for_are_found_and_shown(site: Path) -> None:
+    index = (site / "searchindex.js").read_text()
+    texts = (site / "_static" / "texts.js").read_text()
+    for words, page in (("custom layer", "layer"), ("fine-tune", "how-to"), ("mean.binaryproto", "how-to")):
+        text = re.search(rf'"{page}": "((?:[^"\\]|\\.)*)"', texts)
+        assert text is not None
+        assert words in text[1].lower()
+        assert f'"{page}"' in index
+
+
 def test_every_layer_and_command_is_in_the_reference(site: Path) -> None:
     from netspec.cli import parser
     from netspec.layers import layer_types
+    from netspec.proto.schema import SolverParameter
 
-    layers = (site / "reference" / "layers.html").read_text()
+    layers = text_of(site, "layers-*")
     assert all(f">{kind}<" in layers for kind in layer_types())
-    commands = (site / "reference" / "commands.html").read_text()
+    commands = text_of(site, "commands-*")
     (choices,) = (action.choices for action in parser()._actions if action.dest == "command")
     assert all(re.search(f">netspec {name}[< ]", commands) for name in choices or ())
+    shown = re.sub(r"<[^>]+>", "", text_of(site, "solver"))
+    assert all(re.search(rf"\b{field}\b", shown) for field in SolverParameter.DESCRIPTOR.fields_by_name)
 
 
 def test_every_layer_is_drawn_with_its_shapes(site: Path) -> None:
     from netspec.layers import layer_types
 
-    page = (site / "reference" / "layers.html").read_text()
+    page = text_of(site, "layers-*")
     pictures = {
         found["kind"]: found
         for found in re.finditer(

@@ -106,7 +106,16 @@ class DetectorSettings:
 
 
 class LoopDetector:
-    """Finds loops frame by frame; ``loops`` holds the results that were accepted, in order."""
+    """Finds loops frame by frame; ``loops`` holds the results that were accepted, in order.
+
+    Frames are numbered from 0; the newest, ``exclude_recent`` of them, are no candidates.
+
+        >>> detector = LoopDetector(exclude_recent=1, threshold=-0.5)
+        >>> for place in (0, 1, 2, 0):
+        ...     result = detector.add_descriptor(numpy.eye(3)[place])
+        >>> result.accepted, result.verdict
+        (0, 'accepted')
+    """
 
     def __init__(
         self,

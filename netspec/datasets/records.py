@@ -31,6 +31,11 @@ class Records(Dataset[tuple[torch.Tensor, ...]]):
     whether crops are random. Mirrors and crops are drawn again in each epoch, which :meth:`set_epoch` sets. Of HDF5
     files, which Caffe does not transform, an item has a row of each of the datasets ``tops``. A layer "data" of a net
     with the same ``seed`` draws the same. Raises SpecError for faults of the files.
+
+        >>> records = Records("train_lmdb", "crop_size: 32 mirror: true mean_value: 104")
+        >>> image, label = records[0]
+        >>> len(records), image.shape, label.shape
+        (6, torch.Size([3, 32, 32]), torch.Size([]))
     """
 
     def __init__(

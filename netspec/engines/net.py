@@ -59,6 +59,10 @@ def load_net(
     engine has it, ``cache`` the folder that keeps exported models (None: the user's cache folder, False: none).
     ``limit`` is the memory, in bytes, that the net may need (None: what there is).
     Raises SpecError for every fault of the files.
+
+        >>> net = netspec.load_net("deploy.prototxt", weights="x.caffemodel")
+        >>> net(images)["prob"].shape
+        torch.Size([2, 4])
     """
     choice = Choice.of(engine, precision, cache)
     options = BuildOptions(

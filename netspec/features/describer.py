@@ -25,6 +25,10 @@ class Describer:
     ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how many. ``engine`` and ``precision`` say
     what runs the net (docs/engines.md), ``cache`` which folder keeps its model. Raises SpecError for faults of the
     files.
+
+        >>> describe = Describer("deploy.prototxt", "x.caffemodel", blob="feat")
+        >>> describe(numpy.zeros((48, 64, 3), numpy.uint8)).shape
+        (4,)
     """
 
     def __init__(

@@ -45,6 +45,14 @@ class Net(torch.nn.Module):
     ``layers[i]`` belongs to ``param.layer[i]``, splits included. Gradients are computed by torch.
 
     Threads may share a net: one waits for the pass of another, and ``blobs`` has what its own last pass kept.
+
+        >>> net = netspec.load_net("deploy.prototxt", weights="x.caffemodel")
+        >>> net.inputs, net.outputs, net.shapes["feat"]
+        (['data'], ['prob'], (1, 4))
+        >>> net.keep = ["feat"]
+        >>> scores = net(data=images)["prob"]
+        >>> net.blobs["feat"].shape
+        torch.Size([2, 4])
     """
 
     def __init__(self, plan: Plan, options: BuildOptions | None = None) -> None:

@@ -37,10 +37,12 @@ def layer(
 ) -> OneLayer:
     """Return the layer described by ``text``, the part between the braces of ``layer { }``.
 
-    ``netspec.layer('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }')(x)`` is its top for the bottom ``x``.
     Bottoms and tops need no names; ``tops`` is the number of tops, by default the smallest. The layer is built when the
     shapes of its bottoms are known: at the first call, or at once if ``shapes`` are given. ``exact`` is as for a net
     (netspec/exact). Raises SpecError, and ValueError for an unknown ``exact``.
+
+        >>> netspec.layer('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }')(images).shape
+        torch.Size([2, 3, 16, 16])
     """
     options = BuildOptions(str(device), seed, allow_python=allow_python, exact=exact)
     context = Context(phase_of(phase), options, Random(seed))

@@ -121,6 +121,9 @@ def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
 
     A shared blob is written for each of its layers, in HDF5 only for its owner. Raises SpecError if the file cannot be
     written; an older file is then not changed.
+
+        >>> net = netspec.load_net("deploy.prototxt", seed=1)
+        >>> netspec.save_weights(net, "random.caffemodel")
     """
     (write_hdf5 if str(path).endswith(".h5") else write_binary)(net, path, diff)
 

@@ -56,6 +56,11 @@ def load_solver(
     ``stages`` go to the training net. Several devices train side by side, the first being the root. For the others see
     :class:`~netspec.solver.options.TrainingOptions` and :class:`~netspec.graph.options.BuildOptions`, which all of this
     is from here on. Raises SpecError for every fault of the files.
+
+        >>> solver = netspec.load_solver("solver.prototxt", weights="x.caffemodel")
+        >>> solver.step(2)
+        >>> solver.iteration
+        2
     """
     build = BuildOptions(
         level=level,
