@@ -27,7 +27,7 @@ from netspec.net import build
 from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST, phase_of
 from netspec.run.shapes import fitted
-from netspec.run.walk import Result, walk, weighted_sum
+from netspec.run.walk import Result, losses_of, walk, weighted_sum
 
 Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path, with these blobs besides its outputs
 
@@ -114,7 +114,7 @@ class Engine:
     def __init__(self, net: Net, choice: Choice, origin: Origin | None, write: Write) -> None:
         self._plan, self._layers, self._exact = net.plan, list(net.layers), net.options.exact
         self._choice, self._from, self._write = choice, origin, write
-        self._losses = [tuple((j, w) for j, w in enumerate(row) if w) for row in net.loss_weights]
+        self._losses = losses_of(net.loss_weights)
         self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
         layers = zip(net.plan.nodes, net.layers, strict=True)
         ends = [node for node, layer in layers if layer.is_input or reads_data(layer)]

@@ -16,6 +16,7 @@ from netspec.data import blobs
 from netspec.files.whole_file import whole_file
 from netspec.graph.filter import filter_net
 from netspec.graph.fold import origins
+from netspec.graph.inputs import add_input
 from netspec.graph.options import BuildOptions
 from netspec.layers.folding import passes_on
 from netspec.layers.reading import reads_data
@@ -54,9 +55,7 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
             continue
         kept = list(layer.top) if labels else list(layer.top)[:1]
         missing.update(list(layer.top)[len(kept) :])
-        entry = result.layer.add(name=layer.name, type="Input", top=kept)
-        for shape in built[layer.name].top_shapes[: len(kept)]:
-            entry.input_param.shape.add().dim.extend(shape)
+        add_input(result, layer.name, dict(zip(kept, built[layer.name].top_shapes, strict=False)))
         places.append(source.layers[i])
     return result, source.with_layers(places)
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from netspec.features.views import middle
 from netspec.files.image_list import ImageList
 from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, with_state
+from netspec.graph.inputs import is_input, shapes_of_input
 from netspec.graph.options import BuildOptions
 from netspec.graph.prune import prune
 from netspec.proto.binary import read_net_binary
@@ -161,9 +162,8 @@ def extract_images(describe: ImageNet, images: ImageList, progress: Progress = i
 
 def _shape_of(blob: str, net: NetParameter, source: SourceMap, options: BuildOptions) -> Shape:
     """Return the shape of a blob of a net; data is opened, but no memory for blobs is used."""
-    if len(net.layer) == 1 and net.layer[0].type == "Input" and net.layer[0].input_param.shape:  # no need of torch
-        shapes: Any = net.layer[0].input_param.shape
-        return tuple(shapes[list(net.layer[0].top).index(blob) if len(shapes) > 1 else 0].dim)
+    if len(net.layer) == 1 and is_input(net.layer[0]) and (known := shapes_of_input(net.layer[0]).get(blob)):
+        return known  # torch is not needed
     from netspec.net.build import build_filtered
 
     built = build_filtered(net, source, replace(options, device="meta"))

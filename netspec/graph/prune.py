@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from netspec.graph import check_blobs
+from netspec.graph.inputs import add_input
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
@@ -35,8 +36,7 @@ def prune(
     pruned = copy_without(net, {"layer"})
     places = []
     for name, shape in given.items():
-        entry = pruned.layer.add(name=name, type="Input", top=[name])
-        entry.input_param.shape.add().dim.extend(shape)
+        add_input(pruned, name, {name: shape})
         places.append(source.net)
     for i in reversed(kept):
         pruned.layer.add().CopyFrom(net.layer[i])

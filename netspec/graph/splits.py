@@ -10,10 +10,11 @@ from collections import Counter
 from collections.abc import Mapping
 
 from netspec.errors import SpecError, did_you_mean
-from netspec.proto.schema import NetParameter
+from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
 
+SPLIT = "Split"
 Top = tuple[int, int]  # layer index, top index
 MOST_NAMES = 20  # blobs that an error names
 MOST_HINTS = 20  # unknown blobs for which similar names are looked for: that takes time for each blob there is
@@ -40,7 +41,7 @@ def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
                 added = split.layer.add()
                 places.append(source.layers[i])
                 added.name = f"{blob}_{layer.name}_{j}_split"
-                added.type = "Split"
+                added.type = SPLIT
                 added.bottom.append(blob)
                 added.top.extend(_blob_name(layer.name, blob, j, k) for k in range(uses[top]))
                 if weights.get(top):
@@ -53,6 +54,21 @@ def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
 def is_split(name: str, kind: str) -> bool:
     """Say whether a layer of this name and type is one of those that :func:`insert_splits` inserts."""
     return kind == "Split" and name.endswith("_split")
+
+
+def without_splits(net: NetParameter) -> list[LayerParameter]:
+    """Return the layers without Split layers, their tops named again as what they copy."""
+    names: dict[str, str] = {}
+    layers = []
+    for layer in net.layer:
+        if layer.type == SPLIT:
+            names.update((top, names.get(layer.bottom[0], layer.bottom[0])) for top in layer.top)
+            continue
+        copy = LayerParameter()
+        copy.CopyFrom(layer)
+        copy.bottom[:] = [names.get(bottom, bottom) for bottom in layer.bottom]
+        layers.append(copy)
+    return layers
 
 
 def _names(blobs: Mapping[str, object]) -> str:

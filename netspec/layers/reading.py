@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 
 from netspec.errors import SpecError
@@ -57,6 +58,15 @@ class Fed(Protocol):
 
 
 @runtime_checkable
+class TakesArrays(Protocol):
+    """A layer whose records are arrays of a program."""
+
+    def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
+        """Take images (n, C, H, W) and labels (n,). Raises SpecError for other shapes."""
+        ...
+
+
+@runtime_checkable
 class Constant(Protocol):
     """A layer some of whose tops are written when it is made and never again."""
 
@@ -82,6 +92,17 @@ class Scores(Protocol):
 def reads_data(layer: Layer | type[Layer]) -> bool:
     """Return whether a layer's tops are records; exported nets take them as inputs."""
     return getattr(layer, "reads_data", False)
+
+
+def takes_shapes(layer: type[Layer]) -> bool:
+    """Return whether ``--shape`` may tell the shapes of a layer's tops although it has bottoms."""
+    return getattr(layer, "takes_shapes", False)
+
+
+def channels_read(param: Any, layer: type[Layer] | None) -> int:
+    """Return the channels of a layer's bottoms that the filters in its LayerParameter have; 0 where it has none."""
+    read = getattr(layer, "channels_read", None)
+    return read(param) if read and param.blobs else 0
 
 
 def changes_itself(layer: Layer) -> bool:

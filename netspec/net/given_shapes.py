@@ -7,12 +7,15 @@ from pathlib import Path
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where, did_you_mean
+from netspec.layers import class_of
+from netspec.layers.reading import takes_shapes
 from netspec.proto.schema import NetParameter
 
 
 def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
     """Return an error for each given shape whose blob is not a top of a data layer (or Python layer)."""
-    makers = [layer for net in nets for layer in net.layer if not layer.bottom or layer.type == "Python"]
+    layers = [layer for net in nets for layer in net.layer]
+    makers = [layer for layer in layers if not layer.bottom or ((cls := class_of(layer)) and takes_shapes(cls))]
     blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
     known = ", ".join(blobs) or "none"
     return [

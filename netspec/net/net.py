@@ -21,7 +21,7 @@ from netspec.graph import check_blobs
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
-from netspec.layers.reading import Fed, Restarts
+from netspec.layers.reading import Fed, Restarts, TakesArrays
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST, TRAIN
@@ -246,13 +246,12 @@ class Net(torch.nn.Module):
         Raises SpecError for other shapes, and for a net without such a layer.
         Caffe: Net_SetInputArrays (python/caffe/_caffe.cpp)
         """
-        takers = [layer for layer in self.layers if hasattr(layer, "set_input_arrays")]
-        if not takers:
+        taker = next((layer for layer in self.layers if isinstance(layer, TakesArrays)), None)
+        if taker is None:
             message = (
                 "set_input_arrays is for nets with a MemoryData layer, and this one has none; call net(blob=array)"
             )
             raise SpecError(message, Where(self.plan.source.file))
-        taker: Any = takers[0]
         taker.set_input_arrays(data, np.zeros(len(data), np.float32) if labels is None else labels)
 
     def missing_inputs(self) -> Iterator[SpecError]:

@@ -9,9 +9,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from netspec.errors import SpecError, Where, did_you_mean
+from netspec.graph.inputs import add_input, is_input, shapes_of_input
+from netspec.graph.splits import without_splits
 from netspec.layers import layer_class
 from netspec.layers.base import Shape
-from netspec.layers.reading import reads_data
+from netspec.layers.reading import channels_read, reads_data, takes_shapes
 from netspec.proto.binary import parse_net_binary
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
@@ -31,7 +33,7 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
     where = Where(str(path))
     if not any(layer.type for layer in trained.layer):
         raise SpecError("holds weights, but no net", where)
-    layers = _without_splits(trained)
+    layers = without_splits(trained)
     inputs = _inputs(layers)
     for name in shapes:
         if name not in inputs:
@@ -42,11 +44,11 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
     made = set(given)
     net = NetParameter(name=trained.name)
     for name, shape in given.items():
-        net.layer.add(name=name, type="Input", top=[name]).input_param.shape.add().dim.extend(shape)
+        add_input(net, name, {name: shape})
     missing = {name for name in inputs if name not in given}
     without = []
     for layer in layers:
-        if _reads_data(layer) or layer.type == "Input":
+        if _reads_data(layer) or is_input(layer):
             continue
         if missing & set(layer.bottom):
             missing.update(top for top in layer.top if top not in made)
@@ -66,24 +68,9 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
     return net, source.with_layers([source.net] * len(net.layer))
 
 
-def _without_splits(net: NetParameter) -> list[LayerParameter]:
-    """Return the layers without Split layers, their tops named again as what they copy."""
-    names: dict[str, str] = {}
-    layers = []
-    for layer in net.layer:
-        if layer.type == "Split":
-            names.update((top, names.get(layer.bottom[0], layer.bottom[0])) for top in layer.top)
-            continue
-        copy = LayerParameter()
-        copy.CopyFrom(layer)
-        copy.bottom[:] = [names.get(bottom, bottom) for bottom in layer.bottom]
-        layers.append(copy)
-    return layers
-
-
 def _reads_data(layer: LayerParameter) -> bool:
     cls = layer_class(layer.type)
-    return not layer.bottom and (cls is None or reads_data(cls) or layer.type == "Python")
+    return not layer.bottom and (cls is None or reads_data(cls) or takes_shapes(cls))
 
 
 def _inputs(layers: list[LayerParameter]) -> dict[str, Shape]:
@@ -91,10 +78,8 @@ def _inputs(layers: list[LayerParameter]) -> dict[str, Shape]:
     inputs: dict[str, Shape] = {}
     made: set[str] = set()
     for layer in layers:
-        if layer.type == "Input":
-            shapes = [tuple(shape.dim) for shape in layer.input_param.shape]
-            shapes = shapes * len(layer.top) if len(shapes) == 1 else shapes
-            inputs.update(zip(layer.top, shapes, strict=False))
+        if is_input(layer):
+            inputs.update(shapes_of_input(layer))
         elif _reads_data(layer):
             inputs.update((top, _shape_of_images(layer, top, layers)) for top in layer.top)
         for bottom in layer.bottom:
@@ -116,10 +101,8 @@ def _shape_of_images(reader: LayerParameter, top: str, layers: list[LayerParamet
 def _channels(blob: str, layers: list[LayerParameter]) -> int:
     """Return the channels that the filters of the first convolution of a blob have; 0 where there is none."""
     for layer in layers:
-        if blob in layer.bottom and layer.type == "Convolution" and layer.blobs:
-            shape = layer.blobs[0]
-            channels = shape.shape.dim[1] if len(shape.shape.dim) > 1 else shape.channels
-            return channels * layer.convolution_param.group
+        if blob in layer.bottom and (channels := channels_read(layer, layer_class(layer.type))):
+            return channels
     return 0
 
 

@@ -12,7 +12,7 @@ from netspec.layers.base import Layer
 from netspec.run.chains import chains, together
 from netspec.run.in_place import Memory, is_overwritten, run_overwritten
 from netspec.run.segments import Segment, rows
-from netspec.run.walk import Result, Step, Values, Visit, walk
+from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
 
 class Eager:
@@ -32,7 +32,7 @@ class Eager:
         learns: bool = False,
     ) -> None:
         self._plan, self._layers, self._exact = plan, list(layers), exact
-        self._losses = [tuple((j, w) for j, w in enumerate(row) if w) for row in loss_weights]
+        self._losses = losses_of(loss_weights)
         self._last_uses = last_uses(plan)
         self.overwritten = [is_overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
         apart = self._apart()

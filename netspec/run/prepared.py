@@ -33,7 +33,7 @@ from netspec.layers.reading import changes_itself
 from netspec.process.heap import give_back_freed_memory
 from netspec.run.fold import absorbed_by, roles_of
 from netspec.run.shapes import fitted
-from netspec.run.walk import Result, Step, Values, walk
+from netspec.run.walk import Result, Step, Values, losses_of, walk
 
 PROGRAMS = 64  # kept for a net: pyramids of images need one for each size
 RUNS = 4  # times what one run needs: so much may programs keep together, in bytes
@@ -79,7 +79,7 @@ class Prepared:
         self.passes = frozenset(passes)
         self._plan, self._layers, self._exact = plan, list(layers), exact
         self._device = layers[0].context.device if len(layers) else None
-        self._losses = [tuple((j, w) for j, w in enumerate(row) if w) for row in loss_weights]
+        self._losses = losses_of(loss_weights)
         self._sources = [
             Step(i, layer.run, (), node.tops, self._losses[i])
             for i, (node, layer) in enumerate(zip(plan.nodes, self._layers, strict=True))

@@ -23,6 +23,7 @@ from netspec.graph.plan import Plan
 from netspec.layers.base import Layer
 from netspec.layers.gradients import gradient_from_memory, gradient_reads
 from netspec.layers.training import Backward, Diff, Forward, Kernels, Learning, has_kernels, kernels, recorded
+from netspec.run.walk import losses_of
 
 LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
 Values = list[Any]  # by value number, a tensor or None
@@ -62,7 +63,7 @@ def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int
 class _Prepared:
     """The kernels of all layers for one set of shapes, and what they hold."""
 
-    forward: list[tuple[Forward, tuple[int, ...], tuple[int, ...], list[tuple[int, float]]]]
+    forward: list[tuple[Forward, tuple[int, ...], tuple[int, ...], tuple[tuple[int, float], ...]]]
     backward: list[tuple[Backward, tuple[int, ...], tuple[int, ...]]]
     start: Values  # the gradients that are there before the backward pass: those of the losses
     blobs: list[torch.Tensor]
@@ -95,7 +96,7 @@ class TrainingStep:
         overwritten: Sequence[bool],
         weighted: Callable[[torch.Tensor, float], torch.Tensor],
     ) -> None:
-        self._plan, self._layers, self._loss_weights = plan, list(layers), loss_weights
+        self._plan, self._layers, self._loss_of = plan, list(layers), losses_of(loss_weights)
         self._overwritten, self._weighted = overwritten, weighted
         self._sources = [i for i, node in enumerate(plan.nodes) if not node.bottoms and not len(layers[i].blobs)]
         self._hooks: list[Any] = [
@@ -212,12 +213,11 @@ class TrainingStep:
         made.backward.reverse()
         return made
 
-    def _losses(self, i: int, layer: Layer, made: _Prepared) -> list[tuple[int, float]]:
+    def _losses(self, i: int, layer: Layer, made: _Prepared) -> tuple[tuple[int, float], ...]:
         """Note the gradients of a layer's losses; return which of its tops they are, and their weights."""
-        found = [(j, weight) for j, weight in enumerate(self._loss_weights[i]) if weight]
-        for j, weight in found:
+        for j, weight in self._loss_of[i]:
             made.start[self._tops(i)[j]] = torch.full(layer.top_shapes[j], weight)
-        return found
+        return self._loss_of[i]
 
     def _tops(self, i: int) -> tuple[int, ...]:
         """Return the values that layer i makes; a loss may have a top without a name."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -41,6 +41,14 @@ class Runner(Protocol):
 
 
 Visit = Callable[[Step, list[torch.Tensor]], Any]  # runs a step on its bottoms; returns what it returns
+
+
+Losses = list[tuple[tuple[int, float], ...]]  # by layer: the tops that are losses, by their place, and their weights
+
+
+def losses_of(loss_weights: Sequence[Sequence[float]]) -> Losses:
+    """Return which tops are losses, where ``loss_weights[i][j]`` is the loss weight of layer i's top j."""
+    return [tuple((j, weight) for j, weight in enumerate(row) if weight) for row in loss_weights]
 
 
 def walk(steps: Iterable[Step], values: Values, exact: str, visit: Visit | None = None) -> torch.Tensor | None:

@@ -56,6 +56,7 @@ class Python(Layer):
     not_exported = "it runs Python code of its own"
     bottoms = (0, None)
     tops = (0, None)
+    takes_shapes = True  # where its code must not run
     promises = False  # as in Caffe, the code may reshape its tops in forward
 
     @override

@@ -50,6 +50,13 @@ class Convolution(SlidingFilter):
     same_tops = True
     traceable = True
 
+    @staticmethod
+    def channels_read(param: Any) -> int:
+        """Return the channels of the bottoms that the filters in a LayerParameter have."""
+        filters = param.blobs[0]
+        channels = filters.shape.dim[1] if len(filters.shape.dim) > 1 else filters.channels
+        return channels * param.convolution_param.group
+
     @override
     def setup(self) -> None:
         self.read_geometry()
