@@ -69,27 +69,25 @@ def caffe_names() -> frozenset[str]:
 
 
 if TYPE_CHECKING:
-    from netspec.proto.caffe_pb2 import (
-        BlobProto,
-        BlobProtoVector,
-        BlobShape,
-        Datum,
-        FillerParameter,
-        LayerParameter,
-        NetParameter,
-        NetState,
-        NetStateRule,
-        ParamSpec,
-        Phase,
-        SolverParameter,
-        SolverState,
-        TransformationParameter,
-        V0LayerParameter,
-        V1LayerParameter,
-    )
+    from netspec.proto import caffe_pb2  # a stub; import-linter knows it as part of the package
 
+    BlobProto = caffe_pb2.BlobProto
+    BlobProtoVector = caffe_pb2.BlobProtoVector
+    BlobShape = caffe_pb2.BlobShape
+    Datum = caffe_pb2.Datum
+    FillerParameter = caffe_pb2.FillerParameter
+    LayerParameter = caffe_pb2.LayerParameter
+    NetParameter = caffe_pb2.NetParameter
+    NetState = caffe_pb2.NetState
+    NetStateRule = caffe_pb2.NetStateRule
+    ParamSpec = caffe_pb2.ParamSpec
+    SolverParameter = caffe_pb2.SolverParameter
+    SolverState = caffe_pb2.SolverState
+    TransformationParameter = caffe_pb2.TransformationParameter
+    V0LayerParameter = caffe_pb2.V0LayerParameter
+    V1LayerParameter = caffe_pb2.V1LayerParameter
     CaffeMessage = Any  # a message of any kind, its fields and enums included
-    PhaseValue = Phase.ValueType
+    PhaseValue = caffe_pb2.Phase.ValueType
 
 else:
     CaffeMessage = Message

@@ -9,11 +9,11 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from netspec.pycaffe import logs
+from netspec.pycaffe.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from netspec.pycaffe.interface import *  # noqa: F403
 
-__version__ = "1.0.0"  # of the Caffe whose interface this is
 TRAIN, TEST = 0, 1
 
 _WITHOUT_TORCH = {"NetSpec": "net_spec", "layers": "net_spec", "params": "net_spec", "to_proto": "net_spec"}

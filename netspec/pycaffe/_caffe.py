@@ -3,7 +3,6 @@
 from netspec.layers import layer_types as layer_type_list
 from netspec.layers.utility.live_blobs import Blob, BlobVec
 from netspec.layers.utility.pycaffe_shim import Layer
-from netspec.pycaffe import __version__
 from netspec.pycaffe.logs import init_log
 from netspec.pycaffe.logs import log_message as log
 from netspec.pycaffe.mode import (
@@ -29,3 +28,4 @@ from netspec.pycaffe.solver import (
     Solver,
     get_solver,
 )
+from netspec.pycaffe.version import __version__

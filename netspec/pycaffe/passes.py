@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -208,18 +208,18 @@ class Passes:
         if self._prepares and (start, end) == (0, len(self._layers) - 1) and not self._has_hooks():
             return self._forward_prepared()
         with one_thread() if any(self._has_kernels) else nullcontext():
-            loss = walk(self._steps(start, end), {}, self.net.options.exact)
+            loss = walk(self._steps("forward", range(start, end + 1)), {}, self.net.options.exact)
         return torch.zeros((), device=self.net.device) if loss is None else loss
 
-    def _steps(self, start: int, end: int) -> Iterator[Step]:
-        """Yield the passes of layers through memory, and what hooks do before and after them."""
-        before, after = self.hooks["before_forward"], self.hooks["after_forward"]
-        for i in range(start, end + 1):
-            for hook in before:
+    def _steps(self, which: str, numbers: Iterable[int]) -> Iterator[Step]:
+        """Yield the forward or backward passes of layers through memory, and what hooks do before and after them."""
+        run = self._forward if which == "forward" else self._backward
+        for i in numbers:
+            for hook in self.hooks[f"before_{which}"]:
                 yield Step(i, partial(hook, i), (), ())
-            losses = tuple((j, weight) for j, (_, weight) in enumerate(self._losses[i]))
-            yield Step(i, partial(self._forward, i), (), (), losses)
-            for hook in after:
+            losses = tuple((j, weight) for j, (_, weight) in enumerate(self._losses[i])) if which == "forward" else ()
+            yield Step(i, partial(run, i), (), (), losses)
+            for hook in self.hooks[f"after_{which}"]:
                 yield Step(i, partial(hook, i), (), ())
 
     def _has_hooks(self) -> bool:
@@ -275,16 +275,7 @@ class Passes:
         """
         self.upload()
         with one_thread() if any(self._has_kernels) else nullcontext():
-            self._backward_by_layers(start, end)
-
-    def _backward_by_layers(self, start: int, end: int) -> None:
-        for i in range(start, end - 1, -1):
-            for hook in self.hooks["before_backward"]:
-                hook(i)
-            if self.net.backward_plan.layers[i]:
-                self._backward(i)
-            for hook in self.hooks["after_backward"]:
-                hook(i)
+            walk(self._steps("backward", range(start, end - 1, -1)), {}, self.net.options.exact)
 
     def reshape(self) -> None:
         """Give every blob the shape that follows from those of the inputs, and compute nothing."""
@@ -416,6 +407,8 @@ class Passes:
         return any(top is blob for top in self.tops[i])
 
     def _backward(self, i: int) -> None:
+        if not self.net.backward_plan.layers[i]:
+            return
         layer, bottoms, tops = self._layers[i], self.bottoms[i], self.tops[i]
         wanted = self.net.backward_plan.bottoms[i]
         if isinstance(layer, Python):

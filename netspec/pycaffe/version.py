@@ -1,0 +1,3 @@
+"""The Caffe whose interface this is."""
+
+__version__ = "1.0.0"
