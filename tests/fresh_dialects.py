@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator
+from copy import copy
 
 import pytest
 
@@ -10,12 +11,18 @@ from netspec.proto.dialect import files
 from netspec.proto.dialect import registry as dialect
 
 
+def keep_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let what is registered from now on be forgotten afterwards."""
+    for name in ("_LAYERS", "_OWNERS", "_REPLACING", "_everywhere"):
+        monkeypatch.setattr(registry, name, copy(getattr(registry, name)))
+
+
 def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Let a test use dialects; switch them off when it is done."""
     assert dialect.active() == []
     files.announce_known()
     monkeypatch.setattr(dialect, "_known", dict(dialect._known))
-    monkeypatch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
+    keep_registry(monkeypatch)
     yield
     for name in dialect.active():
         dialect.deactivate(name)

@@ -2,9 +2,11 @@
 
 A prototxt that uses what Caffe does not have switches on the dialects that have it: netspec's own (the files in this
 folder), and those that installed packages offer (entry points of the group ``netspec.dialects``). ``--plugin FILE.py``
-on the command line, or ``netspec.use_dialect("FILE.py")``, adds one from a file. A dialect is on for the whole process.
-Where several have one name, the one is taken of which the file has most; a layer type alone that several have is an
-error, and ``--plugin NAME`` says which is meant.
+on the command line, or ``netspec.use_dialect("FILE.py")``, adds one from a file, for every net of the process. The
+fields that dialects add are known to the whole process from then on, since protobuf has one schema in it; layers in the
+place of Caffe's are those of the nets that use the dialect (BuildOptions.dialects). Where several have one name, the
+one is taken of which the file has most; a layer type alone that several have is an error, and ``--plugin NAME`` says
+which is meant.
 
 To write one, put this into a file, say ``doubling.py``, and pass ``--plugin doubling.py``::
 
@@ -41,7 +43,8 @@ fork, new fields of Caffe's messages in ``extend``; one plain string. A layer is
 (netspec/layers/base.py);
 ``@register`` has its type and the fields of LayerParameter that it reads: a net warns of fields that no layer reads.
 ``@register("Dropout", ..., replaces=Dropout)`` puts a subclass in the place of one of Caffe's layers, to honor a
-field that the fork added to it. To offer a dialect with a package, name its module in that package's pyproject.toml::
+field that the fork added to it, in nets that use the dialect. To offer a dialect with a package, name its module in
+that package's pyproject.toml::
 
     [project.entry-points."netspec.dialects"]
     doubling = "mypackage.doubling"
@@ -63,7 +66,8 @@ def use_dialect(name: str | Path) -> None:
     Does nothing where it is there already. Raises SpecError where there is no such dialect, its file has a fault, or
     Caffe or another dialect has one of its fields or layer types.
     """
-    from netspec.layers.registry import run_dialects  # it needs torch
+    from netspec.layers.registry import use_everywhere  # it needs torch
 
-    switch_on(find_file(name))
-    run_dialects()
+    file = find_file(name)
+    switch_on(file)
+    use_everywhere(file.name)

@@ -25,7 +25,7 @@ class BuildOptions:
     these gradients. With ``compiled``, torch.compile makes functions of those layers that it can follow.
     ``passes`` are those of netspec/graph/steps.py that a net of phase TEST may use when it runs without gradients.
     Weights must have every layer of the net if ``strict``. The net may need ``limit`` bytes of memory (None: what there
-    is on its device).
+    is on its device). ``dialects`` are those of Caffe's forks that the net uses; what its text says is added.
     """
 
     device: str = "cpu"
@@ -45,6 +45,7 @@ class BuildOptions:
     compiled: bool = False
     strict: bool = False
     limit: int | None = None
+    dialects: Collection[str] = ()
 
     def __post_init__(self) -> None:
         check_choice(self.exact)

@@ -6,16 +6,22 @@ import importlib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, TypeVar
 
 from netspec.errors import SpecError, Where, did_you_mean
+from netspec.graph.options import BuildOptions
 from netspec.layers.base import Layer
 from netspec.proto.dialect.files import DialectFile, announce_known, find_file, known_files, switch_on, waiting
 from netspec.proto.dialect.registry import OWN_LAYER, advice_for, deactivate, dialects_with_type
-from netspec.proto.schema import LayerParameter
+from netspec.proto.dialect.used import dialects_in
+from netspec.proto.schema import LayerParameter, NetParameter
 
 _LAYERS: dict[str, type[Layer]] = {}
+_OWNERS: dict[str, str] = {}  # layer type -> the dialect that has it; Caffe's own are not here
+_REPLACING: dict[str, dict[str, type[Layer]]] = {}  # layer type of Caffe's -> dialect -> class
+_everywhere: set[str] = set()  # dialects that count for every net of the process: a user asked for them
+_loading = ""  # the dialect whose file is run now
 L = TypeVar("L", bound=type[Layer])
 
 
@@ -24,25 +30,46 @@ def register(type_name: str, *reads: str, replaces: type[Layer] | None = None) -
 
     ``reads`` are the fields of LayerParameter that are the layer's own, e.g. ``"pooling_param"``, and what a dialect
     adds to them, e.g. ``"pooling_param.extra"``; a net warns of all others (netspec/net/ignored_fields.py). With
-    ``replaces`` a dialect's subclass takes the place of the class that has the type, to honor such an addition.
+    ``replaces`` a dialect's subclass takes the place of the class that has the type, to honor such an addition, in nets
+    that use the dialect.
     """
 
     def add(cls: L) -> L:
         assert _LAYERS.get(type_name) is replaces, f"layer type {type_name} registered twice"
         cls.type = type_name
         cls.reads = frozenset(reads)
-        _LAYERS[type_name] = cls
+        if replaces is None:
+            _LAYERS[type_name] = cls
+            _OWNERS.update({type_name: _loading} if _loading else {})
+        else:
+            _REPLACING.setdefault(type_name, {})[_loading or cls.__module__.rpartition(".")[2]] = cls
         return cls
 
     return add
 
 
-def layer_class(type_name: str) -> type[Layer] | None:
-    """Return the class registered for a type, or None.
+def dialects_of(net: NetParameter) -> frozenset[str]:
+    """Return the dialects that count for a net: those whose fields and layer types it has, and those for every net."""
+    types = {layer.type for layer in net.layer if layer_class(layer.type)}
+    found = {*_everywhere, *(_OWNERS[each] for each in types if each in _OWNERS)}
+    return frozenset(found.union(*(dialects_in(layer) for layer in net.layer)) if _REPLACING else found)
+
+
+def use_everywhere(dialect: str) -> None:
+    """Let the layers of a dialect count for every net that this process builds from now on."""
+    run_dialects()
+    _everywhere.add(dialect)
+
+
+def layer_class(type_name: str, dialects: Collection[str] = ()) -> type[Layer] | None:
+    """Return the class registered for a type, or None; of ``dialects``, one may have a class in place of Caffe's.
 
     A type that one known dialect has switches that dialect on.
     """
     run_dialects()
+    for dialect in dialects:
+        if cls := _REPLACING.get(type_name, {}).get(dialect):
+            return cls
     if type_name not in _LAYERS:
         announce_known()
         dialects = [name for name in dialects_with_type(type_name) if name in known_files()]
@@ -52,21 +79,22 @@ def layer_class(type_name: str) -> type[Layer] | None:
     return _LAYERS.get(type_name)
 
 
-def class_of(param: LayerParameter, allow_python: bool = False) -> type[Layer] | None:
-    """Return the class of a layer, or None: that of its type.
+def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type[Layer] | None:
+    """Return the class of a layer, or None: that of its type, where ``options.dialects`` have no other.
 
     A Python layer that a dialect knows by its module and class, ``"rpn.proposal_layer.ProposalLayer"``, is the
     dialect's, unless Python code is allowed to run and its module is there.
     """
     if param.type != "Python":
-        return layer_class(param.type)
+        return layer_class(param.type, options.dialects if options else ())
     python: Any = layer_class("Python")
     known = layer_class(f"{param.python_param.module}.{param.python_param.layer}")
-    return python if known is None or (allow_python and python.is_there(param)) else known
+    return python if known is None or (options and options.allow_python and python.is_there(param)) else known
 
 
 def run_dialects() -> None:
     """Register the layers of the dialects that were switched on. Raises SpecError for one that cannot be loaded."""
+    global _loading
     while waiting:
         file, dialect = waiting.pop(0)
         module = file.module or f"netspec_dialect_{file.name}"
@@ -77,10 +105,13 @@ def run_dialects() -> None:
                 if cls := _LAYERS.get(layer_type):
                     message = f'layer type "{layer_type}" already exists, from {cls.__module__}'
                     raise SpecError(message, Where(str(file.path)))
+            _loading = file.name
             _run(file, module)
         except SpecError:
             deactivate(dialect.name)
             raise
+        finally:
+            _loading = ""
 
 
 def _run(file: DialectFile, name: str) -> None:

@@ -21,6 +21,7 @@ from netspec.graph.plan import Backward, Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.base import Layer, Shape, shape_string
 from netspec.layers.context import Context, Random
+from netspec.layers.registry import dialects_of
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.run.eager import last_uses
@@ -44,11 +45,12 @@ class Assembly:
     """The layers of a plan, ``layers[i]`` of its node i; those with errors are missing, if errors are collected.
 
     ``shapes`` are those of the blobs, ``loss_weights[i][j]`` is the weight of layer i's top j; ``backward`` says what
-    needs backward computation, None where a layer is missing.
+    needs backward computation, None where a layer is missing. ``options`` are those given, with the net's dialects.
     """
 
     def __init__(self, plan: Plan, options: BuildOptions) -> None:
-        self._plan, self._options, self._report = plan, options, plan.source.report
+        self._plan, self._report = plan, plan.source.report
+        self.options = replace(options, dialects=tuple(sorted({*options.dialects, *dialects_of(plan.net)})))
         self.layers: dict[int, Layer] = {}
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
@@ -73,14 +75,14 @@ class Assembly:
         node, param = self._plan.nodes[i], self._plan.net.layer[i]
         tie = _Tie(self._plan, i, partial(self._take, i))
         log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
-        cls = class_of(param, self._options.allow_python)
+        cls = class_of(param, self.options)
         if cls is None:
             self._report(SpecError(unknown_type(node.type), tie.at("type")))
             return None
         if any(v not in self._values for v in node.bottoms):
             return None  # an error upstream was reported
         phase = self._plan.net.state.phase
-        context = Context(phase, self._options, self.random, tie.at, self._report, tie.created, tie.take)
+        context = Context(phase, self.options, self.random, tie.at, self._report, tie.created, tie.take)
         try:
             layer = cls(param, [self._values[v] for v in node.bottoms], context)
         except SpecError as fault:
@@ -122,7 +124,7 @@ class Assembly:
         """
         if (
             self._device.type == "meta"
-            or self.need.total + size <= (limit := limit_on(self._device, self._options.limit)) // MUCH
+            or self.need.total + size <= (limit := limit_on(self._device, self.options.limit)) // MUCH
         ):
             return
         if not self._surveyed:
@@ -137,11 +139,11 @@ class Assembly:
     def _survey(self) -> Need:
         """Return what the net needs, from the shapes that are known so far, without memory, data or Python layers."""
         seen = replace(
-            self._options,
+            self.options,
             device="meta",
             open_data=False,
             write_files=False,
-            given_shapes={**self._options.given_shapes, **self.shapes},
+            given_shapes={**self.options.given_shapes, **self.shapes},
             allow_python=False,
         )
         silent = replace(self._plan, source=self._plan.source.telling(lambda fault: None))

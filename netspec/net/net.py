@@ -62,7 +62,6 @@ class Net(torch.nn.Module):
         self.param = plan.net
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
-        self.options = options
         self.device = torch.device(options.device)
         self.keep: str | Iterable[str] = ()
         self._kept_of: dict[str | tuple[str, ...], frozenset[int]] = {}  # by ``keep``, as it was last
@@ -70,6 +69,7 @@ class Net(torch.nn.Module):
         if options.exact == ALL and self.device.type == "cpu" and (said := other_kernels()):
             log.warning("net.cpp:53", said)
         made = Assembly(plan, options)
+        self.options = made.options
         self.layers: Any = torch.nn.ModuleList(made.layers.values())
         self.shapes, self.loss_weights, self.learnable = made.shapes, made.loss_weights, made.learnable
         self.need, self.random = made.need, made.random

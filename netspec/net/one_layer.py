@@ -16,6 +16,7 @@ from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, class_of, unknown_type
 from netspec.layers.base import Shape
 from netspec.layers.context import nowhere
+from netspec.layers.registry import dialects_of
 from netspec.net.net import Array
 from netspec.proto.reader import read_text
 from netspec.proto.schema import LayerParameter, NetParameter, phase_of
@@ -78,7 +79,7 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
     net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Place(place.where), (place,)))
     (param,) = net.layer
     at = partial(source.at, 0, layer=param.name, type=param.type)
-    cls = class_of(param)
+    cls = class_of(param, replace(context.options, dialects=tuple(sorted(dialects_of(net)))))
     if cls is None:
         raise SpecError(unknown_type(param.type), at("type"))
     param.bottom.extend(f"bottom{i}" for i in range(len(param.bottom), len(shapes)))

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from netspec.layers import registry
+from fresh_dialects import keep_registry
 from netspec.proto.dialect import files as dialect_files
 from netspec.proto.dialect import registry as dialect
 
@@ -18,7 +18,7 @@ def _no_dialect_is_left_on() -> None:
 @pytest.fixture(autouse=True, scope="module")
 def _leave_no_dialect() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(registry, "_LAYERS", dict(registry._LAYERS))
+        keep_registry(patch)
         yield
     for name in dialect.active():
         dialect.deactivate(name)
