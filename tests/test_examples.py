@@ -16,7 +16,8 @@ from paths import ROOT, shared
 
 pytestmark = pytest.mark.slow
 
-EXAMPLES = sorted(ROOT.glob("examples/*.py"))
+# tests/test_ros_node.py runs the node.
+EXAMPLES = sorted(path for path in ROOT.glob("examples/*.py") if path.stem != "ros_node")
 
 
 @pytest.fixture(scope="module", params=EXAMPLES, ids=lambda path: path.stem)

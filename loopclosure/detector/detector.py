@@ -230,6 +230,10 @@ class LoopDetector:
         """The descriptors of all frames (N, views D), of unit length for cosine."""
         return self._frames.rows().copy()
 
+    def local_features(self, frame: int) -> LocalFeatures:
+        """Return the points that the geometric check found in a frame, to measure a loop by."""
+        return self._frames.local[frame]
+
     def decided(self, loops: Sequence[LoopResult], threshold: float | None) -> None:
         """Take loops that were found with all frames in view, and a threshold for frames to come."""
         self.loops = list(loops)
