@@ -231,7 +231,7 @@ class Passes:
             self.net.prepared is not None
             and self.net.device.type == "cpu"
             and not any(self._records)
-            and not any(map(any, self._kept))
+            and not any(self._kept)
             and not any(isinstance(layer, Python) for layer in self._layers)
             and AUTOMATIC not in self.names
             and not self._overwrites_shared()

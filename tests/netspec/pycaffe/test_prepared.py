@@ -8,6 +8,7 @@ import pytest
 import netspec.pycaffe as caffe
 
 FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
+RELU = 'layer { name: "relu" type: "ReLU" bottom: "data" top: "relu" }'
 NET = f"""
 layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ dim: 2 dim: 8 dim: 40 dim: 40 }} }} }}
 layer {{ name: "conv" type: "Convolution" bottom: "data" top: "conv"
@@ -93,3 +94,10 @@ def test_a_part_of_a_net_reads_what_was_written_to_blobs(net: caffe.Net) -> None
     net.forward()
     net.blobs["ip"].data[...] = 0
     np.testing.assert_allclose(net.forward(start="prob")["prob"], 0.2, rtol=1e-6)
+
+
+def test_constants_are_kept_from_pass_to_pass(net_of: Callable[..., caffe.Net]) -> None:
+    data = 'dummy_data_param { shape { dim: 2 dim: 3 } data_filler { type: "constant" value: 2 } }'
+    net = net_of(f'layer {{ name: "data" type: "DummyData" top: "data" {data} }}\n{RELU}')
+    net.blobs["data"].data[...] = -1  # as in Caffe: the layer wrote once, and writes no more
+    assert net.forward()["relu"].tolist() == [[0, 0, 0]] * 2
