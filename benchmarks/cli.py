@@ -60,7 +60,6 @@ def parser() -> argparse.ArgumentParser:
     p = commands.add("growth", _growth, "time and memory of more and more layers, pairs, frames, ...")
     p.add_argument("kind", choices=KINDS, help="what grows")
     p.add_argument("sizes", type=int, nargs="*", metavar="SIZE", help="how many of it, several times (default: usual)")
-    p.add_argument("--without-others", action="store_true", help="leave out FAISS, which would be installed")
     p.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
     p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
     p = commands.add("feeding", _feeding, "how long trainings wait for data from databases and image files")
@@ -150,16 +149,14 @@ def _feeding(arguments: argparse.Namespace) -> None:
 
 
 def _growth(arguments: argparse.Namespace) -> None:
-    from benchmarks import environment, growth, report
+    from benchmarks import growth, report
 
-    kind = growth.KINDS[arguments.kind]
-    yardsticks = environment.python() if kind.beside and not arguments.without_others else None
-    rows = growth.measure(arguments.kind, arguments.sizes or kind.sizes, yardsticks)
+    rows = growth.measure(arguments.kind, arguments.sizes or growth.KINDS[arguments.kind].sizes)
     print(growth.table(rows))
     if arguments.plot:
         growth.draw(arguments.plot, rows)
     if arguments.json:
-        report.write_json(arguments.json, rows, report.machine(yardsticks))
+        report.write_json(arguments.json, rows, report.machine(None))
 
 
 def _start(arguments: argparse.Namespace) -> None:

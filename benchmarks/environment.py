@@ -14,7 +14,6 @@ PACKAGES = (
     "opencv-python-headless==4.12.0.88",
     "onnxruntime>=1.20",
     "openvino>=2024.6",
-    "faiss-cpu>=1.9",
 )  # the last OpenCV 4 as a wheel
 
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -37,8 +38,9 @@ DATA = 'layer { name: "data" type: "Input" top: "x0" input_param { shape { dim: 
 LOSS = """
 layer {{ name: "loss" type: "Reduction" bottom: "x{i}" top: "loss" loss_weight: 1 }}"""
 TRAINED = "small/siamese_resnet27_256"
-DIMENSIONS = 256
-QUERIES, SINGLE = 500, 50  # frames searched at once, and one by one
+WALK = 300  # frames, whose descriptors are perturbed to the number wanted
+QUERIES, BLOCK = 50, 4096  # frames searched for, and added at a time
+AGAIN = 0.3  # of the difference of any two descriptors: how far a frame seen again is from itself
 WORDS, WORDS_SEEN = 2000, 150
 PAIRS = 2000  # that each number of workers converts
 
@@ -128,59 +130,58 @@ def pairs(size: int) -> Found:
 
 
 def frames(size: int) -> Found:
-    """Search the 10 most similar of ``size`` descriptors, for many frames at once and for one as a detector does."""
-    from loopclosure.descriptors.similarity import top_k
+    """Search ``size`` descriptors of the default net as a detector does, exactly and by FAISS."""
     from loopclosure.detector.detector import LoopDetector
+    from loopclosure.index.index import open_index
 
-    rows, queries = descriptors(size)
-    start = time.process_time()
-    top_k(queries, rows, 10)
-    found = {"top 10 of many frames, ms per frame": 1e3 * (time.process_time() - start) / len(queries)}
-    detector = LoopDetector()
-    for row in rows:
-        detector.add_descriptor(row)
-    start = time.process_time()
-    for row in queries[:SINGLE]:
-        detector.add_descriptor(row)
-    found["detector, ms per frame"] = 1e3 * (time.process_time() - start) / SINGLE
+    base = described_walk(min(WALK, max(2, size)))
+    random = np.random.default_rng(0)
+    rows = np.concatenate([perturbed(base, min(BLOCK, size - k), random) for k in range(0, size, BLOCK)])
+    seen_again = rows[random.integers(0, size, QUERIES)] + AGAIN * _differences(base, QUERIES, random)
+    best: dict[str, list[list[int]]] = {}
+    found: Found = {}
+    for name in ("exact", "faiss") if find_spec("faiss") else ("exact",):
+        detector = LoopDetector(index=open_index(name, "euclidean"))
+        start = time.process_time()
+        no_poses = {"stamps": np.full(size, np.nan), "poses": np.full((size, 7), np.nan)}
+        detector.take_session((rows[k : k + BLOCK] for k in range(0, size, BLOCK)), no_poses, None)
+        found[f"{name}, adding, us per frame"] = 1e6 * (time.process_time() - start) / size
+        detector.begin_session()
+        start = time.process_time()
+        results = [detector.add_descriptor(row) for row in seen_again]
+        found[f"{name}, ms per frame"] = 1e3 * (time.process_time() - start) / QUERIES
+        best[name] = [[number for number, _ in result.candidates] for result in results]
+    if "faiss" in best:
+        pairs = list(zip(best["exact"], best["faiss"], strict=True))
+        found["FAISS, share of best matches found"] = float(np.mean([a[0] == b[0] for a, b in pairs]))
+        found["FAISS, share of best five found"] = float(np.mean([len({*a} & {*b}) / len(a) for a, b in pairs]))
     return found
 
 
-def faiss(size: int) -> Found:
-    """Search the same with FAISS: exactly, and with its graph of neighbors, HNSW."""
-    faiss = import_module("faiss")
+def described_walk(frames: int) -> np.ndarray:
+    """Return the descriptors of a synthetic walk by the default net, less their mean and at most 256 numbers long."""
+    from lmdb_build.walk.sequence import Walk, write_walk
+    from loopclosure.descriptors.whitening import learn_whitening
+    from loopclosure.detector.map import COMPONENTS
+    from loopclosure.places.frames import read_bgr
+    from netspec.features.shipped import default
 
-    faiss.omp_set_num_threads(1)
-    rows, queries = descriptors(size)
-    exact, graph = faiss.IndexFlatL2(DIMENSIONS), faiss.IndexHNSWFlat(DIMENSIONS, 32)
-    exact.add(rows)
-    start = time.process_time()
-    graph.add(rows)
-    added = time.process_time() - start
-    start = time.process_time()
-    right = exact.search(queries, 10)[1]
-    searched = time.process_time() - start
-    single = _least(lambda: [exact.search(row[None], 10) for row in queries[:SINGLE]], 1) / SINGLE
-    start = time.process_time()
-    nearly = [graph.search(row[None], 10)[1][0, 0] for row in queries]
-    walked = time.process_time() - start
-    return {
-        "FAISS, exact, many frames, ms per frame": 1e3 * searched / len(queries),
-        "FAISS, exact, ms per frame": 1e3 * single,
-        "FAISS, HNSW, adding and searching, ms per frame": 1e3 * (added / size + walked / len(queries)),
-        "FAISS, HNSW, share of best matches found": float(np.mean(right[:, 0] == nearly)),
-    }
+    describe = default()
+    with TemporaryDirectory(prefix="growth-") as folder:
+        walk = Walk(frames=frames, width=160, height=120, laps=1)
+        rows = np.array([describe(read_bgr(image)) for image in write_walk(Path(folder) / "walk", walk)])
+    return learn_whitening(rows, COMPONENTS, power=0).project(rows)
 
 
-def descriptors(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit descriptors (size, 256) of places seen ten times each, and of some places seen again (500, 256)."""
-    random = np.random.default_rng(0)
-    places = random.standard_normal((max(1, size // 10), DIMENSIONS), np.float32)
-    rows = np.repeat(places, 10, axis=0)[:size]
-    rows = rows + 0.5 * random.standard_normal(rows.shape, np.float32)
-    queries = places[random.integers(0, len(places), QUERIES)]
-    queries = queries + 0.5 * random.standard_normal(queries.shape, np.float32)
-    return tuple(x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rows, queries))
+def perturbed(base: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
+    """Return ``count`` descriptors between neighbors of ``base`` (N, D), moved by half the difference of any two."""
+    share, at = random.random((count, 1), np.float32), random.integers(0, len(base) - 1, count)
+    return (1 - share) * base[at] + share * base[at + 1] + 0.5 * _differences(base, count, random)
+
+
+def _differences(base: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
+    i, j = random.integers(0, len(base), (2, count))
+    return base[i] - base[j]
 
 
 def places(size: int) -> Found:
@@ -197,7 +198,7 @@ def places(size: int) -> Found:
     online = FabMap(learn_tree(training, lower_bound=0), training)
     for seen in images(size):
         online.add(seen)
-    queries = images(SINGLE)
+    queries = images(QUERIES)
     online.locate(queries[0])  # puts the last image on the map
     spent = _least(lambda: [online.locate(seen) for seen in queries], 1)
     return {"locating, ms per image": 1e3 * spent / len(queries)}
@@ -229,38 +230,26 @@ def workers(size: int) -> Found:
 
 @dataclass(frozen=True)
 class Kind:
-    """Something that grows: what it is counted in, the usual sizes, and what measures one of them.
-
-    ``beside`` measures the same with another program, in the environment of the yardsticks.
-    """
+    """Something that grows: what it is counted in, the usual sizes, and what measures one of them."""
 
     unit: str
     sizes: tuple[int, ...]
     measure: Callable[[int], Found]
-    beside: str = ""
 
 
 KINDS: Mapping[str, Kind] = {
     "layers": Kind("layers", (125, 250, 500, 1000, 2000), layers),
     "batch": Kind("pairs per iteration", (1, 2, 4, 8, 16, 32, 64), batch),
     "pairs": Kind("pairs in an LMDB", (1000, 10_000, 100_000, 1_000_000), pairs),
-    "frames": Kind("frames", (1000, 10_000, 100_000), frames, "faiss"),
+    "frames": Kind("frames", (1000, 10_000, 100_000, 1_000_000), frames),
     "places": Kind("places", (1000, 3000, 10_000), places),
     "workers": Kind("workers", (1, 2), workers),
 }
-MEASURES = {**{name: kind.measure for name, kind in KINDS.items()}, "faiss": faiss}
 
 
-def measure(name: str, sizes: Sequence[int], yardsticks: str | None) -> list[Found]:
-    """Measure a kind at these sizes, one after the other; ``yardsticks`` is their Python, None leaves them out."""
-    kind, found = KINDS[name], []
-    for size in sizes:
-        row = _in_a_process(sys.executable, name, size)
-        if kind.beside and yardsticks:
-            beside = _in_a_process(yardsticks, kind.beside, size)
-            row |= {column: value for column, value in beside.items() if column not in row}
-        found.append({kind.unit: size, **row})
-    return found
+def measure(name: str, sizes: Sequence[int]) -> list[Found]:
+    """Measure a kind at these sizes, one after the other."""
+    return [{KINDS[name].unit: size, **_in_a_process(name, size)} for size in sizes]
 
 
 def table(rows: Sequence[Found]) -> str:
@@ -295,9 +284,10 @@ def draw(path: str, rows: Sequence[Found]) -> None:
     figure.savefig(path)
 
 
-def _in_a_process(python: str, name: str, size: int) -> Found:
-    words = [python, "-m", "benchmarks.growth", name, str(size)]
-    finished = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+def _in_a_process(name: str, size: int) -> Found:
+    words = [sys.executable, "-m", "benchmarks.growth", name, str(size)]
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # FAISS would take all
+    finished = subprocess.run(words, cwd=ROOT, env=one_thread, capture_output=True, text=True, check=False)
     if finished.returncode:
         last = (finished.stderr.strip().splitlines() or ["no message"])[-1]
         raise SpecError(f"{name} {size}: {last}")
@@ -338,7 +328,7 @@ def _number(value: float) -> str:
 def main() -> None:
     """Measure one size and print what was found, as JSON."""
     name, size = sys.argv[1], int(sys.argv[2])
-    print(json.dumps({**MEASURES[name](size), "memory, MB": _peak()}))
+    print(json.dumps({**KINDS[name].measure(size), "memory, MB": _peak()}))
 
 
 if __name__ == "__main__":

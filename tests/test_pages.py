@@ -36,6 +36,7 @@ SUPPOSED = {
     "docs/methods.md": "SEQUENCE net.pt2 A B",
     "docs/nets.md": "prototxt a.caffemodel b.caffemodel",
     "docs/paper.md": "prototxt",
+    "docs/robot.md": "drive.mp4",
     "docs/seeing.md": "train.log old_caffe.log solver.prototxt train_val.prototxt train_lmdb deploy.prototxt "
     "x.caffemodel a.png b.png FOLDER",
     "docs/training.md": "solver.prototxt train_val.prototxt train_lmdb train.log",
@@ -67,7 +68,7 @@ LESS = {
     "docs/how-to.md": {"--train 2000 --val 400": "--train 8 --val 4"},
     "docs/growth.md": {
         "pairs 1000 10000 100000 1000000": "pairs 10 20",
-        "frames 1000 10000 100000": "frames 10 20 --without-others",
+        "frames 1000 10000 100000 1000000": "frames 10 20",
         "places 1000 3000 10000": "places 10 20",
     },
     "docs/paper.md": {"--frames 250": "--frames 60", "--train 1600 --val 400": "--train 96 --val 50"},

@@ -157,7 +157,7 @@ def test_growth_builds_and_runs_nets_of_a_thousand_layers(capsys: pytest.Capture
 @pytest.mark.parametrize("kind", ["batch", "pairs", "frames", "places"])
 def test_growth_is_measured_kept_and_drawn(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plot, out = tmp_path / "growth.png", tmp_path / "growth.json"
-    words = ["growth", kind, "1", "30", "--without-others", "--plot", str(plot), "--json", str(out)]
+    words = ["growth", kind, "1", "30", "--plot", str(plot), "--json", str(out)]
     assert main(words) == 0
     assert len(capsys.readouterr().out.splitlines()) == 4
     assert plot.stat().st_size > 1000
