@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from typing_extensions import override
 
+from netspec.dialects._order import Reordered
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape
 from netspec.layers.targets import OnnxGraph, TorchCode
@@ -42,7 +43,7 @@ STACK = 0  # MergeCropParameter.MergeOp
 
 
 @register("Transpose", "transpose_param")
-class Transpose(Layer):
+class Transpose(Reordered):
     """Bring the axes into another order: axis i of the top is axis ``dim``[i] of the bottom.
 
     bottom[0]  any shape
@@ -58,20 +59,6 @@ class Transpose(Layer):
         if sorted(self.order) != list(range(axes)):
             message = f"found dim {self.order}, expected each of the {axes} axes 0 to {axes - 1} once"
             raise self.error(message, "transpose_param", "dim")
-
-    @override
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return [tuple(bottom_shapes[0][axis] for axis in self.order)]
-
-    @override
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        return data.permute(self.order).contiguous()
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Transpose", bottoms[0], perm=self.order)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("{x}.permute({order})", x=bottoms[0], order=tuple(self.order))
 
 
 @register("Reorg", "reorg_param")

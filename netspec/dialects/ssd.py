@@ -15,6 +15,7 @@ from netspec.dialects._annotated import AnnotatedData
 from netspec.dialects._detection import DetectionOutput
 from netspec.dialects._evaluate import DetectionEvaluate
 from netspec.dialects._multibox import MultiBoxLoss
+from netspec.dialects._order import Reordered
 from netspec.dialects._priors import PriorBox
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape
@@ -249,7 +250,7 @@ register("DetectionOutput", "detection_output_param")(DetectionOutput)
 
 
 @register("Permute", "permute_param")
-class Permute(Layer):
+class Permute(Reordered):
     """Bring the axes into another order: axis i of the top is axis ``order``[i] of the bottom; the others follow.
 
     bottom[0]  any shape
@@ -266,23 +267,6 @@ class Permute(Layer):
                 message = f"found axis {axis}, expected each of 0 to {axes - 1} at most once"
                 raise self.error(message, "permute_param", "order", i)
         self.order = given + [axis for axis in range(axes) if axis not in given]
-
-    @override
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        if len(bottom_shapes[0]) != len(self.order):
-            message = f"found a bottom of shape {bottom_shapes[0]}, expected {len(self.order)} axes as before"
-            raise self.error(message, "bottom")
-        return [tuple(bottom_shapes[0][axis] for axis in self.order)]
-
-    @override
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        return data.permute(self.order).contiguous()
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Transpose", *bottoms, perm=self.order)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call(f"{{x}}.permute({', '.join(map(str, self.order))})", x=bottoms[0])
 
 
 class _Normalized(torch.autograd.Function):

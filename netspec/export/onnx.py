@@ -18,7 +18,7 @@ from netspec.export.preprocess import Preprocess
 from netspec.export.shapes import Fixed, NetShapes, settled
 from netspec.files.whole_file import whole_file
 from netspec.layers.base import Layer
-from netspec.layers.exporting import write_onnx
+from netspec.layers.exporting import export
 from netspec.layers.learned import values_of
 from netspec.layers.targets import Sizes
 from netspec.net.net import Net
@@ -105,7 +105,7 @@ class _Writer:
         self._constants: dict[bytes, str] = {}
         self._blobs: dict[tuple[int, tuple[int, ...]], str] = {}  # by address and shape
         for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
-            tops = write_onnx(layer, _LayerGraph(self, i), *(self.values[v] for v in node.bottoms))
+            tops = export(layer, _LayerGraph(self, i), "ONNX", *(self.values[v] for v in node.bottoms))
             named = (tops,) if isinstance(tops, str) else tops
             self.values.update(zip(node.tops, named, strict=False))
 

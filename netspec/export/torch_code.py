@@ -12,7 +12,7 @@ from netspec.export.shapes import Fixed, NetShapes
 from netspec.export.source import MARK, Module, Program, Statement, mark
 from netspec.graph.fold import origins
 from netspec.layers.base import Layer
-from netspec.layers.exporting import write_torch
+from netspec.layers.exporting import export
 from netspec.layers.folding import passes_on
 from netspec.layers.targets import Sizes
 from netspec.net.net import Net
@@ -28,7 +28,7 @@ def write_program(net: Net, shapes: NetShapes) -> Program:
     for i, node in enumerate(plan.nodes):
         bottoms = [mark("v", collector.value[v]) for v in node.bottoms]
         layer_code = _LayerCode(collector, i)
-        tops = write_torch(net.layers[i], layer_code, *bottoms)
+        tops = export(net.layers[i], layer_code, "PyTorch", *bottoms)
         collector.add(i, node.tops, tops)
     collector.program.outputs = {name: collector.value[v] for name, v in plan.outputs.items()}
     return collector.program

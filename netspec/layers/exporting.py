@@ -23,20 +23,12 @@ class Exported(Protocol):
         ...
 
 
-def write_onnx(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
-    """Write a layer into an ONNX graph. Raises SpecError where it cannot be."""
-    write = offered(layer, "to_onnx")
+def export(layer: Layer, writer: OnnxGraph | TorchCode, target: str, *bottoms: str) -> str | Sequence[str]:
+    """Write a layer for ``ONNX`` or ``PyTorch``; return the values of its tops. Raises SpecError where it cannot be."""
+    write = offered(layer, "to_onnx" if target == "ONNX" else "to_torch")
     if write is None:
-        raise refusal(layer, "ONNX")
-    return write(graph, *bottoms)
-
-
-def write_torch(layer: Layer, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
-    """Write a layer as source for PyTorch. Raises SpecError where it cannot be."""
-    write = offered(layer, "to_torch")
-    if write is None:
-        raise refusal(layer, "PyTorch")
-    return write(code, *bottoms)
+        raise refusal(layer, target)
+    return write(writer, *bottoms)
 
 
 def refusal(layer: Layer, target: str, reason: str = "") -> SpecError:

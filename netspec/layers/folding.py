@@ -10,7 +10,7 @@ import torch
 
 from netspec.layers.base import Layer
 from netspec.layers.learned import values_of
-from netspec.layers.offers import offered
+from netspec.layers.offers import call, offered
 
 Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (C,) in double: y = scale x + shift
 
@@ -23,19 +23,16 @@ class Absorbed:
     blobs: tuple[torch.Tensor, ...]
 
 
-class IsAffine(Protocol):
-    """A layer that may only scale and shift the channels, axis 1, of its bottom."""
+class Folds(Protocol):
+    """What a layer can offer to those who fold a net; any part of it may be missing."""
+
+    passes_on: bool  # whether every top is the bottom, unchanged
+    absorbs: bool  # whether it can absorb, at its present settings, after its own work
+    absorbs_before: bool  # likewise, before it
 
     def as_affine(self) -> Affine | None:
-        """Return that map, None where it is another."""
+        """Return the map that scales and shifts the channels, axis 1, of its bottom, None where it is another."""
         ...
-
-
-class Absorbs(Protocol):
-    """A layer that can do such a map besides its own work: to its top after it, or to its bottom before it."""
-
-    absorbs: bool  # whether it can absorb at its present settings
-    absorbs_before: bool
 
     def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         """Return the layer that scales and shifts the channels of its top as well; in their precision."""
@@ -46,16 +43,9 @@ class Absorbs(Protocol):
         ...
 
 
-class PassesOn(Protocol):
-    """A layer that may hand on its bottom."""
-
-    passes_on: bool  # whether every top is the bottom, unchanged
-
-
 def as_affine(layer: Layer) -> Affine | None:
     """Return the map that a layer is, if it only scales and shifts the channels of its bottom."""
-    find = offered(layer, "as_affine")
-    return None if find is None else find()
+    return call(layer, "as_affine")
 
 
 def passes_on(layer: Layer) -> bool:

@@ -31,3 +31,9 @@ def _has(cls: type[Layer], name: str) -> bool:
 def offered(layer: Layer, name: str) -> Any:
     """Return an attribute that tells of a layer's forward pass, or does the same; None where its class has none."""
     return getattr(layer, name) if _has(type(layer), name) else None
+
+
+def call(layer: Layer, name: str, *arguments: Any) -> Any:
+    """Return what an offered method returns; None where the class has none."""
+    method = offered(layer, name)
+    return None if method is None else method(*arguments)

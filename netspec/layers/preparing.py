@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from netspec.layers.base import Layer
-from netspec.layers.offers import offered
+from netspec.layers.offers import call
 
 Kernel = Callable[..., Any]  # bottoms to a top, or to a tuple of tops
 
@@ -42,7 +42,11 @@ class Preparation:
 
 
 class Prepares(Protocol):
-    """A layer that has something better than to call ``forward`` again and again."""
+    """What a layer can offer to those who run it without gradients; any part of it may be missing."""
+
+    fresh: bool  # its one top is memory of its own, not a bottom's
+    any_layout: bool  # its kernel takes bottoms whose channels lie side by side (channels_last)
+    traceable: bool  # torch.compile can follow its forward pass: see netspec/run/segments.py
 
     def prepare(self, how: Preparation) -> Kernel | None:
         """Return what computes ``forward`` and then ``how.finish``, for bottoms of the present shapes.
@@ -53,25 +57,9 @@ class Prepares(Protocol):
         """
         ...
 
-
-class Facts(Protocol):
-    """What those who lay out memory ask; a layer that has none of these attributes promises nothing."""
-
-    fresh: bool  # its one top is memory of its own, not a bottom's
-    any_layout: bool  # its kernel takes bottoms whose channels lie side by side (channels_last)
-    traceable: bool  # torch.compile can follow its forward pass: see netspec/run/segments.py
-
-
-class Finishes(Protocol):
-    """A layer that maps number to number."""
-
     def finishing(self) -> Finish | None:
-        """Return the map, None where there is no function that does it in place."""
+        """Return the map from number to number that the layer is, None where no function does it in place."""
         ...
-
-
-class RunsWith(Protocol):
-    """A layer whose kernel can do the work of some that follow."""
 
     def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
         """Run this layer and, where one kernel does their work too, some of those that follow.
@@ -81,31 +69,24 @@ class RunsWith(Protocol):
         """
         ...
 
-
-class ScalesChannels(Protocol):
-    """A layer that may multiply each channel, axis 1, by a learned factor."""
-
     def channel_factors(self) -> tuple[torch.Tensor, torch.Tensor | None] | None:
-        """Return the factors and, where there are some, the biases added then; None where it does something else."""
+        """Return the factors of channels, axis 1, and the biases added then, None where it does something else."""
         ...
 
 
 def own_kernel(layer: Layer, how: Preparation) -> Kernel | None:
     """Return the kernel that a layer has for its present shapes, None where it has none of its own."""
-    prepare = offered(layer, "prepare")
-    return None if prepare is None else prepare(how)
+    return call(layer, "prepare", how)
 
 
 def finishing(layer: Layer) -> Finish | None:
     """Return the map from number to number that a layer is, where it can be done in place."""
-    find = offered(layer, "finishing")
-    return None if find is None else find()
+    return call(layer, "finishing")
 
 
 def channel_factors(layer: Layer) -> tuple[torch.Tensor, torch.Tensor | None] | None:
     """Return the learned factors and biases of channels, where to multiply and add them is all that a layer does."""
-    find = offered(layer, "channel_factors")
-    return None if find is None else find()
+    return call(layer, "channel_factors")
 
 
 def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
