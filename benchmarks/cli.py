@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from benchmarks.growth import KINDS
@@ -66,6 +67,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
     p.add_argument("--batch", type=int, default=4, help="items of a batch (default: 4)")
     p.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
+    p = commands.add("settings", _settings, "judge loopclosure's auto on drives whose loops are known")
+    _add_data(p)
+    p.add_argument("families", nargs="*", metavar="FAMILY", help="only the drives made of these (default: all)")
+    p = commands.add("tables", _tables, "measure loopclosure's methods, and write the tables of its pages")
+    _add_data(p)
+    p.add_argument("sets", nargs="*", metavar="SET", help="only on these (default: all)")
+    p.add_argument("--methods", nargs="+", default=[], metavar="NAME", help="only these, as the tables name them")
     commands.add("list", _list, "list the nets of the catalog")
     return made
 
@@ -100,6 +108,25 @@ def _add_ways(p: argparse.ArgumentParser, known: Sequence[str], default: Sequenc
     )
     p.add_argument("--rounds", type=int, default=9, help="rounds, in each of which every way has its turn (default: 9)")
     p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
+
+
+def _add_data(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--data", type=Path, required=True, metavar="FOLDER", help="with sequences, tum_fr1, place_pairs, ..."
+    )
+    p.add_argument("--work", type=Path, required=True, metavar="FOLDER", help="for images, descriptors and results")
+
+
+def _settings(arguments: argparse.Namespace) -> None:
+    from benchmarks.settings import run, summary
+
+    print(summary(run(arguments.data, arguments.work, arguments.families, partial(print, flush=True))))
+
+
+def _tables(arguments: argparse.Namespace) -> None:
+    from benchmarks.tables import measure, write
+
+    write(measure(arguments.data, arguments.work, arguments.sets, arguments.methods, partial(print, flush=True)))
 
 
 def _list(arguments: argparse.Namespace) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.cli.data_set import recording_of
-from loopclosure.cli.run import show_progress
+from loopclosure.cli.data_set import recording_of, typed
+from loopclosure.cli.run import show_progress, warn
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -21,6 +21,7 @@ from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.live import live_frames
+from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
 from netspec.files.whole_file import whole_file
@@ -91,6 +92,9 @@ def add_to(commands: Commands) -> None:
     )
     p.add_argument("--verify", action="store_true", help="verify candidates by SIFT matches and RANSAC")
     p.add_argument("--min-inliers", type=int, help=f"of --verify (default: {GeometricCheck().min_inliers})")
+    p.add_argument(
+        "--odometry", metavar="FILE", help="poses (TUM, KITTI, EuRoC): frames that they put far apart are no loop"
+    )
     p.add_argument("--save", metavar="F.npz", help="write the detector, to continue with --resume")
     p.add_argument("--rerun", metavar="F.rrd", help="write images, scores and loops for the viewer of rerun.io")
 
@@ -116,7 +120,8 @@ def _detect(a: argparse.Namespace) -> None:
         said = [run.verdicts_said(results)]
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.precision is None else a.precision
-        results, found = whole_drive(detector, recording, features, precision, show_progress)
+        odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None
+        results, found = whole_drive(detector, recording, features, precision, show_progress, odometry)
         said = [*found.reasons, found.counts()]
     else:
         results = run.run_detector(detector, recording, features, show_progress)
@@ -159,6 +164,19 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
     return results, None
 
 
+def _odometry(path: str, source: str, recording: run.Recording) -> np.ndarray:
+    """Return the odometry (frames, 7) of the frames that are taken."""
+    read = read_poses(path)
+    for doubt in read.doubts:
+        warn(f"{path}: {doubt}")
+    numbers = recording.numbers
+    untimed = read.stamps is None or recording.stamps is None
+    chosen = set(FRAMES) & set(typed(source, {"": (*FRAMES, *TOPICS)}).settings)
+    if untimed and chosen and numbers[-1] < len(read.poses):
+        return read.poses[numbers]
+    return read.of_images(len(recording), recording.stamps, path)
+
+
 def _checked_options(a: argparse.Namespace) -> dict[str, str]:
     """Return the keywords of --with; refuse options that do not go together."""
     if bool(a.source) == bool(a.video):
@@ -175,6 +193,8 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
     given += ["--verify"] if a.verify else []
     if given and a.threshold is None and not a.video:
         raise WrongUsage(f"{given[0]} means nothing without --threshold")
+    if a.odometry and (a.threshold is not None or a.resume or a.video):
+        raise WrongUsage("--odometry means nothing to a search frame by frame, as with --threshold or --video")
     if a.features and a.options:
         raise WrongUsage("--with belongs to --describe; --features has descriptors already")
     options = {}

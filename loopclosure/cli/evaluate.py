@@ -55,7 +55,7 @@ def _evaluate(a: argparse.Namespace) -> None:
     from loopclosure.report.page import write_report
 
     data = data_set(a)
-    context = MethodContext(data.exclude_frames, a.seed)
+    context = MethodContext(data.exclude_frames, a.seed, data.stamps)
     methods = [evaluate.named_method(text, context) for text in a.method]
     train: list[Path] = []
     for source in a.train:

@@ -16,9 +16,12 @@ import numpy as np
 from loopclosure.detector.verification import DOUBTLESS, LEAST_MATCHES, SURE, Agreement, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
-from loopclosure.methods.decoys import Found, best_setting, threshold
+from loopclosure.methods.decoys import UNEVEN, Found, best_setting, threshold
+from loopclosure.methods.odometry import far_apart
+from loopclosure.methods.seqslam import SequenceSettings
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
+from loopclosure.places.pose_files import read_poses
 from loopclosure.progress import Progress, silent, timed
 
 PRECISION = 0.99
@@ -28,6 +31,7 @@ LEAST_SHARE, LEAST_FOUND = 0.5, 3
 # Where at most this share of unlike pairs are verified, a verified match beside a loop is one as well.
 RARELY = 0.05
 WINDOW = 5  # references beside a line, and at least so many queries along it, that a verified pair vouches for
+BESIDE = SequenceSettings(2 * WINDOW, *UNEVEN)  # the line through a single image that is a loop by itself
 
 Agree = Callable[[int, int], Agreement]
 
@@ -71,6 +75,7 @@ def answer(
     check: GeometricCheck | None = None,
     agree: Agree | None = None,
     progress: Progress = silent,
+    far: np.ndarray | None = None,
 ) -> Answer:
     """Decide which best matches of scores (Q, R), higher = more alike, are loops.
 
@@ -78,10 +83,16 @@ def answer(
     two        two traverses, in the order of time each, or one sequence with itself
     precision  the share of what is accepted that should be right
     check, agree  verification of a query and a reference, by number; None: there are no images
+    far        (Q, R) bool: pairs that odometry puts far apart; they are no candidates, and show how others score
     """
     if not 0 < precision < 1:
         raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
     allowed = allowed & np.isfinite(scores)
+    different = None
+    if far is not None:
+        different, allowed = allowed & far, allowed & ~far
+        if np.count_nonzero(different.any(axis=1)) < LEAST_SHARE * np.count_nonzero(allowed.any(axis=1)):
+            different = None
     if not two:
         allowed &= earlier(len(scores), _visit(scores, allowed))
     known = np.where(allowed, scores, -np.inf)
@@ -90,8 +101,8 @@ def answer(
     there = np.isfinite(score)
     match = np.where(there, single, -1)
     accepted = np.zeros(len(match), bool)
-    found = best_setting(scores, allowed, two, precision)
-    reasons = [_sequences_said(found, precision)]
+    found = best_setting(scores, allowed, two, precision, different)
+    reasons = [_sequences_said(found, precision, "backwards" if different is None else "far apart in odometry")]
     if found is not None:
         match, score, accepted = found.match.copy(), found.targets, found.accepted(precision)
         there = match >= 0
@@ -101,7 +112,7 @@ def answer(
     if check is None or agree is None:
         reasons += ["verification: not tried, there are no images", _total_said(accepted, there)]
         return Answer(match, score, verdicts.tolist(), inliers, 0, reasons)
-    unlike, said = _verification_works(known, match, score, accepted, check, agree)
+    unlike, keeps, said = _verification_works(known, match, score, accepted, two, check, agree)
     reasons.append(said)
     if unlike is not None:
         few = np.zeros(len(match), bool)
@@ -123,7 +134,7 @@ def answer(
             least = min(least, DOUBTLESS)
         sure = evidence >= least
         if np.count_nonzero(unlike >= 1) > LEAST_SHARE * len(unlike):
-            verified = sure | accepted
+            verified = sure | (accepted & keeps)
         kept = sure | (accepted & _between(match, verified, found))
         rare = np.count_nonzero(unlike >= 1) <= RARELY * len(unlike)
         while rare and np.any(more := verified & np.any(_beside(match, kept, found), axis=0) & ~kept):
@@ -156,11 +167,11 @@ def _finite(values: np.ndarray) -> np.ndarray:
     return values[np.isfinite(values)]
 
 
-def _sequences_said(found: Found | None, precision: float) -> str:
+def _sequences_said(found: Found | None, precision: float, others: str) -> str:
     if found is None:
-        return "sequences: none is better than the same ones backwards, so that images are compared one by one"
+        return f"sequences: none is better than others {others}, so that images are compared one by one"
     return (
-        f"{found.setting}: a score of {found.threshold(precision):.4g} or more, since backwards the best of a query is "
+        f"{found.setting}: a score of {found.threshold(precision):.4g} or more, since {others} the best of a query is "
         f"{np.median(found.decoys):.4g} in the middle and {found.decoys.max():.4g} at most"
     )
 
@@ -173,13 +184,22 @@ def _total_said(accepted: np.ndarray, there: np.ndarray) -> str:
 
 
 def _verification_works(
-    known: np.ndarray, match: np.ndarray, score: np.ndarray, accepted: np.ndarray, check: GeometricCheck, agree: Agree
-) -> tuple[np.ndarray | None, str]:
-    """Try matches and unlike pairs; return the evidence of these if verification tells them apart, and a sentence."""
+    known: np.ndarray,
+    match: np.ndarray,
+    score: np.ndarray,
+    accepted: np.ndarray,
+    two: bool,
+    check: GeometricCheck,
+    agree: Agree,
+) -> tuple[np.ndarray | None, bool, str]:
+    """Try matches and unlike pairs; return the evidence of these if verification tells them apart, and a sentence.
+
+    The second value is whether matches of sequences are loops where unlike pairs are verified too.
+    """
     likely = np.flatnonzero(accepted) if accepted.any() else np.argsort(-score, kind="stable")[:SAMPLE]
     likely = likely[match[likely] >= 0]
     if not len(likely):
-        return None, "verification: not tried, no query has a candidate"
+        return None, True, "verification: not tried, no query has a candidate"
     likely = likely[np.unique(np.linspace(0, len(likely) - 1, SAMPLE).round().astype(int))]
     same = sum(check.enough(agree(int(query), int(match[query]))) > 0 for query in likely)
     wide = np.flatnonzero(np.count_nonzero(np.isfinite(known), axis=1) >= 8)
@@ -194,14 +214,22 @@ def _verification_works(
     unlike = np.count_nonzero(against >= 1)
     tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(wide)} unlike pairs"
     if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
-        return None, f"{tried}: these images cannot be verified, so that nothing is rejected for it"
+        following = [check.evidence(agree(int(query), int(query) - 1)) >= SURE for query in likely if query and not two]
+        if accepted.any() and following and np.mean(following) >= LEAST_SHARE:
+            return (
+                np.full(SAMPLE, SURE),
+                False,
+                f"{tried}: consecutive frames are verified, so that these are no loops",
+            )
+        return None, True, f"{tried}: these images cannot be verified, so that nothing is rejected for it"
     # Unlike pairs of a small place, a desk, do show the same things, and so does a dashboard in all images.
     if unlike > LEAST_SHARE * len(wide):
         return (
             against,
+            True,
             f"{tried}: something is the same in all images, so that only what has far more in common is verified",
         )
-    return against, f"{tried}: what is verified is a loop, and what has no verified pair near it is none"
+    return against, True, f"{tried}: what is verified is a loop, and what has no verified pair near it is none"
 
 
 def _between(match: np.ndarray, verified: np.ndarray, found: Found | None) -> np.ndarray:
@@ -221,7 +249,7 @@ def _beside(match: np.ndarray, which: np.ndarray, found: Found | None) -> tuple[
     before, after = np.zeros_like(which), np.zeros_like(which)
     if found is None:
         return before, after
-    sequence, numbers = found.setting.sequence, np.arange(len(match))
+    sequence, numbers = found.setting.sequence or BESIDE, np.arange(len(match))
     for step in range(1, max(WINDOW, sequence.length // 2) + 1):
         for sign, side in ((-1, before), (1, after)):
             other = numbers + sign * step
@@ -237,13 +265,17 @@ class Auto:
     """The loops of another method's scores, chosen without truth; only what is accepted gets a score.
 
     precision       the share of what is accepted that should be right
+    odometry        file of poses of the frames of one sequence; empty: none
     exclude_frames  in one sequence, references within this many frames of the query are not candidates
+    stamps          (Q,) seconds, None if not known
     """
 
     inner: Method
     check: GeometricCheck = field(default_factory=GeometricCheck)
     precision: float = PRECISION
+    odometry: str = ""
     exclude_frames: int = 0
+    stamps: np.ndarray | None = None
     pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
 
     @property
@@ -257,7 +289,11 @@ class Auto:
         seconds = dict(found.seconds)
         two = images.references is not None
         references = images.queries if images.references is None else images.references
-        allowed = np.isfinite(found.scores)
+        allowed, far = np.isfinite(found.scores), None
+        if self.odometry:
+            if two:
+                raise InputError("odometry is that of one sequence; these are queries and references", self.odometry)
+            far = far_apart(read_poses(self.odometry).of_images(len(images.queries), self.stamps, self.odometry))
         if not two:
             allowed &= earlier(len(images.queries), self.exclude_frames)
 
@@ -265,7 +301,7 @@ class Auto:
             return self.pairs.agreement(self.check, images.queries[query], references[reference])
 
         with timed(seconds, "choice and verification"):
-            decided = answer(found.scores, allowed, two, self.precision, self.check, agree, progress)
+            decided = answer(found.scores, allowed, two, self.precision, self.check, agree, progress, far)
         scores = np.full(found.scores.shape, np.nan)
         loops = np.flatnonzero(decided.accepted)
         scores[loops, decided.match[loops]] = decided.score[loops]
@@ -277,7 +313,7 @@ def auto(argument: str, context: MethodContext, inner: Method | None) -> Auto:
     """Build ``auto[:setting=value,...]+METHOD``."""
     if inner is None:
         raise InputError("auto needs a method whose scores it judges; write auto+METHOD, as in auto+features:F.npz")
-    plain = Auto(inner, exclude_frames=context.exclude_frames, pairs=context.pairs)
+    plain = Auto(inner, exclude_frames=context.exclude_frames, stamps=context.stamps, pairs=context.pairs)
     method, check = configure("auto", argument, plain, plain.check)
     method.check = check
     return method

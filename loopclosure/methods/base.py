@@ -77,11 +77,13 @@ class MethodContext:
     exclude_frames   in one sequence, frames with |i - j| <= exclude_frames are not candidates (SeqSLAM must know this
                      before it searches)
     seed             of all random numbers
+    stamps           (Q,) seconds of the queries, None if not known
     pairs            what verification has found, for all methods of a run
     """
 
     exclude_frames: int = 0
     seed: int = 0
+    stamps: np.ndarray | None = None
     pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
 
 

@@ -8,7 +8,8 @@ wrong, without truth: target-decoy competition as in Elias and Gygi, "Target-dec
 2007), with an exponential tail (the peaks over a threshold of extreme-value theory), whose scale is widened by the
 uncertainty of the few independent decoys there are.
 
-A camera that turns back and forth over the same things makes decoys as good as loops. Then little is accepted.
+A camera that turns back and forth over the same things makes decoys as good as loops. Then little is accepted. Where
+odometry tells which frames are far apart, the best of these is the decoy, and single images can be told from chance.
 """
 
 from __future__ import annotations
@@ -35,13 +36,20 @@ REACH = 4
 
 @dataclass(frozen=True)
 class Setting:
-    """How sequences are searched; ``standardized``: rows and columns of the scores first."""
+    """How sequences are searched, None: images one by one; ``standardized``: rows and columns of the scores first."""
 
-    sequence: SequenceSettings
+    sequence: SequenceSettings | None
     standardized: bool = False
+
+    @property
+    def length(self) -> int:
+        """Frames in a sequence, 0 without one."""
+        return self.sequence.length if self.sequence else 0
 
     def __str__(self) -> str:
         s = self.sequence
+        if s is None:
+            return "single images"
         scaled = ", rows and columns standardized" if self.standardized else ""
         return f"sequences of {s.length} frames at {s.slowest:.3g} to {s.fastest:.3g} references a query{scaled}"
 
@@ -53,7 +61,7 @@ class Found:
     scores   (Q, R) of the line through each pair, higher = more alike; NaN where a pair is not a candidate
     match    (Q,) each query's best reference, -1 without one
     targets  (Q,) its score, -inf without one
-    decoys   (Q,) the best score of a reverse line, -inf without one
+    decoys   (Q,) the best score of a reverse line, or of frames far apart in odometry, -inf without one
     near     (Q,) bool: of the queries just before and after, none that is far fits the match better. Where a loop ends,
              the line through its last place is the best one for a while
     """
@@ -67,7 +75,7 @@ class Found:
 
     def threshold(self, precision: float) -> float:
         """Return the least score above which at least this share of the best matches is right; inf if none is."""
-        return threshold(self.targets, self.decoys, precision, self.setting.sequence.length / 2)
+        return threshold(self.targets, self.decoys, precision, max(REACH, self.setting.length / 2))
 
     def accepted(self, precision: float) -> np.ndarray:
         """Return which best matches (Q,) are loops; none if they are too few to tell."""
@@ -105,18 +113,30 @@ def settings(queries: int, references: int, two: bool) -> Iterator[Setting]:
                 yield Setting(sequence, standardized)
 
 
-def search(scores: np.ndarray, allowed: np.ndarray, setting: Setting, two: bool) -> Found:
-    """Search scores (Q, R), higher = more alike, for lines through ``allowed`` (Q, R) pairs."""
+def search(
+    scores: np.ndarray, allowed: np.ndarray, setting: Setting, two: bool, different: np.ndarray | None = None
+) -> Found:
+    """Search scores (Q, R), higher = more alike, for lines through ``allowed`` (Q, R) pairs.
+
+    different  (Q, R) bool: pairs that are known to show different places, the decoys; None: the lines backwards are
+    """
+
+    def along(distances: np.ndarray) -> np.ndarray:
+        return distances if setting.sequence is None else trajectory_costs(distances, setting.sequence)
+
     distances = np.where(allowed, -scores, np.nan)
     if setting.standardized:
         distances = standardize(distances)
-    forward = np.where(allowed, -trajectory_costs(distances, setting.sequence), np.nan)
-    reverse = np.where(allowed, -trajectory_costs(distances[:, ::-1], setting.sequence)[:, ::-1], np.nan)
+    forward = np.where(allowed, -along(distances), np.nan)
+    if different is None:
+        reverse = np.where(allowed, -along(distances[:, ::-1])[:, ::-1], np.nan)
+    else:
+        reverse = np.where(different, -along(np.where(different, -scores, np.nan)), np.nan)
     best = np.where(np.isnan(forward), -np.inf, forward)
     match, targets = best.argmax(axis=1), best.max(axis=1)
     decoys = np.where(np.isnan(reverse), -np.inf, reverse).max(axis=1)
     ratio = len(best[0]) / len(best) if two else 1.0
-    owner = _owner(best, match, setting.sequence.length)
+    owner = _owner(best, match, setting.length)
     near = np.abs(owner - np.arange(len(best))) <= max(REACH, 1 / ratio)
     return Found(setting, forward, np.where(np.isneginf(targets), -1, match), targets, decoys, near)
 
@@ -134,11 +154,14 @@ def _owner(best: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
     return owner
 
 
-def best_setting(scores: np.ndarray, allowed: np.ndarray, two: bool, precision: float) -> Found | None:
+def best_setting(
+    scores: np.ndarray, allowed: np.ndarray, two: bool, precision: float, different: np.ndarray | None = None
+) -> Found | None:
     """Return the search that finds the most loops at this precision; None if none finds any."""
     chosen, most = None, 0
-    for setting in settings(scores.shape[0], scores.shape[1], two):
-        found = search(scores, allowed, setting, two)
+    alone = [] if different is None else [Setting(None)]
+    for setting in (*alone, *settings(scores.shape[0], scores.shape[1], two)):
+        found = search(scores, allowed, setting, two, different)
         count = np.count_nonzero(found.accepted(precision))
         if count * NEARLY > most:
             chosen, most = found, count

@@ -10,6 +10,7 @@ from loopclosure.detector.detector import LoopDetector, LoopResult
 from loopclosure.detector.run import Recording, run_detector
 from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
 from loopclosure.methods.auto import PRECISION, Answer, answer
+from loopclosure.methods.odometry import far_apart
 from loopclosure.places.frames import gray, read_gray
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
@@ -21,10 +22,12 @@ def whole_drive(
     features: Features | None = None,
     precision: float = PRECISION,
     progress: Progress = silent,
+    odometry: np.ndarray | None = None,
 ) -> tuple[list[LoopResult], Answer]:
     """Add every frame of a recording to a new detector, then decide with all of them in view which close loops.
 
-    The detector gets these loops, and for frames to come the least threshold that accepts none of this drive's others.
+    ``odometry`` are poses (frames, 7), NaN where not known. The detector gets these loops, and for frames to come the
+    least threshold that accepts none of this drive's others.
     """
     run_detector(detector, recording, features, progress)
     settings, rows = detector.settings, detector.descriptors
@@ -41,7 +44,8 @@ def whole_drive(
                 pairs.put(check, number, gray(image))
         return pairs.agreement(check, query, reference)
 
-    found = answer(scores, allowed, False, precision, check, agree, progress)
+    far = None if odometry is None else far_apart(odometry)
+    found = answer(scores, allowed, False, precision, check, agree, progress, far)
     single = np.where(allowed, scores, -np.inf).max(axis=1)
     others = float(np.max(single[~found.accepted], initial=-np.inf))
     above = single[found.accepted & (single > others)]

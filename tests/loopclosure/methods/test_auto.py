@@ -10,6 +10,7 @@ from loopclosure.errors import InputError
 from loopclosure.methods.auto import answer
 from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
 from loopclosure.methods.decoys import threshold
+from loopclosure.methods.odometry import far_apart
 from loopclosure.progress import silent
 
 SIZE = 64
@@ -154,6 +155,54 @@ def test_a_camera_that_moves_slowly_closes_no_loop():
     rows = rows[100:] - rows[:-100]
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     assert not answer(alike(rows, rows), np.tri(400, k=-31, dtype=bool), False).accepted.any()
+
+
+def test_where_consecutive_frames_are_verified_a_loop_must_be_too():
+    road = drive(400, 3)
+    rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
+    allowed = np.tri(len(rows), k=-31, dtype=bool)
+    for following, loops in ((60, False), (25, True)):
+        found = answer(
+            alike(rows, rows),
+            allowed,
+            False,
+            0.99,
+            GeometricCheck(),
+            lambda q, r, points=following: Agreement(80, points if q - r == 1 else 9, 20),
+        )
+        assert (np.count_nonzero(found.accepted) > 60) == loops
+
+
+def round_and_round(frames, radius=20.0):
+    """Odometry of laps of 100 frames; it drifts outwards, by 2 % of the way."""
+    angle = 2 * np.pi * np.arange(frames) / 100
+    poses = np.zeros((frames, 7))
+    poses[:, :2] = (radius + 0.02 * radius * angle)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    poses[:, 6] = 1
+    return poses
+
+
+def test_odometry_tells_different_places():
+    far = far_apart(round_and_round(300))
+    lag = np.abs(np.subtract.outer(np.arange(300), np.arange(300)))
+    assert not far[lag % 100 <= 2].any()
+    assert far[lag == 50].all()
+    assert not far_apart(np.full((5, 7), np.nan)).any()
+
+
+def test_with_odometry_single_images_are_told_from_chance():
+    """The camera looks where it likes, so that no sequence comes back; a twin of each place is across the road."""
+    rng = np.random.default_rng(2)
+    places = drive(100, 1)[rng.permutation(100)]
+    places[50:] = again(places[:50], 1.0, 2)
+    rows = np.concatenate([again(places, 0.5, 3), places])
+    scores, allowed = alike(rows, rows), np.tri(200, k=-6, dtype=bool)
+    far = far_apart(round_and_round(200))
+    found = answer(scores, allowed, False, far=far)
+    wrong = np.abs(found.match - np.arange(200) + 100) > 2
+    assert "far apart in odometry" in found.reasons[0]
+    assert np.count_nonzero(found.accepted) > 50
+    assert not (found.accepted & wrong).any()
 
 
 def test_single_images_are_verified_where_sequences_tell_nothing():

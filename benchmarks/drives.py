@@ -1,0 +1,162 @@
+"""Drives whose loops are known, to choose settings on and to judge them: ``tools/bench settings``.
+
+Sequences that pass no place twice are driven again: each frame in another season, which is one change of colors, tones
+and light for the whole drive, from a point of view that differs a little. Then frame i of both shows one place. From
+these and from synthetic walks: whole traverses, keyframes, parts of a route, other speeds, small images, one drive that
+comes back, and drives that share nothing.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lmdb_build.light import change_light
+from lmdb_build.picture import write_jpeg
+from lmdb_build.views import cut_view
+from lmdb_build.walk.sequence import Walk, write_walk
+from loopclosure.places.datasets import DataSet, load_folder, load_sequence
+from loopclosure.places.frames import Selection, image_paths, read_bgr
+from loopclosure.places.sequences import read_sequence
+from loopclosure.places.truth import Exclusion, sequence_truth, traverse_truth
+from netspec.files.opencv import cv2
+
+NEAR, OVERLAP = 1, 4  # frames of one route: the same place, and views that overlap
+KEYFRAMES = 4
+VIEWPOINT = 0.3  # of lmdb_build.views: how differently a place is seen in another season
+SMALL = (64, 32)
+SEASONS = (2, 3)
+WALKS = (41, 42)  # seeds
+GAP = 30  # frames of one drive that are no loop
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A data set, and the sequence or house it was made of: what is chosen is never judged on the same one."""
+
+    family: str
+    kind: str
+    data: DataSet
+
+    @property
+    def name(self) -> str:
+        """Both in one word."""
+        return f"{self.family}/{self.kind}"
+
+
+def drives(data: Path, work: Path, only: Sequence[str] = ()) -> Iterator[Drive]:
+    """Yield all drives that can be made of the folder ``data``, or of some families; images go to ``work``."""
+    routes = {}
+    with (data / "sequences" / "index.csv").open(encoding="utf-8") as table:
+        for row in csv.DictReader(table):
+            if row["has_revisits"] == "no":
+                routes[row["name"]] = image_paths(data / "sequences" / row["name"])
+    names = list(routes)
+    for name, other in zip(names, names[1:] + names[:1], strict=True):
+        if name in (only or names):
+            yield from _of_route(name, routes[name], routes[other], work)
+    for seed in WALKS:
+        for size in ((160, 120), SMALL):
+            if not only or f"walk_{seed}" in only:
+                yield from _of_walk(seed, size, work)
+    for name in ("xyz", "rpy") if not only or "fr1" in only else ():
+        folder = data / "tum_fr1" / f"rgbd_dataset_freiburg1_{name}"
+        exclusion = Exclusion(seconds=3.0)
+        yield Drive("fr1", name, load_sequence(read_sequence(folder, "tum"), Selection(stride=2), exclusion))
+    corridor = data / "corridor_loop"
+    if not only or "corridor" in only:
+        yield Drive("corridor", "loop", load_folder(corridor / "samples", corridor / "samples_GT.bmp"))
+
+
+def _of_route(name: str, route: list[Path], other: list[Path], work: Path) -> Iterator[Drive]:
+    second, third = (in_season(route, work / name, season) for season in SEASONS)
+    foreign = in_season(other, work / other[0].parent.name, SEASONS[0])
+    every = np.arange(len(route), dtype=float)
+    yield Drive(name, "season 2", _traverses(second, every, route, every))
+    yield Drive(name, "season 3", _traverses(third, every, route, every))
+    keys = np.arange(0, len(route), KEYFRAMES)
+    yield Drive(name, "keyframes", _traverses(second, every, [route[i] for i in keys], every[keys]))
+    rng = np.random.default_rng(len(route))
+    uneven = np.repeat(np.arange(len(route)), rng.integers(0, 3, len(route)))
+    uneven = uneven[np.append(True, np.diff(uneven) > 0)]
+    yield Drive(name, "uneven", _traverses([third[i] for i in uneven], every[uneven], route, every))
+    half = slice(len(route) // 4, 3 * len(route) // 4)
+    away = foreign[: len(route) // 2]
+    yield Drive(
+        name,
+        "in part",
+        _traverses(away + third[half], np.append(np.full(len(away), np.nan), every[half]), route, every),
+    )
+    small = _resized(route, work / f"{name}_small"), _resized(second, work / f"{name}_2_small")
+    yield Drive(name, "season 2, small", _traverses(small[1], every, small[0], every))
+    between = other[: len(route) // 2]
+    once = [*route, *between, *second[half]]
+    where = np.concatenate([every, np.full(len(between), np.nan), every[half]])
+    yield Drive(name, "comes back", _one_drive(once, where))
+    yield Drive(name, "shares nothing", _traverses(foreign, np.full(len(foreign), np.nan), route, every))
+
+
+def _of_walk(seed: int, size: tuple[int, int], work: Path) -> Iterator[Drive]:
+    name, end = f"walk_{seed}", "" if size != SMALL else ", small"
+    folders = [walked(work, seed, season, size) for season in (1, *SEASONS)]
+    first, *others = [read_sequence(folder, "tum") for folder in folders]
+    yield Drive(name, f"laps{end}", load_sequence(first, exclusion=Exclusion(seconds=10.0)))
+    for season, other in zip(SEASONS, others, strict=True):
+        yield Drive(name, f"season {season}{end}", load_sequence(other, references=first))
+
+
+def walked(
+    work: Path, seed: int, season: int, size: tuple[int, int], frames: int = 300, laps: int = 2, number: int = 0
+) -> Path:
+    """Return the folder of a synthetic walk in ``work``; with a number, that of ``lmdb-build walk --seed``."""
+    folder = work / f"walk_{seed}_{season}_{size[0]}"
+    if not (folder / "rgb.txt").exists():
+        start_s = 10_000.0 * (number or season)
+        house = 1000 * seed + number if number else seed
+        walk = Walk(frames=frames, width=size[0], height=size[1], laps=laps, seed=house, season=season, start_s=start_s)
+        for _ in write_walk(folder, walk):
+            pass
+    return folder
+
+
+def _traverses(queries: list[Path], there: np.ndarray, references: list[Path], here: np.ndarray) -> DataSet:
+    """Make two traverses of their places on the route, (Q,) and (R,): numbers of frames, NaN elsewhere."""
+    apart = np.abs(np.subtract.outer(there, here))
+    step = np.median(np.diff(here))
+    truth = traverse_truth(apart <= max(NEAR, step / 2), "same place: frames of the same number")
+    return DataSet("", queries, references, truth, overlap=apart <= OVERLAP, overlap_rule=f"{OVERLAP} frames apart")
+
+
+def _one_drive(images: list[Path], where: np.ndarray) -> DataSet:
+    apart = np.abs(np.subtract.outer(where, where))
+    truth = sequence_truth(apart <= NEAR, Exclusion(GAP), "same place: frames of the same number")
+    return DataSet("", images, None, truth, GAP, overlap=apart <= OVERLAP, overlap_rule=f"{OVERLAP} frames apart")
+
+
+def in_season(images: list[Path], folder: Path, season: int) -> list[Path]:
+    """Return the same drive in another season, whose number decides all about it; files in ``folder``."""
+    folder = folder.with_name(f"{folder.name}_{season}")
+    folder.mkdir(parents=True, exist_ok=True)
+    made = [folder / f"{image.stem}.jpg" for image in images]
+    front = read_bgr(images[0])
+    for number, (image, path) in enumerate(zip(images, made, strict=True)):
+        if not path.exists():
+            picture = read_bgr(image)
+            size = (picture.shape[1], picture.shape[0])
+            middle = np.array([0.5, 0.5])
+            view = cut_view(picture, size, middle, np.random.default_rng([season, number]), VIEWPOINT)
+            write_jpeg(path, change_light(view, lambda: front, np.random.default_rng(season)))
+    return made
+
+
+def _resized(images: list[Path], folder: Path) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    made = [folder / f"{image.stem}.jpg" for image in images]
+    for image, path in zip(images, made, strict=True):
+        if not path.exists():
+            write_jpeg(path, cv2.resize(read_bgr(image), SMALL, interpolation=cv2.INTER_AREA))
+    return made

@@ -1,0 +1,200 @@
+"""How good ``auto`` is beside the best setting that the truth would choose, on drives whose loops are known.
+
+For each drive: the precision and recall of what ``auto`` accepts, views that overlap being no mistake, and the greatest
+recall at that precision of any threshold on single images and on each of the sequences that ``auto`` may choose, whole
+or only what geometry verifies.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.drives import Drive, drives
+from loopclosure.descriptors.similarity import similarity_matrix
+from loopclosure.detector.run import load_describe
+from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
+from loopclosure.evaluate import Judgment
+from loopclosure.methods.auto import PRECISION, Auto
+from loopclosure.methods.base import Images, MethodResult, earlier
+from loopclosure.methods.decoys import search, settings
+from loopclosure.places.frames import read_bgr, read_gray
+from loopclosure.progress import silent
+
+ENOUGH = 0.7  # of the best setting's recall
+
+
+@dataclass(frozen=True)
+class Result:
+    """What ``auto`` reached on one drive.
+
+    loops      queries with a loop
+    accepted   matches that auto accepts
+    precision  of these; NaN without any
+    recall     of these
+    best       the recall of the best setting, named ``setting``
+    reasons    what auto says
+    """
+
+    family: str
+    kind: str
+    loops: int
+    accepted: int
+    precision: float
+    recall: float
+    best: float
+    setting: str
+    reasons: list[str]
+
+    @property
+    def silent(self) -> bool:
+        """Whether auto accepts nothing where there is something to find."""
+        return self.best > 0 and not self.accepted
+
+    @property
+    def good(self) -> bool:
+        """Whether precision and recall are what they should be."""
+        return (not self.accepted or self.precision >= PRECISION) and self.recall >= ENOUGH * self.best
+
+
+@dataclass
+class Kept:
+    """What is computed once for all drives of a family, and kept in a file between runs."""
+
+    path: Path
+    rows: dict[Path, np.ndarray] = field(default_factory=dict)
+    found: dict[Any, Agreement] = field(default_factory=dict)
+    best: dict[str, tuple[float, str]] = field(default_factory=dict)
+    describe: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def __post_init__(self) -> None:
+        if self.path.exists():  # written below
+            self.rows, self.found, self.best = pickle.loads(self.path.read_bytes())
+        self.pairs = Pairs(read_gray, _found=self.found)
+
+    def descriptors(self, images: Sequence[Path]) -> np.ndarray:
+        """Return the descriptors (N, D) of images by the net that comes with the package."""
+        for image in images:
+            if image not in self.rows:
+                self.describe = self.describe or load_describe("default")
+                self.rows[image] = np.asarray(self.describe(read_bgr(image)), np.float32).reshape(-1)
+        return np.array([self.rows[image] for image in images])
+
+    def save(self) -> None:
+        """Write the file."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.write_bytes(pickle.dumps((self.rows, self.found, self.best)))
+
+
+@dataclass
+class Scored:
+    """A method whose scores are known already."""
+
+    scores: np.ndarray
+    name: str = "known"
+
+    def score(self, images: Images, progress: Any) -> MethodResult:
+        """See :class:`loopclosure.methods.base.Method`."""
+        return MethodResult(self.scores)
+
+
+def measure(drive: Drive, kept: Kept) -> Result:
+    """Run ``auto`` on one drive, and look for the best setting."""
+    data = drive.data
+    queries = kept.descriptors(data.query_images)
+    references = None if data.reference_images is None else kept.descriptors(data.reference_images)
+    scores = similarity_matrix(queries, references)
+    truth = data.soft_truth or data.truth
+    auto = Auto(Scored(scores), exclude_frames=data.exclude_frames, pairs=kept.pairs)
+    found = auto.score(Images(data.query_images, data.reference_images), silent)
+    accepted = int(np.count_nonzero(np.isfinite(found.scores)))
+    judged = Judgment.of(found.scores, truth).best
+    if drive.kind not in kept.best:
+        kept.best[drive.kind] = _best(scores, drive, kept.pairs)
+    best, setting = kept.best[drive.kind]
+    return Result(
+        family=drive.family,
+        kind=drive.kind,
+        loops=int(np.count_nonzero(truth.queries_with_a_loop)),
+        accepted=accepted,
+        precision=float(judged.precision[-1]) if len(judged.precision) else float(accepted == 0),
+        recall=float(judged.recall[-1]) if len(judged.recall) else 0.0,
+        best=best,
+        setting=setting,
+        reasons=found.notes,
+    )
+
+
+def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
+    """Return the greatest recall at the precision wanted, and the setting that has it."""
+    data, two = drive.data, drive.data.reference_images is not None
+    truth = data.soft_truth or data.truth
+    if not truth.positives:
+        return 0.0, "nothing to find"
+    allowed = np.isfinite(scores)
+    if not two:
+        allowed &= earlier(len(scores), data.exclude_frames)
+    tried = {"single images": np.where(allowed, scores, np.nan)}
+    tried |= {str(s): search(scores, allowed, s, two).scores for s in settings(scores.shape[0], scores.shape[1], two)}
+    recalls = {name: _recall(matrix, truth) for name, matrix in tried.items()}
+    check = GeometricCheck()
+    for name in ("single images", max(recalls, key=lambda name: recalls[name])):
+        known = np.where(np.isnan(tried[name]), -np.inf, tried[name])
+        verified = np.full(scores.shape, np.nan)
+        for query, reference in enumerate(known.argmax(axis=1)):
+            if np.isfinite(known[query, reference]) and check.enough(
+                pairs.agreement(check, data.query_images[query], data.references[reference])
+            ):
+                verified[query, reference] = known[query, reference]
+        recalls[f"{name}, verified"] = _recall(verified, truth)
+    name = max(recalls, key=lambda name: recalls[name])
+    return recalls[name], name
+
+
+def _recall(scores: np.ndarray, truth: Any) -> float:
+    return Judgment.of(scores, truth).best.recall_at_precision(PRECISION)
+
+
+def run(data: Path, work: Path, only: Sequence[str], say: Callable[[str], None]) -> list[Result]:
+    """Measure all drives, or those of some families; what was measured is added to ``work``/settings.json."""
+    file = work / "settings.json"
+    results = {}
+    if file.exists():
+        results = {f"{r['family']}/{r['kind']}": Result(**r) for r in json.loads(file.read_text())}
+    kept: Kept | None = None
+    for drive in drives(data, work, only):
+        path = work / "kept" / f"{drive.family}.pickle"
+        if kept is None or kept.path != path:
+            kept = Kept(path)
+        results[drive.name] = measure(drive, kept)
+        say(line(results[drive.name]))
+        kept.save()
+        file.write_text(json.dumps([asdict(result) for result in results.values()], indent=1), encoding="utf-8")
+    return list(results.values())
+
+
+def line(result: Result) -> str:
+    """Say in one line what was reached."""
+    share = f"{result.recall / result.best:.2f}" if result.best else "-"
+    mark = "" if result.good else " silent" if result.silent else " MISSED"
+    return (
+        f"{result.family + ', ' + result.kind:40} {result.loops:4} {result.accepted:4} {result.precision:6.3f} "
+        f"{result.recall:6.3f} {result.best:6.3f} {share:>5}{mark}"
+    )
+
+
+def summary(results: Sequence[Result]) -> str:
+    """Say how many drives were as they should be."""
+    right = sum(not r.accepted or r.precision >= PRECISION for r in results)
+    there = [r for r in results if r.best > 0]
+    enough = sum(r.recall >= ENOUGH * r.best for r in there)
+    return (
+        f"{right} of {len(results)} drives with a precision of {PRECISION:g}; {enough} of {len(there)} with {ENOUGH:g} "
+        f"of the best recall; on {sum(r.silent for r in there)} auto cannot tell"
+    )

@@ -1,0 +1,136 @@
+"""The tables of loopclosure/README.md and docs/results.md, measured anew: ``tools/bench tables``.
+
+Figures are kept in ``loops.json`` beside this file, the first that was measured of each and the last; a table shows
+both where they differ. What is not measured in a run keeps its figures.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.drives import walked
+from benchmarks.settings import Kept
+from loopclosure.evaluate import Outcome, judge
+from loopclosure.methods.base import MethodContext, make_method
+from loopclosure.places.datasets import DataSet, load_folder, load_place_pairs, load_sequence
+from loopclosure.places.frames import Selection, image_paths
+from loopclosure.places.sequences import read_sequence
+from loopclosure.places.truth import Exclusion
+
+HERE = Path(__file__).parent
+FIGURES = HERE / "loops.json"
+PAGES = (HERE.parent / "loopclosure" / "README.md", HERE.parent / "docs" / "results.md")
+SETS = ("fr1_rpy", "corridor_loop", "walk", "ESSEX3IN1", "SPED")
+PAIRS = SETS[3:]
+TITLES = {
+    "fr1_rpy": "fr1_rpy, last 40 %",
+    "corridor_loop": "corridor_loop",
+    "walk": "synthetic walk",
+    "ESSEX3IN1": "ESSEX3IN1",
+    "SPED": "SPED",
+}
+# As the tables name them; F is the file of descriptors by the net that comes with the package, W a file of words.
+METHODS = {
+    "gray thumbnails, 32x24": "thumbnails",
+    "bag of SIFT words, tf-idf": "bow:model=W",
+    "FAB-MAP 2.0": "fabmap:model=W",
+    "VLAD of 64 SIFT words": "vlad:model=V",
+    "HOG, 256x256": "hog",
+    "like CoHOG, 256x256": "cohog",
+    "the net": "features:F",
+    "verified+net": "verified+features:F",
+    "SeqSLAM on the net": "seqslam+features:F",
+    "verified, SeqSLAM on the net": "verified+seqslam+features:F",
+    "auto, on the net": "auto+features:F",
+    "verified+FAB-MAP": "verified+fabmap:model=W",
+}
+TABLES = {
+    "average precision": [name for name in METHODS if not name.startswith(("verified", "auto"))],
+    "recall": ["FAB-MAP 2.0", *[name for name in METHODS if "net" in name], "verified+FAB-MAP"],
+}
+AUTO = "auto, on the net"
+
+
+def data_set(name: str, data: Path, work: Path) -> DataSet:
+    """Load one of the sets."""
+    if name == "fr1_rpy":
+        sequence = read_sequence(data / "tum_fr1" / "rgbd_dataset_freiburg1_rpy", "tum")
+        return load_sequence(sequence, Selection(start="60%"), Exclusion(seconds=3.0))
+    if name == "corridor_loop":
+        return load_folder(data / name / "samples", data / name / "samples_GT.bmp")
+    if name == "walk":
+        sequence = read_sequence(walked(work, 900, 1, (160, 120), frames=400, laps=3, number=1), "tum")
+        return load_sequence(sequence, exclusion=Exclusion(seconds=10.0))
+    return load_place_pairs(data / "place_pairs" / {"SPED": "SPED_Test"}.get(name, name))
+
+
+def measure(
+    data: Path, work: Path, sets: Sequence[str], methods: Sequence[str], say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Measure methods on sets, and add the figures to those that are kept."""
+    figures: dict[str, Any] = json.loads(FIGURES.read_text(encoding="utf-8"))
+    train = image_paths(data / "ie_tower")[::4] if any("W" in METHODS[name] for name in methods) else []
+    for name in sets or SETS:
+        held = data_set(name, data, work)
+        kept = Kept(work / "kept" / f"{name}.pickle")
+        images = [*held.query_images, *(held.reference_images or [])]
+        np.savez(work / f"{name}.npz", features=kept.descriptors(images), names=[str(image) for image in images])
+        context = MethodContext(held.exclude_frames, stamps=held.stamps, pairs=kept.pairs)
+        for label in methods or METHODS:
+            if name in PAIRS and label not in TABLES["average precision"]:
+                continue
+            file = work / {"F": f"{name}.npz", "W": "words.npz", "V": "vlad.npz"}.get(METHODS[label][-1], "")
+            spec = re.sub(r"\b[FWV]$", str(file), METHODS[label])
+            outcome = judge(label, make_method(spec, context), held, train)
+            for kind, value in _figures(label, outcome, name):
+                say(f"{name}, {label}, {kind}: {value}")
+                cell = figures[kind].setdefault(label, {}).setdefault(name, [])
+                figures[kind][label][name] = [*cell[:1], value]
+        kept.save()
+        FIGURES.write_text(json.dumps(figures, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return figures
+
+
+def _figures(label: str, outcome: Outcome, name: str) -> Iterator[tuple[str, str]]:
+    if label in TABLES["average precision"]:
+        found = outcome.recall_at[1] if name in PAIRS else outcome.pairs.average_precision
+        yield "average precision", f"{found:.3f}"
+    if name not in PAIRS and label in TABLES["recall"]:
+        zones = [judged.best for judged in (outcome.rule, outcome.soft) if judged is not None]
+        if label == AUTO:
+            said = [f"{z.recall[-1]:.3f} at {z.precision[-1]:.3f}" if len(z.recall) else "none" for z in zones]
+        else:
+            said = [f"{z.recall_at_full_precision:.3f}" for z in zones]
+        yield "recall", said[0] + "".join(f" ({text})" for text in said[1:])
+
+
+def tables(figures: dict[str, Any]) -> dict[str, str]:
+    """Return the tables in Markdown, by name: a cell is the old figure and the new one, or both in one."""
+    made = {}
+    for kind, labels in TABLES.items():
+        sets = SETS if kind == "average precision" else SETS[:3]
+        rows = [["method", *(TITLES[name] for name in sets)], ["---"] * (len(sets) + 1)]
+        for label in labels:
+            cells = [figures[kind].get(label, {}).get(name, []) for name in sets]
+            rows.append([label, *(" → ".join(dict.fromkeys(cell)) for cell in cells)])
+        made[kind] = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return made
+
+
+def write(figures: dict[str, Any], pages: Sequence[Path] = PAGES) -> None:
+    """Put the tables between their markers, ``<!-- table: NAME -->`` and ``<!-- end -->``, in the pages."""
+    made = tables(figures)
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        for name, table in made.items():
+            begin = f"<!-- table: {name} -->"
+            text = re.sub(
+                f"{begin}.*?<!-- end -->", lambda _, t=table, b=begin: f"{b}\n{t}\n<!-- end -->", text, flags=re.DOTALL
+            )
+        page.write_text(text, encoding="utf-8")

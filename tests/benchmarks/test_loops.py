@@ -1,0 +1,50 @@
+"""tools/bench settings and tables: drives whose loops are known, and figures between their markers."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks import drives, settings, tables
+
+
+def test_figures_that_changed_stand_beside_the_old_ones(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- table: recall -->\nold\n<!-- end -->\nafter\n")
+    recall = {"the net": {"walk": ["0.5", "0.7"], "corridor_loop": ["0.1", "0.1"]}}
+    figures = {"recall": recall, "average precision": {}}
+    tables.write(figures, [page])
+    text = page.read_text()
+    assert text.startswith("before\n<!-- table: recall -->\n| method | fr1_rpy")
+    assert "| the net |  | 0.1 | 0.5 → 0.7 |\n" in text
+    assert text.endswith("<!-- end -->\nafter\n")
+    tables.write(figures, [page])
+    assert page.read_text() == text
+
+
+def test_a_route_in_another_season_has_the_same_places(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for name in ("a", "b"):
+        (tmp_path / "sequences" / name).mkdir(parents=True)
+        for i in range(40):
+            picture = cv2.resize(rng.integers(0, 256, (12, 16, 3), np.uint8), (64, 48))
+            cv2.imwrite(str(tmp_path / "sequences" / name / f"{i:06d}.jpg"), picture)
+    (tmp_path / "sequences" / "index.csv").write_text("name,has_revisits\na,no\nb,no\nc,yes\n")
+    made = {drive.kind: drive.data for drive in drives.drives(tmp_path, tmp_path / "work", ["a"])}
+    assert len(made["season 2"].query_images) == 40
+    assert made["season 2"].truth.hard.sum(axis=1).tolist() == [2, *[3] * 38, 2]
+    assert len(made["keyframes"].reference_images or []) == 10
+    assert made["in part"].truth.queries_with_a_loop.tolist() == [False] * 20 + [True] * 20
+    assert made["comes back"].truth.queries_with_a_loop.sum() == 20
+    assert made["shares nothing"].truth.positives == 0
+    again = drives.in_season(made["season 2"].references, tmp_path / "other", 2)
+    assert np.array_equal(cv2.imread(str(again[5])), cv2.imread(str(made["season 2"].query_images[5])))
+
+
+def test_what_auto_should_reach() -> None:
+    silent = settings.Result("a", "b", 9, 0, 1.0, 0.0, 0.9, "", [])
+    right = settings.Result("a", "b", 9, 8, 1.0, 0.8, 0.9, "", [])
+    wrong = settings.Result("a", "b", 9, 8, 0.9, 0.8, 0.9, "", [])
+    assert [r.good for r in (silent, right, wrong)] == [False, True, False]
+    said = settings.summary([silent, right, wrong])
+    assert said == ("2 of 3 drives with a precision of 0.99; 2 of 3 with 0.7 of the best recall; on 1 auto cannot tell")
