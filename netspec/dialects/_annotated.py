@@ -25,36 +25,48 @@ from netspec.proto.schema import has, message, value
 
 Array = np.ndarray
 
+PERIOD = 10  # iterations from one draw of a resize_param to the next
+MOST_BOXES = 300  # of an image, with yolo_data_type: 1
+
 
 class AnnotatedSource:
     """The records of a database of AnnotatedDatum, made into batches.
 
-    The variations of a record follow from ``seed``, ``stream`` and the record's position alone. ``typed`` says that
-    records count as having boxes, whatever they say. Raises SpecError for a record that cannot be read.
+    The variations of a record follow from ``seed``, ``stream`` and the record's position alone. Of several
+    ``augments`` one is drawn for each PERIOD iterations, by the prob of their resize_param. ``typed`` says that records
+    count as having boxes, whatever they say. With ``centered``, each image's boxes are the rows of YOLO instead:
+    class from 0, x, y, width, height; ``difficult`` says whether difficult boxes are among them. Raises SpecError for a
+    record that cannot be read.
     """
 
     def __init__(
         self,
         reader: Reader,
         cursor: Cursor,
-        augment: Augmenter,
+        augments: Sequence[Augmenter],
         typed: bool,
         seed: int,
         stream: str,
         where: Where | None,
+        centered: bool = False,
+        difficult: bool = True,
     ) -> None:
-        self.cursor, self._reader, self._augment, self._where = cursor, reader, augment, where
-        self._seed, self._stream = seed, stream
+        self.cursor, self._reader, self._augments, self._where = cursor, reader, augments, where
+        self._seed, self._stream, self._centered, self._difficult = seed, stream, centered, difficult
         self._parse = message("ssd.AnnotatedDatum").FromString
         self._has_boxes = True
         image, first = self._read(cursor.first())
         self._has_boxes = typed or first.HasField("type")
-        self._shape = (image.shape[2], *augment.size(image.shape))
+        self._shapes = [(image.shape[2], *augment.size(image.shape)) for augment in augments]
         count = sum(len(group.annotation) for group in first.annotation_group)
         batch = cursor.batch_size
         self.shapes: Sequence[Shape] = (
-            (batch, *self._shape),
-            (1, 1, max(count, 1), COLUMNS + 1) if self._has_boxes else (batch, 1, 1, 1),
+            (batch, *self._shapes[0]),
+            (batch, 1, MOST_BOXES, 5)
+            if centered
+            else (1, 1, max(count, 1), COLUMNS + 1)
+            if self._has_boxes
+            else (batch, 1, 1, 1),
         )
 
     def keys(self, iteration: int) -> list[str]:
@@ -64,23 +76,44 @@ class AnnotatedSource:
     def batch(self, iteration: int) -> Arrays:
         """Return images (N, C, H, W) and rows of boxes (1, 1, n, 8), or labels (N, 1, 1, 1)."""
         images, rows, labels = [], [], []
+        chosen = self._chosen(iteration)
+        augment, shape = self._augments[chosen], self._shapes[chosen]
         places = zip(self.cursor.records(iteration), self.cursor.positions(iteration), strict=True)
         for item, (record, position) in enumerate(places):
             pixels, datum = self._read(record)
             draw = Random(derived(self._seed, f"{self._stream}/{position}"))
-            image, boxes = self._augment(pixels, self._boxes(datum), draw)
-            if self.cursor.batch_size > 1 and image.shape != self._shape:
+            image, boxes = augment(pixels, self._boxes(datum), draw)
+            if self.cursor.batch_size > 1 and image.shape != shape:
                 advice = "all must have the same size: give resize_param, or batch_size: 1"
-                found = f'record "{self._name(record)}" gives {times(image.shape)}, the first {times(self._shape)}'
+                found = f'record "{self._name(record)}" gives {times(image.shape)}, the first {times(shape)}'
                 raise SpecError(f"{found}; {advice}", self._where)
             images.append(image)
             rows.append(np.insert(boxes, 0, item, axis=1))
             labels.append(datum.datum.label)
         if not self._has_boxes:
             return np.stack(images), np.array(labels, np.float32).reshape(-1, 1, 1, 1)
+        if self._centered:
+            return np.stack(images), np.stack([self._as_centered(boxes[:, 1:]) for boxes in rows])
         found = np.concatenate(rows)
         nothing = np.full((1, COLUMNS + 1), -1, np.float32)
         return np.stack(images), (found if len(found) else nothing)[None, None]
+
+    def _chosen(self, iteration: int) -> int:
+        """Return the number of the augmenter of an iteration."""
+        if len(self._augments) == 1:
+            return 0
+        draw = Random(derived(self._seed, f"{self._stream}/resize/{iteration // PERIOD}"))
+        (chosen,) = draw.choices(range(len(self._augments)), [a.resize.prob for a in self._augments])
+        return chosen
+
+    def _as_centered(self, boxes: Array) -> Array:
+        """Return boxes (n, 7) as YOLO's rows (1, MOST_BOXES, 5), zeros after the last."""
+        if not self._difficult:
+            boxes = boxes[boxes[:, 6] == 0]
+        rows = np.zeros((1, MOST_BOXES, 5), np.float32)
+        low, high = boxes[:MOST_BOXES, 2:4], boxes[:MOST_BOXES, 4:6]
+        rows[0, : len(low)] = np.concatenate([boxes[:MOST_BOXES, :1] - 1, (low + high) / 2, high - low], axis=1)
+        return rows
 
     def _name(self, record: int) -> str:
         return self._reader.key(record).decode(errors="backslashreplace")
@@ -94,7 +127,7 @@ class AnnotatedSource:
                 raise ValueError("is no AnnotatedDatum") from None
             if not datum.HasField("datum"):
                 raise ValueError("is no AnnotatedDatum; for a database of plain images use a layer of type Data")
-            image = datum_to_array(datum.datum, self._augment.color)
+            image = datum_to_array(datum.datum, self._augments[0].color)
             if image.dtype != np.uint8:
                 raise ValueError(f"has {image.dtype} values, expected 8 bits per channel")
             return np.ascontiguousarray(image.transpose(1, 2, 0)), datum
@@ -122,8 +155,10 @@ class AnnotatedData(Data):
     top[0]  images (batch_size, C, H, W)
     top[1]  a row for each box (1, 1, n, 8): image, label, instance, xmin, ymin, xmax, ymax, difficult; corners in
             parts of the image; one row of -1 where there is none. Records without a type give their labels
-            (batch_size, 1, 1, 1). May be left out.
-    Fork: src/caffe/layers/annotated_data_layer.cpp
+            (batch_size, 1, 1, 1). May be left out. With yolo_data_type: 1 (batch_size, 1, 300, 5): class from 0, x, y,
+            width, height; zeros after the last box.
+    Fork: src/caffe/layers/annotated_data_layer.cpp; of several resize_param one is drawn by prob for 10 iterations
+    each: eric612/MobileNet-YOLO
     """
 
     @override
@@ -131,11 +166,21 @@ class AnnotatedData(Data):
         p = self.param
         yield from ReadingLayer.wrong_settings(self)
         yield from wrong_settings(p.transform_param, self._samplers, self.context.at)
-        resize = value(p.transform_param, "resize_param")
-        if resize.resize_mode == FIT_SMALL_SIZE and p.data_param.batch_size > 1:
+        resizes = value(p.transform_param, "resize_param")
+        if any(resize.resize_mode == FIT_SMALL_SIZE for resize in resizes) and p.data_param.batch_size > 1:
             found = f"found {p.data_param.batch_size}"
             message = f"FIT_SMALL_SIZE gives each image a size of its own: it needs batch_size: 1, {found}"
             yield self.error(message, "data_param", "batch_size")
+        if not 0 <= self._jitter < 1:
+            message = f"found yolo_data_jitter {self._jitter:g}, expected 0 to less than 1"
+            yield self.error(message, "annotated_data_param", "yolo_data_jitter")
+
+    @property
+    def _jitter(self) -> float:
+        """How much of a side a window may leave out at most; in YOLO's manner unless it is given."""
+        settings = value(self.param, "annotated_data_param")
+        given = settings.HasField("yolo_data_jitter") or settings.yolo_data_type == 1
+        return float(settings.yolo_data_jitter) if given else 0.0
 
     @property
     def _samplers(self) -> Sequence[Any]:
@@ -146,15 +191,22 @@ class AnnotatedData(Data):
     def open(self) -> Source | None:
         p, context = self.param, self.context
         reader = self._reader
-        augment = self.attempt(Augmenter, p.transform_param, self._samplers, self.phase, context.at)
-        if reader is None or augment is None:
+        transform, settings = p.transform_param, value(p, "annotated_data_param")
+        resizes = list(value(transform, "resize_param")) or [None]
+        given = (transform, self._samplers, self.phase, context.at)
+        made = [self.attempt(Augmenter, *given, resize, self._jitter) for resize in resizes]
+        augments = [augment for augment in made if augment is not None]
+        if reader is None or len(augments) < len(made):
             return None
         if p.data_param.force_encoded_color:
-            augment.color = True
+            for augment in augments:
+                augment.color = True
         skip = self.skip(p.data_param.rand_skip, len(reader), "data_param", "rand_skip")
-        cursor = Cursor(len(reader), self.batch_size, skip, rank=context.options.rank, ranks=context.options.ranks)
-        typed = has(value(p, "annotated_data_param"), "anno_type")
-        source = AnnotatedSource(reader, cursor, augment, typed, context.data_seed, self.stream, self.place)
+        cursor = self.cursor(len(reader), skip)
+        centered, difficult = settings.yolo_data_type == 1, settings.train_diffcult
+        typed = has(settings, "anno_type") or centered
+        seed, place = context.data_seed, self.place
+        source = AnnotatedSource(reader, cursor, augments, typed, seed, self.stream, place, centered, difficult)
         self.log_size(source, "annotated_data_layer.cpp:62")
         return source
 
@@ -162,19 +214,21 @@ class AnnotatedData(Data):
     def known_shape(self) -> Shape | None:
         """Return the shape where the prototxt says size and channels."""
         p = self.param.transform_param
-        resize, crop = value(p, "resize_param"), (value(p, "crop_h"), value(p, "crop_w"))
+        resizes, crop = value(p, "resize_param"), (value(p, "crop_h"), value(p, "crop_w"))
         channels = 3 if p.force_color else 1 if p.force_gray else len(p.mean_value)
         if p.crop_size or all(crop):
             size = (p.crop_size,) * 2 if p.crop_size else crop
-        elif has(p, "resize_param") and resize.resize_mode != FIT_SMALL_SIZE:
-            size = (resize.height, resize.width)
+        elif resizes and resizes[0].resize_mode != FIT_SMALL_SIZE:
+            size = (resizes[0].height, resizes[0].width)
         else:
             return None
         return (self.batch_size, channels, *size) if channels > 1 or p.force_gray else None
 
     @override
     def shapes_without_data(self) -> list[Shape]:
-        """Return the images' shape, and that of a single box."""
+        """Return the images' shape, and that of a single box, or of an image's boxes as YOLO has them."""
         data, *_ = super().shapes_without_data()
         given = self.context.options.given_shapes
-        return [data, *(given.get(top, (1, 1, 1, COLUMNS + 1)) for top in self.param.top[1:])]
+        centered = value(self.param, "annotated_data_param").yolo_data_type == 1
+        boxes = (self.batch_size, 1, MOST_BOXES, 5) if centered else (1, 1, 1, COLUMNS + 1)
+        return [data, *(given.get(top, boxes) for top in self.param.top[1:])]

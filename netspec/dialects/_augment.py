@@ -37,6 +37,7 @@ INTERPOLATION = {
     5: cv2.INTER_LANCZOS4,
 }
 CENTER = 0
+ABOUT = 0.01  # how far the probabilities of several resize_param may be from 1 together
 
 
 def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Where]) -> Iterator[SpecError]:
@@ -46,9 +47,14 @@ def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Wh
         return SpecError(message, at(*path))
 
     yield from contradictions(transform, at)
-    resize = value(transform, "resize_param")
-    if has(transform, "resize_param") and not (resize.height and resize.width):
-        yield fault("height and width must both be above 0", "transform_param", "resize_param")
+    resizes = value(transform, "resize_param")
+    for i, resize in enumerate(resizes):
+        if not (resize.height and resize.width):
+            yield fault("height and width must both be above 0", "transform_param", "resize_param", i)
+    if len(resizes) > 1 and abs(sum(resize.prob for resize in resizes) - 1) > ABOUT:
+        total = sum(resize.prob for resize in resizes)
+        message = f"found {len(resizes)} resize_param whose prob add up to {total:g}, expected 1"
+        yield fault(message, "transform_param", "resize_param")
     if has(transform, "expand_param"):
         if value(transform, "expand_param").max_expand_ratio <= 1:
             yield fault("max_expand_ratio must be above 1", "transform_param", "expand_param")
@@ -73,11 +79,20 @@ def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Wh
 class Augmenter:
     """Applies a ``transform_param`` with SSD's fields, after the batch samplers. ``at(*path)`` is a field's place.
 
-    Raises SpecError for a mean file that cannot be read.
+    ``resize`` is its resize_param, or one of them; None for none. With ``jitter`` one window is drawn without the
+    samplers. Raises SpecError for a mean file that cannot be read.
     """
 
-    def __init__(self, transform: Any, samplers: Sequence[Any], phase: int, at: Callable[..., Where]) -> None:
-        self._at, self._samplers = at, list(samplers)
+    def __init__(
+        self,
+        transform: Any,
+        samplers: Sequence[Any],
+        phase: int,
+        at: Callable[..., Where],
+        resize: Any = None,
+        jitter: float = 0.0,
+    ) -> None:
+        self._at, self._samplers, self._jitter = at, list(samplers), jitter
         self._scale, self._mirror = np.float32(transform.scale), transform.mirror
         self._random_crop = phase == TRAIN
         crop = (value(transform, "crop_h"), value(transform, "crop_w"))
@@ -92,7 +107,7 @@ class Augmenter:
             return value(transform, name) if has(transform, name) else None
 
         self._distort, self._expand = given("distort_param"), given("expand_param")
-        self.resize, self._emit = given("resize_param"), given("emit_constraint")
+        self.resize, self._emit = resize, given("emit_constraint")
 
     def __call__(self, image: Array, boxes: Array, draw: Random) -> tuple[Array, Array]:
         """Return an image as float32 (C, H', W') and the boxes that belong to it; all chance comes from ``draw``."""
@@ -100,7 +115,7 @@ class Augmenter:
             image = distorted(image, self._distort, draw)
         if self._expand is not None and draw.random() <= self._expand.prob:
             image, boxes = self._expanded(image, boxes, draw)
-        windows = list(self._windows(boxes[:, CORNERS], draw))
+        windows = [self._jittered(draw)] if self._jitter else list(self._windows(boxes[:, CORNERS], draw))
         if windows:
             image, boxes = self._cut(image, boxes, draw.choice(windows))
         return self._transformed(image, boxes, draw)
@@ -146,6 +161,18 @@ class Augmenter:
                 if suits(window, boxes, sampler.sample_constraint):
                     found += 1
                     yield window
+
+    def _jittered(self, draw: Random) -> Array:
+        """Return a window of YOLO's: the whole image, or in 8 of 10 cases sides shorter by up to half or all of jitter.
+
+        Images that are padded to a size keep their proportions.
+        """
+        (shorter,) = draw.choices((0, self._jitter / 2, self._jitter), (0.2, 0.2, 0.6))
+        width = draw.uniform(1 - shorter, 1)
+        keeps = self.resize is not None and self.resize.resize_mode == FIT_LARGE_SIZE_AND_PAD
+        height = width if keeps else draw.uniform(1 - shorter, 1)
+        left, top = draw.uniform(0, 1 - width), draw.uniform(0, 1 - height)
+        return np.array([left, top, left + width, top + height], np.float32).clip(0, 1)
 
     def _cut(self, image: Array, boxes: Array, window: Array) -> tuple[Array, Array]:
         height, width = image.shape[:2]

@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from netspec.dialects._relu6 import Capped
 from netspec.layers import Layer, register
-from netspec.layers.activation import Activation
 from netspec.layers.base import Shape
 from netspec.layers.folding import Affine, blob_in_double
 from netspec.layers.normalization import onnx_normalized, torch_batch_norm
@@ -115,7 +115,7 @@ class Axpy(Layer):
 
 
 @register("ReLU6", "relu6_param")
-class ReLU6(Activation):
+class ReLU6(Capped):
     """min(max(x, 0) + negative_slope min(x, 0), 6); the gradient at 0 is the negative side's, at 6 none.
 
     bottom[0]  any shape
@@ -123,29 +123,9 @@ class ReLU6(Activation):
     Fork: chuanqi305/ssd and others, src/caffe/layers/relu6_layer.cpp
     """
 
-    gradient_reads = frozenset({"bottom"})
-
     @override
     def setup(self) -> None:
         self.slope: float = value(self.param, "relu6_param").negative_slope
-
-    @override
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.where(x >= 6, 6, F.leaky_relu(x, self.slope) if self.slope else F.relu(x))
-
-    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        return torch.where(bottom > 0, diff, diff * self.slope).where(bottom < 6, 0)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.slope == 0:
-            return graph.node("Clip", *bottoms, graph.constant(0.0), graph.constant(6.0))
-        leaky = graph.node("LeakyRelu", *bottoms, alpha=self.slope)
-        return graph.node("Min", leaky, graph.constant(6.0))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.slope == 0:
-            return code.call("F.relu6({x})", x=bottoms[0])
-        return code.call("F.leaky_relu({x}, {slope}).clamp(max=6)", x=bottoms[0], slope=self.slope)
 
 
 @register("DepthwiseConvolution", "convolution_param")

@@ -1,7 +1,8 @@
-"""Fields that forks added to Convolution: the holes of DeepLab, and a pad of its own for each side (Synopsys)."""
+"""Fields that forks added to Caffe's layers: DeepLab's holes; a pad for each side, AVE_EXC_PAD and relu6 (Synopsys)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,13 +10,14 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
-from netspec.layers import register
+from netspec.dialects._relu6 import Capped
+from netspec.layers import activation, register
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.preparing import Kernel, Preparation
 from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.vision import convolution
-from netspec.proto.schema import has, value
+from netspec.layers.vision import convolution, pooling, windows
+from netspec.proto.schema import added_value, has, value
 
 DECLARATIONS = """
 extend ConvolutionParameter {
@@ -26,6 +28,17 @@ extend ConvolutionParameter {
   optional uint32 pad_r = 1037 [default = 0];
   optional uint32 pad_t = 1038 [default = 0];
   optional uint32 pad_b = 1039 [default = 0];
+}
+enum PoolMethod { AVE_EXC_PAD = 3; AVE_TF = 4; }
+extend PoolingParameter {
+  optional PoolMethod pool = 1035;
+  optional uint32 pad_l = 1036 [default = 0];
+  optional uint32 pad_r = 1037 [default = 0];
+  optional uint32 pad_t = 1038 [default = 0];
+  optional uint32 pad_b = 1039 [default = 0];
+}
+extend ReLUParameter {
+  optional bool relu6 = 1003 [default = false];
 }
 """
 
@@ -114,3 +127,114 @@ class Convolution(convolution.Convolution):
             sides = tuple(self.sides)
             bottoms = tuple(code.call("F.pad({x}, {sides})", x=bottom, sides=sides) for bottom in bottoms)
         return super().to_torch(code, *bottoms)
+
+
+POOLING = "pooling_param"
+
+
+@register("Pooling", POOLING, *(f"{POOLING}.{name}" for name in ("pool", *SIDES)), replaces=pooling.Pooling)
+class Pooling(pooling.Pooling):
+    """Caffe's Pooling, with pad_l, pad_r, pad_t and pad_b, and AVE_EXC_PAD: the mean of a window's pixels alone.
+
+    With AVE, padding counts as zeros, up to each side's pad. AVE_TF is an older name of AVE_EXC_PAD.
+
+    bottom[0]  (N, C, H, W)
+    top[0]     (N, C, H', W'),  H' = ceil((H + pad_t + pad_b - kernel) / stride) + 1 by Caffe's rules
+    top[1]     only without these fields: as Caffe's
+    Fork: foss-for-synopsys-dwc-arc-processors/synopsys-caffe, src/caffe/layers/pooling_layer.cpp
+    """
+
+    def __new__(cls, param: Any = None, *arguments: Any) -> Any:
+        """Make Caffe's own layer where the prototxt has none of these fields; a copy is made without a ``param``."""
+        p = None if param is None else param.pooling_param
+        if p is not None and not added_value(p, "pool") and not any(value(p, name) for name in SIDES):
+            return pooling.Pooling(param, *arguments)
+        return super().__new__(cls)
+
+    @override
+    def setup(self) -> None:
+        super().setup()
+        param = self.param.pooling_param
+        self.pixels_only = bool(added_value(param, "pool"))
+        if self.pixels_only:
+            self.method = pooling.AVE
+        if self.method == pooling.STOCHASTIC:
+            raise self.error("STOCHASTIC pooling does not support padding", POOLING)
+        if self.num_tops > 1:
+            raise self.error("there is no mask with AVE_EXC_PAD or a pad for each side", "top", 1)
+        left, right, up, down = (value(param, name) for name in SIDES)
+        if any((left, right, up, down)) and any(self.pad):
+            raise self.error("found both pad and a pad for each side; give one of them", POOLING)
+        self.sides = ((up, down), (left, right)) if any((left, right, up, down)) else [(p, p) for p in self.pad]
+
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the top's shape; each side's pad must be less than the kernel."""
+        shape, param = bottom_shapes[0], self.param.pooling_param
+        if len(shape) != 4:
+            raise self.error(f"pooling needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
+        self.kernel = (shape[2], shape[3]) if param.global_pooling else self.kernel
+        counts, self.frame, self.lengths = [], [], []
+        for size, kernel, stride, (before, after) in zip(shape[2:], self.kernel, self.stride, self.sides, strict=True):
+            if max(before, after) >= kernel > 1 or (kernel == 1 and before + after):
+                raise self.error(f"a pad of {max(before, after)} must be less than the kernel {kernel}", POOLING)
+            room = size + before + after - kernel
+            count = (room // stride if param.round_mode == windows.FLOOR else -(-room // stride)) + 1
+            count -= any(map(any, self.sides)) and (count - 1) * stride >= size + before
+            if count < 1:
+                raise self.error(f"no window of {kernel} at stride {stride} fits {size} pixels", POOLING)
+            counts.append(count)
+            self.frame = [before, (count - 1) * stride + kernel - before - size, *self.frame]
+            starts = [i * stride - before for i in range(count)]
+            limits = (0, size) if self.pixels_only else (-before, size + after)
+            self.lengths.append([min(start + kernel, limits[1]) - max(start, limits[0]) for start in starts])
+        return [(*shape[:2], *counts)]
+
+    @override
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        if self.method == pooling.MAX:
+            return F.max_pool2d(F.pad(data, self.frame, value=windows.LOWEST), self.kernel, self.stride)
+        sums = F.avg_pool2d(F.pad(data, self.frame), self.kernel, self.stride, divisor_override=1)
+        return sums / self._areas().to(data)
+
+    def _areas(self) -> torch.Tensor:
+        return torch.outer(*(torch.tensor(lengths, dtype=torch.float64) for lengths in self.lengths))
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        for axis in (2, 3):
+            graph.size(0, axis, "its windows follow from the map's size")
+        left, right, up, down = self.frame
+        if min(self.frame) < 0:
+            raise refusal(self, "ONNX", "its windows leave out the map's end")
+        value = graph.constant(windows.LOWEST if self.method == pooling.MAX else 0.0)
+        framed = graph.node(
+            "Pad", *bottoms, graph.constant([0, 0, up, left, 0, 0, down, right]), value, mode="constant"
+        )
+        geometry = {"kernel_shape": list(self.kernel), "strides": list(self.stride)}
+        if self.method == pooling.MAX:
+            return graph.node("MaxPool", framed, **geometry)
+        shares = (self._areas() / math.prod(self.kernel)).float()
+        return graph.node("Div", graph.node("AveragePool", framed, **geometry), graph.constant(shares[None, None]))
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        raise refusal(self, "PyTorch", "it has no pooling with a pad for each side, or of pixels alone")
+
+
+@register("ReLU", "relu_param", "relu_param.relu6", replaces=activation.ReLU)
+class ReLU(Capped):
+    """Caffe's ReLU; with relu6 no more than 6: min(max(x, 0) + negative_slope min(x, 0), 6).
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: foss-for-synopsys-dwc-arc-processors/synopsys-caffe, src/caffe/layers/relu_layer.cpp
+    """
+
+    def __new__(cls, param: Any = None, *arguments: Any) -> Any:
+        """Make Caffe's own layer where the prototxt does not ask for relu6; a copy is made without a ``param``."""
+        if param is not None and not value(param.relu_param, "relu6"):
+            return activation.ReLU(param, *arguments)
+        return super().__new__(cls)
+
+    @override
+    def setup(self) -> None:
+        self.slope: float = self.param.relu_param.negative_slope

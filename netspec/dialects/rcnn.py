@@ -1,4 +1,4 @@
-"""Fast and Faster R-CNN and R-FCN: rbgirshick/caffe-fast-rcnn, daijifeng001/caffe-rfcn.
+"""Fast and Faster R-CNN: rbgirshick/caffe-fast-rcnn; R-FCN's layers are in rfcn.py.
 
 The Python layers of py-faster-rcnn are here too, by module and class. Where ``--allow-python-layers`` is given and
 their module can be imported, the module's code runs instead.
@@ -19,6 +19,7 @@ from typing_extensions import override
 from netspec.dialects._boxes import as_array
 from netspec.dialects._faster import RATIOS, SCALES, AnchorTarget, ProposalTarget, RoIData, settings
 from netspec.dialects._proposals import all_anchors, base_anchors, moved, suppress
+from netspec.dialects._regions import RegionPooling, whole
 from netspec.layers import Layer, common, register
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
@@ -35,11 +36,6 @@ message ROIPoolingParameter {
 message SmoothL1LossParameter {
   optional float sigma = 1 [default = 1];
 }
-message PSROIPoolingParameter {
-  required float spatial_scale = 1;
-  required int32 output_dim = 2;
-  required int32 group_size = 3;
-}
 message ProposalParameter {
   optional uint32 feat_stride = 1 [default = 16];
   optional uint32 base_size = 2 [default = 16];
@@ -52,7 +48,6 @@ message ProposalParameter {
 }
 extend LayerParameter {
   optional ProposalParameter proposal_param = 10002;
-  optional PSROIPoolingParameter psroi_pooling_param = 10001;
   optional ROIPoolingParameter roi_pooling_param = 8266711;
   optional SmoothL1LossParameter smooth_l1_loss_param = 8266712;
 }
@@ -94,37 +89,8 @@ class Dropout(common.Dropout):
         return code.call("{x} * {kept}", x=bottoms[0], kept=1 - self.ratio)
 
 
-class _RegionPooling(Layer):
-    """Base of the layers that pool the part of a map that a region of the image covers."""
-
-    bottoms = (2, 2)
-
-    def check_regions(self, bottom_shapes: Sequence[Shape]) -> int:
-        """Return how many regions there are; refuse other bottoms than a map and regions."""
-        maps, regions = bottom_shapes
-        if len(maps) != 4:
-            raise self.error(f"found a map of shape {maps}, expected 4 axes (N, C, H, W)", "bottom", 0)
-        if regions[1:] not in ((5,), (5, 1, 1)):
-            raise self.error(f"found regions of shape {regions}, expected (R, 5): image, x1, y1, x2, y2", "bottom", 1)
-        return regions[0]
-
-    def images_of(self, regions: torch.Tensor, images: int) -> torch.Tensor:
-        """Return the image that each region (R, 5) is in; raise SpecError for one that is not in the batch."""
-        image = regions[:, 0].long()
-        wrong = image[(image < 0) | (image >= images)]
-        if len(wrong):
-            raise self.error(f"found a region in image {wrong[0]}, expected 0 to {images - 1}", "bottom", 1)
-        return image
-
-
-def _rounded(x: torch.Tensor) -> torch.Tensor:
-    """Return the nearest whole numbers; halves away from zero, as C's round does."""
-    whole = x.trunc()
-    return whole + x.sign() * ((x - whole).abs() >= 0.5)
-
-
 @register("ROIPooling", "roi_pooling_param")
-class ROIPooling(_RegionPooling):
+class ROIPooling(RegionPooling):
     """Divide each region of a map into pooled_h x pooled_w bins and return the maximum of each.
 
     A region's corners are scaled by spatial_scale and rounded to pixels, both included. The first of equal pixels gets
@@ -155,7 +121,7 @@ class ROIPooling(_RegionPooling):
         with torch.no_grad():
             regions = regions.reshape(-1, 5)
             image = self.images_of(regions, images)
-            corners = _rounded(regions[:, 1:] * self.scale)
+            corners = whole(regions[:, 1:] * self.scale)
             rows = self._bins(corners[:, 1], corners[:, 3], self.bins[0], height)[:, :, None]
             columns = self._bins(corners[:, 0], corners[:, 2], self.bins[1], width)[:, None]
             windows = torch.cat(torch.broadcast_tensors(rows, columns), dim=3)
@@ -226,68 +192,6 @@ def _first_of(a: Table, b: Table) -> Table:
     """Return the greater values; of equal ones those of the first pixel."""
     second = (b[0] > a[0]) | ((b[0] == a[0]) & (b[1] < a[1]))
     return torch.where(second, b[0], a[0]), torch.where(second, b[1], a[1])
-
-
-@register("PSROIPooling", "psroi_pooling_param")
-class PSROIPooling(_RegionPooling):
-    """Divide each region of a map into g x g bins and return the mean of each, from a channel of its own.
-
-    Channel d of the top, row i and column j of the bins, is read from channel (d g + i) g + j of the map, g being
-    group_size. A region's corners are rounded to pixels of the image, both included, then scaled by spatial_scale; a
-    bin is made of all pixels that it touches, and is 0 where there are none.
-
-    bottom[0]  the map (N, output_dim g g, H, W)
-    bottom[1]  regions (R, 5): image, x1, y1, x2, y2; gets no gradient
-    top[0]     (R, output_dim, g, g)
-    Fork: daijifeng001/caffe-rfcn, src/caffe/layers/psroi_pooling_layer.cpp
-    """
-
-    not_exported = "there is no position-sensitive pooling of regions"
-
-    @override
-    def setup(self) -> None:
-        param = value(self.param, "psroi_pooling_param")
-        for name in ("output_dim", "group_size"):
-            if getattr(param, name) < 1:
-                raise self.error(f"{name} must be given and be at least 1", "psroi_pooling_param", name)
-        self.channels, self.bins, self.scale = param.output_dim, param.group_size, param.spatial_scale
-
-    @override
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of all regions' bins; the map must have a channel for each."""
-        regions = self.check_regions(bottom_shapes)
-        expected = self.channels * self.bins * self.bins
-        if bottom_shapes[0][1] != expected:
-            message = f"found {bottom_shapes[0][1]} channels, expected output_dim group_size^2 = {expected}"
-            raise self.error(message, "bottom", 0)
-        return [(regions, self.channels, self.bins, self.bins)]
-
-    @override
-    def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
-        with torch.no_grad():
-            regions = regions.reshape(-1, 5)
-            image = self.images_of(regions, maps.shape[0])
-            corners = _rounded(regions[:, 1:])
-            columns = self._inside(corners[:, 0], corners[:, 2], maps.shape[3])
-            rows = self._inside(corners[:, 1], corners[:, 3], maps.shape[2])
-            areas = rows.sum(2)[:, :, None] * columns.sum(2)[:, None, :]
-            rows, columns = rows.to(maps), columns.to(maps)
-        grouped = maps.unflatten(1, (self.channels, self.bins, self.bins))
-        sums = maps.new_zeros(self.top_shapes[0])
-        for i in image.unique().tolist():
-            own = image == i
-            by_row = torch.einsum("rqw,cpqhw->rcpqh", columns[own], grouped[i])
-            sums = sums.index_put((own,), torch.einsum("rph,rcpqh->rcpq", rows[own], by_row))
-        return sums / areas.clamp(min=1)[:, None]
-
-    def _inside(self, first: torch.Tensor, last: torch.Tensor, size: int) -> torch.Tensor:
-        """Return 1 for each pixel of the map that a bin touches along one axis, else 0: (R, bins, size)."""
-        start = first * self.scale
-        length = ((last + 1) * self.scale - start).clamp(min=0.1)
-        steps = torch.arange(self.bins + 1, dtype=first.dtype, device=first.device) * (length / self.bins)[:, None]
-        ends = steps + start[:, None]
-        pixels = torch.arange(size, dtype=first.dtype, device=first.device)
-        return ((pixels >= ends[:, :-1, None].floor()) & (pixels < ends[:, 1:, None].ceil())).to(first.dtype)
 
 
 @register("Proposal", "proposal_param")

@@ -176,6 +176,10 @@ message AnnotatedDataParameter {
   repeated BatchSampler batch_sampler = 1;
   optional string label_map_file = 2;
   optional AnnotatedDatum.AnnotationType anno_type = 3;
+  // eric612/MobileNet-YOLO
+  optional int32 yolo_data_type = 4 [default = 0];
+  optional float yolo_data_jitter = 5 [default = 0.3];
+  optional bool train_diffcult = 6 [default = true];
 }
 message DetectionEvaluateParameter {
   optional uint32 num_classes = 1;
@@ -208,7 +212,7 @@ message EmitConstraint {
   optional float emit_overlap = 2;
 }
 extend TransformationParameter {
-  optional ResizeParameter resize_param = 8;
+  repeated ResizeParameter resize_param = 8;
   optional EmitConstraint emit_constraint = 10;
   optional uint32 crop_h = 11 [default = 0];
   optional uint32 crop_w = 12 [default = 0];

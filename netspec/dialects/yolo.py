@@ -1,4 +1,4 @@
-"""YOLO in Caffe, versions 2 and 3: eric612/MobileNet-YOLO and its kin. Their losses are not here; the nets run."""
+"""YOLO in Caffe, versions 2 and 3: eric612/MobileNet-YOLO and its kin. Of version 3 the loss is not here; nets run."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from typing_extensions import override
 
 from netspec.dialects._boxes import Array, as_array, overlaps
+from netspec.dialects._region_loss import RegionLoss
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape
 from netspec.proto.schema import value
@@ -35,11 +36,34 @@ message Yolov3DetectionOutputParameter {
   optional uint32 mask_group_num = 7 [default = 2];
   repeated uint32 mask = 8;
 }
+message RegionLossParameter {
+  optional uint32 side = 1 [default = 13];
+  optional uint32 num_class = 2 [default = 20];
+  optional uint32 bias_match = 3 [default = 1];
+  optional uint32 coords = 4 [default = 4];
+  optional uint32 num = 5 [default = 5];
+  optional uint32 softmax = 6 [default = 1];
+  optional float jitter = 7 [default = 0.2];
+  optional uint32 rescore = 8 [default = 1];
+  optional float object_scale = 9 [default = 1];
+  optional float class_scale = 10 [default = 1];
+  optional float noobject_scale = 11 [default = 0.5];
+  optional float coord_scale = 12 [default = 5];
+  optional uint32 absolute = 13 [default = 1];
+  optional float thresh = 14 [default = 0.2];
+  optional uint32 random = 15 [default = 1];
+  repeated float biases = 16;
+  optional string softmax_tree = 17;
+  optional string class_map = 18;
+}
 extend LayerParameter {
+  optional RegionLossParameter region_loss_param = 1200;
   optional YoloDetectionOutputParameter yolo_detection_output_param = 1198;
   optional Yolov3DetectionOutputParameter yolov3_detection_output_param = 1199;
 }
 """
+
+register("RegionLoss", "region_loss_param")(RegionLoss)
 
 OBJECT, CLASSES = 4, 5  # where they begin among the numbers of a box; x, y, width and height are before them
 

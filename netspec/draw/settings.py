@@ -29,7 +29,8 @@ def settings_text(layer: Any) -> str:
 
 def _words(param: Any) -> Iterator[str]:
     given: dict[str, Any] = {}
-    for name, field in fields_of(param.DESCRIPTOR).items():
+    for field in fields_of(param.DESCRIPTOR).values():
+        name = field.name
         if field.type != Declared.TYPE_MESSAGE and field.present(param) and name not in SILENT:
             given[name] = _value(field, field.get(param))
     for name, (high, wide) in WINDOWS.items():

@@ -18,7 +18,7 @@ from netspec.errors import ForkFault, SpecError, Where, did_you_mean
 from netspec.proto.dialect import registry as dialect
 from netspec.proto.dialect.files import announce_known
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
-from netspec.proto.schema import Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
+from netspec.proto.schema import MORE, Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Place
 
 _RANGES: dict[int, tuple[int, int]] = {
@@ -91,7 +91,8 @@ class _Reader:
             self._report(fault)
             self._skip(name)
             return
-        if not field.repeated and field.present(message):
+        more = fields_of(message.DESCRIPTOR).get(alias + MORE)
+        if not field.repeated and any(f is not None and f.present(message) for f in (field, more)):
             first = children[alias][0].where.line
             raise self._error(f'"{alias}" was already given in line {first}; it can be given only once', name)
         nodes = children.setdefault(field.name, [])
@@ -99,6 +100,8 @@ class _Reader:
             self._next()
         elif field.type != Declared.TYPE_MESSAGE:
             raise self._expected('":"', f'after "{name.text}"')
+        if more is not None and self.token.text in more.descriptor.enum_type.values_by_name:
+            field = more
         if meaning is not None:
             field.set(message, field.descriptor.enum_type.values_by_name[meaning[self._boolean()]].number)
             nodes.append(Place(self.lexer.where(name.start)))
@@ -236,7 +239,9 @@ class _Reader:
             word = self._next().text
             if word in values:
                 return values[word].number
-            known = did_you_mean(word, list(values)) or f"; it is one of {', '.join(values)}"
+            more = fields_of(self._open[-1][0].DESCRIPTOR).get(field.name + MORE)
+            names = [*values, *(more.descriptor.enum_type.values_by_name if more else ())]
+            known = did_you_mean(word, names) or f"; it is one of {', '.join(names)}"
             raise self._error(f'"{field.name}" has no value "{word}"{known}', start)
         negative = self._minus()
         if self.token.kind != INTEGER:

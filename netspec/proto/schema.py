@@ -18,6 +18,7 @@ from google.protobuf.message import Message
 from netspec.errors import SpecError
 
 PACKAGE = "caffe"
+MORE = "+"  # no name in a text ends in it
 _LAST_NUMBER = 1 << 29  # field numbers end before this
 
 #: The pool; :mod:`netspec.proto.dialect.registry` adds the messages and fields of forks to it.
@@ -156,7 +157,8 @@ class Field:
         return message.HasField(self.name)
 
 
-#: Fields that active dialects add: full name of the message -> name of the field -> Field.
+#: Fields that active dialects add: full name of the message -> name of the field -> Field. Values that they add to an
+#: enum of Caffe's are a field too, which has the name of Caffe's field, under that name and MORE.
 added_fields: dict[str, dict[str, Field]] = {}
 _own_fields: dict[str, dict[str, Field]] = {}
 
@@ -190,6 +192,13 @@ def _field(message: Message, name: str) -> Field:
 def value(message: Message, name: str) -> Any:
     """Return the value of a field, or its default if it is absent; ``name`` may be a field of an active dialect."""
     return _field(message, name).get(message)
+
+
+def added_value(message: Message, name: str) -> str:
+    """Return the value that a field of an enum was given, if it is one that a dialect adds to the enum; else ""."""
+    field = fields_of(message.DESCRIPTOR).get(name + MORE)
+    given = field is not None and field.present(message)
+    return field.descriptor.enum_type.values_by_number[field.get(message)].name if given else ""
 
 
 def has(message: Message, name: str) -> bool:

@@ -25,7 +25,7 @@ from netspec.data.transformer import Transformer, contradictions
 from netspec.errors import SpecError, UnknownShape, Where
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
-from netspec.proto.schema import PHASE_NAMES
+from netspec.proto.schema import PHASE_NAMES, value
 from netspec.terminal import log
 
 BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
@@ -63,7 +63,7 @@ class ReadingLayer(Layer):
 
     def wrong_settings(self) -> Iterator[SpecError]:
         """Yield what is wrong whatever the files hold."""
-        p = getattr(self.param, self.group)
+        p = value(self.param, self.group)
         if p.batch_size <= 0:
             yield self.error(f"batch_size must be above 0, found {p.batch_size}", self.group, "batch_size")
         if not p.source:
@@ -87,7 +87,7 @@ class ReadingLayer(Layer):
 
     @override
     def setup(self) -> None:
-        self.batch_size: int = getattr(self.param, self.group).batch_size
+        self.batch_size: int = value(self.param, self.group).batch_size
         self._source: Source | None = None
         self._feed: Feed[Batch] | None = None
         if not self.opens_data:
@@ -207,6 +207,12 @@ class ReadingLayer(Layer):
             raise self.error(f"cannot skip {skip} records (rand_skip): there are only {count}", *path)
         return skip
 
+    def cursor(self, count: int, skip: int, shuffle: bool = False) -> Cursor:
+        """Return the order in which ``count`` records are read, the first ``skip`` of them not."""
+        options = self.context.options
+        draws = (self.context.data_seed, self.stream, options.rank, options.ranks)
+        return Cursor(count, self.batch_size, skip, shuffle, *draws)
+
     def log_size(self, source: Source, site: str) -> None:
         """Log the shape of a batch."""
         log.info(site, "output data size: " + ",".join(map(str, source.shapes[0])))
@@ -255,10 +261,7 @@ class Data(ReadingLayer):
         if p.force_encoded_color:
             transformer.color = True
         skip = self.skip(p.rand_skip, len(reader), "data_param", "rand_skip")
-        cursor = Cursor(
-            len(reader), self.batch_size, skip, rank=self.context.options.rank, ranks=self.context.options.ranks
-        )
-        source = DatabaseSource(reader, cursor, transformer, self.place)
+        source = DatabaseSource(reader, self.cursor(len(reader), skip), transformer, self.place)
         self.log_size(source, "data_layer.cpp:45")
         return source
 
@@ -308,8 +311,7 @@ class ImageData(ReadingLayer):
             log.info("image_data_layer.cpp:53", "Shuffling data")
         log.info("image_data_layer.cpp:63", f"A total of {len(images)} images.")
         skip = self.skip(p.rand_skip, len(images), "image_data_param", "rand_skip")
-        seed, rank, ranks = self.context.data_seed, self.context.options.rank, self.context.options.ranks
-        cursor = Cursor(len(images), self.batch_size, skip, p.shuffle, seed, self.stream, rank, ranks)
+        cursor = self.cursor(len(images), skip, p.shuffle)
         size = (p.new_height, p.new_width) if p.new_height else None
         self.possible((3, *(size or ())))
         source = ImageListSource(images, p.root_folder, p.is_color, size, cursor, transformer)

@@ -1,31 +1,38 @@
-"""Which dialects a prototxt is written in: those whose fields and layer types it has."""
+"""Which dialects a prototxt is written in: those whose fields, values and layer types it has."""
 
 from __future__ import annotations
 
 from netspec.proto.dialect.files import announce_known, find_file, known_files, switch_on
-from netspec.proto.dialect.registry import active, known
+from netspec.proto.dialect.registry import Dialect, active, known
 from netspec.proto.lexer import NAME, STRING, Lexer
 from netspec.proto.schema import caffe_names
 from netspec.terminal import log
 
 
 def use_dialects_of(text: str, file: str) -> list[str]:
-    """Switch on the dialects whose fields or layer types a prototxt has; return their names.
+    """Switch on the dialects whose fields, values of enums or layer types a prototxt has; return their names.
 
-    The dialect that has most of them comes first; what it has is not looked for in others. A name that Caffe has too,
-    in whichever message (``bias_filler``), switches nothing on. ``file`` is what errors call the text. Raises SpecError
-    for text that is no prototxt at all.
+    The dialect that has most of them comes first, of equal ones that whose messages have more of the fields; what it
+    has is not looked for in others. Where two have the same all the same, neither is switched on. A name that Caffe has
+    too, in whichever message (``bias_filler``), switches nothing on. ``file`` is what errors call the text. Raises
+    SpecError for text that is no prototxt at all.
     """
     words = _words(text, file) - caffe_names()
     announce_known()
-    own = {d.name: {field for _, field in d.fields()} | set(d.layer_types) for d in known() if d.name in known_files()}
+    own = {d.name: _own_words(d) for d in known() if d.name in known_files()}
     for name in active():
         words -= own.pop(name, set())
     used = []
+    inner = {d.name: d.inner_fields() for d in known()}
     while own:
-        name = max(own, key=lambda name: len(words & own[name]))
+        found = {name: (len(words & names), len(words & inner[name])) for name, names in own.items()}
+        name = max(own, key=lambda name: found[name])
         if not words & own[name]:
             break
+        alike = [other for other in own if found[other] == found[name] and words & own[other] == words & own[name]]
+        if len(alike) > 1:  # the layer that is built asks which is meant
+            words -= own[name]
+            continue
         switch_on(find_file(name))
         used.append(name)
         words -= own.pop(name)
@@ -34,8 +41,14 @@ def use_dialects_of(text: str, file: str) -> list[str]:
     return used
 
 
+def _own_words(dialect: Dialect) -> set[str]:
+    """Return the names of a dialect's fields, of the values that it adds to Caffe's enums, and of its layer types."""
+    values = {value for names in dialect.values().values() for value in names}
+    return {field for _, field in dialect.fields()} | values | set(dialect.layer_types)
+
+
 def _words(text: str, file: str) -> set[str]:
-    """Return the field names and the layer types in a prototxt."""
+    """Return the names of fields and of values, and the layer types, in a prototxt."""
     lexer = Lexer(text, file)
     words, before = set(), ["", ""]
     for token in lexer:

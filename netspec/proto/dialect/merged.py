@@ -2,18 +2,19 @@
 
 :mod:`netspec.proto.dialect.registry` adds the fields of dialects as extensions, so that they can come and go. Programs
 that were written for a fork know them as fields of the fork's own ``caffe_pb2``: ``layer.permute_param.order``. Their
-classes come from here. They have the same bytes and the same text.
+classes come from here. They have the same text; the same bytes too, but for values added to an enum of Caffe's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool
 
 from netspec.errors import SpecError, Where
-from netspec.proto.dialect.registry import Dialect, active_dialects
+from netspec.proto.dialect.registry import Dialect, active_dialects, full_name_of
 from netspec.proto.schema import PACKAGE, pool
 
 _FILE = "caffe.proto"
@@ -41,14 +42,27 @@ def _merged(dialects: tuple[Dialect, ...]) -> Any:
         additions.CopyFrom(dialect.declarations)
         for declared in additions.message_type:
             _add_message(file, messages, declared, dialect)
-        file.enum_type.extend(additions.enum_type)
+        values = dialect.values()
+        replaced = {f.type_name for f in additions.extension if (full_name_of(f.extendee), f.name) in values}
+        file.enum_type.extend(enum for enum in additions.enum_type if enum.name not in replaced)
         for field in additions.extension:
             extended = messages[field.extendee.rpartition(".")[2]]
+            if names := values.get((full_name_of(field.extendee), field.name)):
+                _add_values(extended, field.name, names)
+                continue
             field.ClearField("extendee")
             extended.field.append(field)
     merged = descriptor_pool.DescriptorPool()
     merged.Add(file)
     return merged.FindFileByName(_FILE)
+
+
+def _add_values(extended: descriptor_pb2.DescriptorProto, field: str, names: Sequence[str]) -> None:
+    """Add the values ``names`` to the enum of a field of Caffe's, under numbers after its own."""
+    enum = next(f.type_name for f in extended.field if f.name == field).rpartition(".")[2]
+    values = next(found.value for found in extended.enum_type if found.name == enum)
+    for name in names:
+        values.add(name=name, number=1 + max(value.number for value in values))
 
 
 def _add_message(

@@ -11,13 +11,24 @@ fields of Caffe's messages in ``extend``::
     }
 
 The text reader and writer then treat ``norm_param { ... }`` as a field of LayerParameter, and a layer reads it
-with ``schema.value(self.param, "norm_param")``. The classes of Caffe's messages stay the same objects; while no
-dialect is active, the schema is Caffe's. Numbers must be above those that Caffe itself uses in the message. A fork
-that uses one of these (``interp_param = 143``) needs another number here; text files do not contain the numbers.
+with ``schema.value(self.param, "norm_param")``. Values for an enum of Caffe's are declared as a field that has the name
+of Caffe's, of an enum that has the new ones only::
+
+    enum PoolMethod { AVE_EXC_PAD = 3; }
+    extend PoolingParameter {
+      optional PoolMethod pool = 1036;
+    }
+
+``schema.added_value(self.param.pooling_param, "pool")`` then is ``"AVE_EXC_PAD"``.
+
+The classes of Caffe's messages stay the same objects; while no dialect is active, the schema is Caffe's. Numbers must
+be above those that Caffe itself uses in the message. A fork that uses one of these (``interp_param = 143``) needs
+another number here; text files do not contain the numbers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -26,7 +37,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
 from netspec.errors import SpecError, Where
 from netspec.proto.dialect.declarations import read_declarations
-from netspec.proto.schema import PACKAGE, add_file, added_fields, as_field, fields_of, pool
+from netspec.proto.schema import MORE, PACKAGE, add_file, added_fields, as_field, fields_of, pool
 
 
 @dataclass(frozen=True)
@@ -52,12 +63,37 @@ class Dialect:
 
     def fields(self) -> set[tuple[str, str]]:
         """The fields that it adds: full name of Caffe's message and name of the field."""
-        return {(full_name, field) for (full_name, _), field in self.numbers().items()}
+        return {(full_name, field) for (full_name, _), field in self.numbers().items()} - set(self.values())
+
+    def values(self) -> dict[tuple[str, str], Sequence[str]]:
+        """The values that it adds to Caffe's enums, by full name of the message and name of the field."""
+        file = self.declarations
+        enums = {enum.name: [value.name for value in enum.value] for enum in file.enum_type}
+        added = {(full_name_of(f.extendee), f.name): enums[f.type_name] for f in file.extension if f.type_name in enums}
+        return {key: names for key, names in added.items() if is_enum_of_caffe(*key)}
+
+    def inner_fields(self) -> set[str]:
+        """The names of the fields of its own messages."""
+        return {field.name for declared in self.declarations.message_type for field in declared.field}
 
     def numbers(self) -> dict[tuple[str, int], str]:
         """The names of the fields that it adds, by full name of Caffe's message and number of the field."""
         added = self.declarations.extension
-        return {(f"{PACKAGE}.{f.extendee.removeprefix(f'{PACKAGE}.')}", f.number): f.name for f in added}
+        return {(full_name_of(f.extendee), f.number): f.name for f in added}
+
+
+def full_name_of(extendee: str) -> str:
+    """Return the full name of a message of Caffe's, as ``extend`` names it."""
+    return f"{PACKAGE}.{extendee.removeprefix(f'{PACKAGE}.')}"
+
+
+def is_enum_of_caffe(message: str, field: str) -> bool:
+    """Return whether a message of Caffe's (full name) has a field of an enum of this name."""
+    try:
+        found = pool.FindMessageTypeByName(message).fields_by_name.get(field)
+    except KeyError:
+        return False
+    return found is not None and found.enum_type is not None
 
 
 OWN_LAYER = "docs/layer.md shows how to add one with --plugin FILE.py"
@@ -70,7 +106,7 @@ def announce(dialect: Dialect) -> None:
 
     Raises SpecError if its declarations cannot be read, or extend a message that Caffe does not have.
     """
-    for full_name, _ in dialect.fields():
+    for full_name, _ in dialect.numbers():
         try:
             pool.FindMessageTypeByName(full_name)
         except KeyError:
@@ -94,16 +130,28 @@ def activate(dialect: Dialect) -> None:
     for full_name, field in dialect.fields():
         if field in fields_of(pool.FindMessageTypeByName(full_name)):
             raise SpecError(f'{full_name} already has a field "{field}"', Where(file.name))
+    for full_name, field in dialect.values():
+        if field + MORE in fields_of(pool.FindMessageTypeByName(full_name)):
+            message = f'another active dialect adds values to "{field}" of {full_name}'
+            raise SpecError(message, Where(file.name))
     _check_numbers(dialect)
     try:
         pool.FindFileByName(file.name)
     except KeyError:
         _add(file)
     for declared in file.extension:
-        descriptor: Any = pool.FindExtensionByName(f"{file.package}.{declared.name}")
-        fields = added_fields.setdefault(descriptor.containing_type.full_name, {})
-        fields[declared.name] = as_field(declared, descriptor)
+        descriptor: Any = pool.FindExtensionByName(f"{file.package}.{_scope(declared.extendee)}.{declared.name}")
+        full_name = descriptor.containing_type.full_name
+        added_fields.setdefault(full_name, {})[_key(dialect, full_name, declared.name)] = as_field(declared, descriptor)
     _active[dialect.name] = dialect
+
+
+def _scope(extendee: str) -> str:
+    return f"FieldsOf{extendee.rpartition('.')[2]}"
+
+
+def _key(dialect: Dialect, full_name: str, field: str) -> str:
+    return field + MORE if (full_name, field) in dialect.values() else field
 
 
 def _check_numbers(dialect: Dialect) -> None:
@@ -115,16 +163,27 @@ def _check_numbers(dialect: Dialect) -> None:
 
 
 def _add(file: FileDescriptorProto) -> None:
+    """Add a dialect's file to the pool, the new fields of each message in a scope of their own: names may be alike."""
+    scoped = FileDescriptorProto()
+    scoped.CopyFrom(file)
+    del scoped.extension[:]
+    scopes: dict[str, Any] = {}
+    for declared in file.extension:
+        name = _scope(declared.extendee)
+        if name not in scopes:
+            scopes[name] = scoped.message_type.add(name=name)
+        scopes[name].extension.append(declared)
     try:
-        add_file(file)
+        add_file(scoped)
     except TypeError as fault:
         raise SpecError(f"these declarations do not fit Caffe's schema: {fault}", Where(file.name)) from None
 
 
 def deactivate(name: str) -> None:
     """Remove the fields of an active dialect from the schema."""
-    for full_name, field in _active.pop(name).fields():
-        del added_fields[full_name][field]
+    dialect = _active.pop(name)
+    for (full_name, _), field in dialect.numbers().items():
+        del added_fields[full_name][_key(dialect, full_name, field)]
 
 
 def known() -> list[Dialect]:

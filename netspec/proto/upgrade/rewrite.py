@@ -28,14 +28,14 @@ class Draft:
         """Copy all fields of a message that this one has too, except those to omit."""
         for name, field in fields_of(message.DESCRIPTOR).items():
             if name not in leave_out and name in fields_of(self.message.DESCRIPTOR) and field.present(message):
-                self.put(name, field.get(message), places.fields.get(name, ()))
+                self.put(name, field.get(message), places.fields.get(field.name, ()))
 
     def put(self, name: str, value: Any, places: tuple[Place, ...]) -> None:
         """Set a field, or add one or several values to a repeated one."""
         field = fields_of(self.message.DESCRIPTOR)[name]
         _put(self.message, field, value)
         before = self.places.get(name, ()) if field.repeated else ()
-        self.places[name] = (*before, *places)
+        self.places[field.name] = (*before, *places)
 
     def inner(self, name: str, where: Where) -> Draft:
         """Return the draft of a singular message field; a new one is empty and has the place ``where``."""

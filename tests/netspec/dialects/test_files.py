@@ -96,7 +96,7 @@ FAULTS = {
     "nothing like it": (
         None,
         "x" * 20,
-        f'unknown dialect "{"x" * 20}"; expected one of: blocks, filters, layout, nvidia, rcnn, ristretto, ssd,',
+        f'unknown dialect "{"x" * 20}"; expected one of: blocks, filters, hed, layout, nvidia, rcf, rcnn,',
     ),
     "no such file": (None, "{path}", "{path}: cannot be read: No such file or directory"),
     "not text": (b"\xff\xfe", "{path}", "{path}: cannot be read: 'utf-8' codec can't decode"),
@@ -217,13 +217,13 @@ def test_a_type_that_two_dialects_have_is_asked_about(tmp_path: Path, capsys: py
     assert 'unknown layer type "Lens"; dialects "blocks" and "ssd" have "Lens"; add --plugin blocks' in said
 
 
-def test_what_is_read_from_a_files_syntax_is_what_running_it_registers() -> None:
-    for name in known_files():
-        before = set(layer_types())
-        declared = read_dialect(find_file(name))
-        use_dialect(name)
-        assert set(layer_types()) - before == set(declared.layer_types), name
-        assert declared.fields()
+@pytest.mark.parametrize("name", sorted(known_files()))
+def test_what_is_read_from_a_files_syntax_is_what_running_it_registers(name: str) -> None:
+    before = set(layer_types())
+    declared = read_dialect(find_file(name))
+    use_dialect(name)
+    assert set(layer_types()) - before == set(declared.layer_types)
+    assert declared.fields() or declared.layer_types
 
 
 # ---- Entry points ----

@@ -1,5 +1,6 @@
 """Fields that forks added to Caffe's own layers: Convolution's holes and sides, BatchNorm's slopes and biases."""
 
+import copy
 from collections.abc import Callable
 
 import numpy as np
@@ -9,7 +10,8 @@ import torch.nn.functional as F
 
 from netspec.dialects import use_dialects_of
 from netspec.errors import SpecError
-from netspec.layers import Layer
+from netspec.layers import Layer, activation
+from netspec.layers.vision import pooling
 from netspec.net.build import build_net
 from netspec.proto.schema import TRAIN
 from netspec.proto.text import parse_net_text
@@ -92,3 +94,65 @@ def test_batch_norm_begins_with_slopes_of_1_and_is_caffes_without_them(build: Bu
     assert layer.blobs[3].tolist() == [1, 1, 1]
     assert layer.blobs[4].tolist() == [0, 0, 0]
     assert len(build("nvidia", "type: 'BatchNorm'", (2, 3)).blobs) == 3
+
+
+POOL = "type: 'Pooling' pooling_param { kernel_size: 3 stride: 2 %s }"
+SIDES = [("", (0, 0, 0, 0)), ("pad: 1", (1, 1, 1, 1)), ("pad_l: 1 pad_b: 2", (1, 0, 0, 2)), ("pad_r: 2", (0, 2, 0, 0))]
+
+
+def pooled(data: torch.Tensor, method: str, sides: tuple[int, ...], floor: bool) -> np.ndarray:
+    """Return what a loop over windows of 3 x 3, at stride 2, finds; ``sides`` are left, right, top and bottom."""
+    left, right, above, below = sides
+    spans = []
+    for size, before, after in ((data.shape[2], above, below), (data.shape[3], left, right)):
+        count = (size + before + after - 3) // 2 + 1 if floor else -(-(size + before + after - 3) // 2) + 1
+        count -= any(sides) and (count - 1) * 2 >= size + before
+        spans.append([(2 * i - before, min(2 * i - before + 3, size + after)) for i in range(count)])
+    found = np.zeros((*data.shape[:2], *map(len, spans)), np.float32)
+    for n, c, i, j in np.ndindex(*found.shape):
+        (y0, y1), (x0, x1) = spans[0][i], spans[1][j]
+        area = (y1 - y0) * (x1 - x0)
+        inside = [float(v) for v in data[n, c, max(y0, 0) : y1, max(x0, 0) : x1].flatten()]
+        found[n, c, i, j] = max(inside) if method == "MAX" else sum(inside) / (area if method == "AVE" else len(inside))
+    return found
+
+
+@pytest.mark.parametrize("floor", [False, True])
+@pytest.mark.parametrize(("given", "sides"), SIDES)
+@pytest.mark.parametrize("method", ["MAX", "AVE", "AVE_EXC_PAD", "AVE_TF"])
+def test_pooling_with_a_pad_for_each_side_and_of_pixels_alone(
+    build: Build, gradcheck: Gradcheck, method: str, given: str, sides: tuple[int, ...], floor: bool
+) -> None:
+    data = torch.randn(2, 2, 7, 6)
+    layer = build("filters", POOL % f"pool: {method} {given} ceil_mode: {str(not floor).lower()}", data.shape)
+    (top,) = layer.run(data)
+    assert layer.top_shapes == [tuple(top.shape)]
+    np.testing.assert_allclose(top.detach(), pooled(data, method, sides, floor), rtol=1e-5, atol=1e-6)
+    gradcheck(layer, data)
+    assert type(copy.deepcopy(layer)) is type(layer)
+
+
+def test_pooling_without_these_fields_is_caffes_own(build: Build) -> None:
+    assert type(build("filters", POOL % "pad: 1", (1, 1, 5, 5))) is pooling.Pooling
+    assert type(build("filters", "type: 'ReLU'", (1, 1, 5, 5))) is activation.ReLU
+
+
+@pytest.mark.parametrize(
+    ("given", "fault"),
+    [
+        ("pad: 1 pad_l: 1", "found both pad and a pad"),
+        ("pad_l: 3", "a pad of 3 must be less"),
+        ("pool: AVG_EX_PAD", "AVE_EXC_PAD"),
+    ],
+)
+def test_contradictions_of_pooling_are_refused(build: Build, given: str, fault: str) -> None:
+    with pytest.raises(SpecError, match=fault):
+        build("filters", POOL % given, (1, 3, 9, 9))
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.25])
+def test_relu6(build: Build, gradcheck: Gradcheck, slope: float) -> None:
+    data = torch.tensor([[-4.0, -1, 0, 2, 6, 7]])
+    layer = build("filters", f"type: 'ReLU' relu_param {{ relu6: true negative_slope: {slope} }}", data.shape)
+    assert layer.run(data)[0].tolist() == [[-4 * slope, -slope, 0, 2, 6, 6]]
+    gradcheck(layer, torch.tensor([[-4.0, -1, 0.5, 2, 5, 7]]))

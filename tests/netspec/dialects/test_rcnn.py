@@ -87,26 +87,26 @@ def test_bins_that_share_a_pixel_both_get_it(build: Build) -> None:
     assert top.flatten().tolist() == [1, 2]
 
 
-@pytest.mark.parametrize("kind", ["ROIPooling", "PSROIPooling"])
-def test_a_region_must_lie_in_an_image_of_the_batch(build: Build, kind: str) -> None:
+@pytest.mark.parametrize(("dialect", "kind"), [("rcnn", "ROIPooling"), ("rfcn", "PSROIPooling")])
+def test_a_region_must_lie_in_an_image_of_the_batch(build: Build, dialect: str, kind: str) -> None:
     settings = {
         "ROIPooling": "roi_pooling_param { pooled_h: 1 pooled_w: 1 }",
         "PSROIPooling": "psroi_pooling_param { spatial_scale: 1 output_dim: 1 group_size: 1 }",
     }
-    layer = build("rcnn", f"type: '{kind}' {settings[kind]}", (2, 1, 3, 3), (1, 5))
+    layer = build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3, 3), (1, 5))
     with pytest.raises(SpecError, match="found a region in image 2, expected 0 to 1"):
         layer.run(torch.zeros(2, 1, 3, 3), torch.tensor([[2.0, 0, 0, 1, 1]]))
     with pytest.raises(SpecError, match=r"expected \(R, 5\): image, x1, y1, x2, y2"):
-        build("rcnn", f"type: '{kind}' {settings[kind]}", (2, 1, 3, 3), (1, 4))
+        build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3, 3), (1, 4))
     with pytest.raises(SpecError, match=r"expected 4 axes \(N, C, H, W\)"):
-        build("rcnn", f"type: '{kind}' {settings[kind]}", (2, 1, 3), (1, 5))
+        build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3), (1, 5))
 
 
 def test_psroi_pooling(build: Build, gradcheck: Gradcheck) -> None:
     group, channels, scale = 3, 2, 0.5
     maps, regions = torch.randn(2, channels * group * group, 5, 6), torch.tensor(REGIONS)
     layer = build(
-        "rcnn",
+        "rfcn",
         "type: 'PSROIPooling' psroi_pooling_param { spatial_scale: 0.5 output_dim: 2 group_size: 3 }",
         maps.shape,
         regions.shape,
@@ -130,9 +130,9 @@ def test_psroi_pooling(build: Build, gradcheck: Gradcheck) -> None:
 def test_psroi_pooling_needs_a_channel_for_each_bin(build: Build) -> None:
     settings = "psroi_pooling_param { spatial_scale: 1 output_dim: 2 group_size: 3 }"
     with pytest.raises(SpecError, match=r"found 17 channels, expected output_dim group_size\^2 = 18"):
-        build("rcnn", f"type: 'PSROIPooling' {settings}", (1, 17, 5, 5), (1, 5))
+        build("rfcn", f"type: 'PSROIPooling' {settings}", (1, 17, 5, 5), (1, 5))
     with pytest.raises(SpecError, match='PSROIPoolingParameter lacks the required field "group_size"'):
-        build("rcnn", "type: 'PSROIPooling' psroi_pooling_param { spatial_scale: 1 output_dim: 2 }", (1, 2), (1, 5))
+        build("rfcn", "type: 'PSROIPooling' psroi_pooling_param { spatial_scale: 1 output_dim: 2 }", (1, 2), (1, 5))
 
 
 @pytest.mark.parametrize("weights", [0, 1, 2])

@@ -153,7 +153,7 @@ def test_regions_are_pooled(net_of: Callable[..., Net]) -> None:
     ("dialect", "layer", "shapes"),
     [
         (
-            "rcnn",
+            "rfcn",
             "type: 'PSROIPooling' psroi_pooling_param { spatial_scale: 0.5 output_dim: 2 group_size: 2 }",
             {"x": (1, 8, 6, 6), "rois": (3, 5)},
         ),

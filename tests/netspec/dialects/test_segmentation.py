@@ -1,0 +1,143 @@
+"""Images with labels for their pixels: SegNet's and ENet's, HED's and RCF's."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from netspec.dialects import use_dialect, use_dialects_of
+from netspec.errors import SpecError
+from netspec.layers import Context, Layer
+from netspec.net.build import build_net
+from netspec.net.one_layer import make_layer
+from netspec.proto.schema import TRAIN
+from netspec.proto.text import parse_net_text
+
+Build = Callable[..., Layer]
+Gradcheck = Callable[..., None]
+
+
+@pytest.fixture
+def pairs(tmp_path: Path) -> Path:
+    """A list of two images 6 x 8 whose blue is the place of a pixel, and their labels, which are the same."""
+    place = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    for name in ("a", "b"):
+        value = place if name == "a" else 255 - place
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.stack([value, value * 0, value * 0], axis=2))
+        cv2.imwrite(str(tmp_path / f"{name}_labels.png"), value)
+    (tmp_path / "list.txt").write_text("/a.png /a_labels.png\n/b.png /b_labels.png\n")
+    return tmp_path
+
+
+def dense(pairs: Path, given: str = "", transform: str = "") -> Layer:
+    use_dialect("segmentation")
+    settings = f'source: "{pairs}/list.txt" root_folder: "{pairs}" batch_size: 2 {given}'
+    text = f"type: 'DenseImageData' dense_image_data_param {{ {settings} }} transform_param {{ {transform} }}"
+    return make_layer(text, (), Context(TRAIN), 2)
+
+
+def test_labels_are_mirrored_and_cut_as_their_images(pairs: Path) -> None:
+    layer = dense(pairs, "mirror: true crop_height: 4 crop_width: 5 shuffle: true", "mean_value: 3 scale: 0.5")
+    seen = set()
+    for _ in range(12):
+        images, labels = layer.run()
+        assert images.shape == (2, 3, 4, 5)
+        assert labels.shape == (2, 1, 4, 5)
+        assert torch.equal(images[:, :1], (labels - 3) * 0.5)
+        seen |= {tuple(label.flatten()[:2].tolist()) for label in labels}
+    layer.close()
+    assert len(seen) > 12  # other windows, mirrored or not
+
+
+def test_labels_are_resized_without_mixing_and_may_be_smaller(pairs: Path) -> None:
+    layer = dense(pairs, "new_height: 12 new_width: 16 label_divide_factor: 4")
+    images, labels = layer.run()
+    layer.close()
+    assert images.shape == (2, 3, 12, 16)
+    assert labels.shape == (2, 1, 3, 4)
+    assert labels[0, 0, 1].tolist() == [16, 18, 20, 22]
+
+
+@pytest.mark.parametrize(
+    ("given", "transform", "fault"),
+    [
+        ("new_height: 4", "", "new_height and new_width must be given together"),
+        ("", "mirror: true", "mirror would not change the labels; give mirror in dense_image_data_param"),
+        ("", "crop_size: 4", "give crop_height and crop_width in dense_image_data_param"),
+        ("crop_height: 7 crop_width: 7", "", "smaller than the crop"),
+        ("label_divide_factor: 0", "", "label_divide_factor must be at least 1"),
+    ],
+)
+def test_faults(pairs: Path, given: str, transform: str, fault: str) -> None:
+    with pytest.raises(SpecError, match=fault):
+        dense(pairs, given, transform)
+
+
+def test_a_list_has_two_names_a_line(pairs: Path) -> None:
+    (pairs / "list.txt").write_text("/a.png 0 1\n")
+    with pytest.raises(
+        SpecError, match=r'list\.txt:1:1: found "/a.png 0 1", expected the names of an image and of its labels'
+    ):
+        dense(pairs)
+    (pairs / "list.txt").write_text("/a.png /c.png\n")
+    with pytest.raises(SpecError, match=r"c\.png"):
+        dense(pairs)
+
+
+def test_a_loss_that_weighs_classes(build: Build, gradcheck: Gradcheck) -> None:
+    scores, labels = torch.randn(2, 3, 4), torch.tensor([[0.0, 1, 2, 5], [2, 2, 1, 5]])
+    given = "weight_by_label_freqs: true class_weighting: 0.5 class_weighting: 2 class_weighting: 3 ignore_label: 5"
+    layer = build("segmentation", f"type: 'SoftmaxWithLoss' loss_param {{ {given} }}", scores.shape, labels.shape)
+    each = F.cross_entropy(scores, labels.long(), reduction="none", ignore_index=5)
+    weights = torch.tensor([0.5, 2, 3, 0, 0, 0])[labels.long()]
+    torch.testing.assert_close(layer.run(scores, labels)[0], (each * weights).sum() / 6)
+    gradcheck(layer, scores, labels, fixed=(1,))
+    text = "type: 'SoftmaxWithLoss' loss_param { weight_by_label_freqs: true class_weighting: 1 }"
+    with pytest.raises(SpecError, match="found 1 class_weighting, expected one for each of 3 classes"):
+        build("segmentation", text, scores.shape, labels.shape)
+
+
+EDGES = """layer { name: "data" type: "ImageLabelmapData" top: "data" top: "label"
+  image_data_param { source: "%s/list.txt" root_folder: "%s" batch_size: 2 }
+  transform_param { mirror: true crop_size: 4 mean_value: 1 } }"""
+
+
+@pytest.mark.parametrize("dialect", ["hed", "rcf"])
+def test_edge_maps(pairs: Path, dialect: str) -> None:
+    use_dialect(dialect)
+    (text,) = (EDGES % (pairs, pairs)).partition("{")[2:]
+    layer = make_layer(text.rpartition("}")[0], (), Context(TRAIN), 2)
+    images, labels = layer.run()
+    layer.close()
+    gray = images[:, :1] + 1
+    below = torch.zeros_like(gray) if dialect == "hed" else gray / 255
+    assert torch.equal(labels, torch.where(gray > 127, 1, below))
+
+
+def test_which_of_two_forks_is_meant_is_asked(pairs: Path) -> None:
+    text = EDGES % (pairs, pairs)
+    assert use_dialects_of(text, "net.prototxt") == []
+    with pytest.raises(SpecError, match='dialects "hed" and "rcf" have "ImageLabelmapData"; add --plugin hed'):
+        build_net(*parse_net_text(text, "net.prototxt"))
+
+
+@pytest.mark.parametrize(("dialect", "of_others"), [("hed", 1.0), ("rcf", 1.1)])
+def test_edges_weigh_as_much_as_all_else(build: Build, gradcheck: Gradcheck, dialect: str, of_others: float) -> None:
+    scores, edges = torch.randn(2, 1, 3, 4), torch.rand(2, 1, 3, 4).round()
+    edges[0, 0, 0, 0] = 0.25 if dialect == "rcf" else 0
+    layer = build(dialect, "type: 'SigmoidCrossEntropyLoss'", scores.shape, edges.shape)
+    expected = 0.0
+    for x, t in zip(scores.flatten(1).tolist(), edges.flatten(1).tolist(), strict=True):
+        ones, zeros = t.count(1.0), t.count(0.0)
+        for value, target in zip(x, t, strict=True):
+            p = 1 / (1 + np.exp(-value))
+            if target == 1:
+                expected -= np.log(p) * zeros / (ones + zeros)
+            elif target == 0:
+                expected -= of_others * np.log(1 - p) * ones / (ones + zeros)
+    np.testing.assert_allclose(layer.run(scores, edges)[0].item(), expected / 2, rtol=1e-5)
+    gradcheck(layer, scores, edges, fixed=(1,))
