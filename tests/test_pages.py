@@ -92,7 +92,11 @@ NOT_RUN = {
         "tools/bench growth": BENCH,
         "benchmarks/gpu_steps": "needs a GPU; tests/benchmarks/test_gpu_steps.py runs it without one",
     },
-    "prototxt/README.md": {"lmdb-build compare prototxt/normalized/siamese_8": "needs a GPU"},
+    "prototxt/README.md": {
+        "lmdb-build compare prototxt/normalized/siamese_8": "needs a GPU",
+        "python3 examples/validation_set.py": "tests/test_examples.py runs it",
+        "loopclosure evaluate traverses:val/outdoor": "needs what that script writes",
+    },
     "docs/faithful.md": {"tools/run_tests": "runs tests that run beside this one"},
     "docs/from-pytorch.md": {
         "pip install": "needs a package index",
