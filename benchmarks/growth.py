@@ -39,7 +39,7 @@ LOSS = """
 layer {{ name: "loss" type: "Reduction" bottom: "x{i}" top: "loss" loss_weight: 1 }}"""
 TRAINED = "small/siamese_resnet27_256"
 WALK = 300  # frames, whose descriptors are perturbed to the number wanted
-QUERIES, BLOCK = 50, 4096  # frames searched for, and added at a time
+QUERIES, AT_ONCE = 50, 4096  # frames searched for, and added at a time
 AGAIN = 0.3  # of the difference of any two descriptors: how far a frame seen again is from itself
 WORDS, WORDS_SEEN = 2000, 150
 PAIRS = 2000  # that each number of workers converts
@@ -136,7 +136,7 @@ def frames(size: int) -> Found:
 
     base = described_walk(min(WALK, max(2, size)))
     random = np.random.default_rng(0)
-    rows = np.concatenate([perturbed(base, min(BLOCK, size - k), random) for k in range(0, size, BLOCK)])
+    rows = np.concatenate([perturbed(base, min(AT_ONCE, size - k), random) for k in range(0, size, AT_ONCE)])
     seen_again = rows[random.integers(0, size, QUERIES)] + AGAIN * _differences(base, QUERIES, random)
     best: dict[str, list[list[int]]] = {}
     found: Found = {}
@@ -144,7 +144,7 @@ def frames(size: int) -> Found:
         detector = LoopDetector(index=open_index(name, "euclidean"))
         start = time.process_time()
         no_poses = {"stamps": np.full(size, np.nan), "poses": np.full((size, 7), np.nan)}
-        detector.take_session((rows[k : k + BLOCK] for k in range(0, size, BLOCK)), no_poses, None)
+        detector.take_session((rows[k : k + AT_ONCE] for k in range(0, size, AT_ONCE)), no_poses, None)
         found[f"{name}, adding, us per frame"] = 1e6 * (time.process_time() - start) / size
         detector.begin_session()
         start = time.process_time()
