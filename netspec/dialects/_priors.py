@@ -111,10 +111,10 @@ class PriorBox(Layer):
         offset = np.float32(param.offset)
         y = (np.arange(height, dtype=np.float32) + offset) * np.float32(step[0])
         x = (np.arange(width, dtype=np.float32) + offset) * np.float32(step[1])
-        centre = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)[:, :, None].astype(float)
+        center = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)[:, :, None].astype(float)
         half = self.sizes / 2.0
         extent = np.array(image[::-1], float)
-        boxes = np.concatenate([(centre - half) / extent, (centre + half) / extent], axis=-1).astype(np.float32)
+        boxes = np.concatenate([(center - half) / extent, (center + half) / extent], axis=-1).astype(np.float32)
         boxes = boxes.clip(0, 1) if param.clip else boxes
         self.boxes = np.stack([boxes.reshape(-1), np.tile(self.variances, boxes.size // 4)])[None]
         return [self.boxes.shape]

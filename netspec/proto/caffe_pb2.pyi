@@ -70,7 +70,7 @@ Global___BlobShape: _TypeAlias = BlobShape  # noqa: Y015
 
 @_typing.final
 class BlobProto(_message.Message):
-    """An array: weights, an optimiser's history, a mean image. Values are row-major."""
+    """An array: weights, an optimizer's history, a mean image. Values are row-major."""
 
     DESCRIPTOR: _descriptor.Descriptor
 

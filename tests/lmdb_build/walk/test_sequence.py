@@ -151,10 +151,10 @@ def test_a_painted_corner_appears_where_its_point_in_space_projects(seed: int) -
     assert (expected < [CAMERA.width - 8, CAMERA.height - 8]).all()
 
     picture = Renderer(flat_house(quad), CAMERA, plain_light()).draw(position, rotation)
-    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    gray = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     start = np.array([[expected + rng.uniform(-1.5, 1.5, 2)]], np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
-    found = cv2.cornerSubPix(grey, start, (6, 6), (-1, -1), criteria)[0, 0]
+    found = cv2.cornerSubPix(gray, start, (6, 6), (-1, -1), criteria)[0, 0]
     np.testing.assert_allclose(found, expected, atol=0.25)
 
 

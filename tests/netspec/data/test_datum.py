@@ -7,7 +7,7 @@ import pytest
 from netspec.data.datum import array_to_datum, datum_to_array, encoded_datum, parse_datum, planar
 from netspec.proto.schema import Datum
 
-COLOURS = np.random.default_rng(0).integers(0, 256, (3, 5, 7), np.uint8)
+COLORS = np.random.default_rng(0).integers(0, 256, (3, 5, 7), np.uint8)
 
 
 def png(image: np.ndarray) -> bytes:
@@ -15,12 +15,12 @@ def png(image: np.ndarray) -> bytes:
 
 
 def test_uint8_goes_through_data() -> None:
-    datum = parse_datum(array_to_datum(COLOURS, 3).SerializeToString())
+    datum = parse_datum(array_to_datum(COLORS, 3).SerializeToString())
     assert (datum.channels, datum.height, datum.width, datum.label) == (3, 5, 7, 3)
     assert not datum.float_data
     found = datum_to_array(datum)
     assert found.dtype == np.uint8
-    assert (found == COLOURS).all()
+    assert (found == COLORS).all()
 
 
 def test_floats_go_through_float_data() -> None:
@@ -40,16 +40,16 @@ def test_data_is_preferred_where_both_are_given() -> None:  # data_transformer.c
 
 @pytest.mark.parametrize(("color", "channels"), [(None, 3), (True, 3), (False, 1)])
 def test_encoded_images_are_decoded_as_asked(color: bool | None, channels: int) -> None:
-    found = datum_to_array(encoded_datum(png(COLOURS), 1), color)
+    found = datum_to_array(encoded_datum(png(COLORS), 1), color)
     assert found.shape == (channels, 5, 7)
     if channels == 3:
-        assert (found == COLOURS).all()
+        assert (found == COLORS).all()
 
 
 def test_a_gray_file_stays_gray_unless_color_is_forced() -> None:
-    datum = encoded_datum(png(COLOURS[:1]))
-    assert (datum_to_array(datum) == COLOURS[:1]).all()
-    assert (datum_to_array(datum, color=True) == COLOURS[[0, 0, 0]]).all()
+    datum = encoded_datum(png(COLORS[:1]))
+    assert (datum_to_array(datum) == COLORS[:1]).all()
+    assert (datum_to_array(datum, color=True) == COLORS[[0, 0, 0]]).all()
 
 
 def test_planar_takes_gray_and_color() -> None:

@@ -89,9 +89,9 @@ def test_force_color_and_force_gray_are_for_encoded_images(caplog: pytest.LogCap
     file = cv2.imencode(".png", IMAGES[0].transpose(1, 2, 0))[1].tobytes()
     assert transformer().decode(encoded_datum(file)).shape == (3, 9, 12)
     assert transformer(force_gray=True).decode(encoded_datum(file)).shape == (1, 9, 12)
-    grey = transformer(force_gray=True)
+    gray = transformer(force_gray=True)
     for _ in range(2):
-        assert grey.decode(array_to_datum(IMAGES[0])).shape == (3, 9, 12)
+        assert gray.decode(array_to_datum(IMAGES[0])).shape == (3, 9, 12)
     assert [record.message for record in caplog.records] == ["force_color and force_gray only for encoded datum"]
 
 

@@ -257,7 +257,7 @@ def test_upsample_refuses_a_mask_of_a_larger_map(build: Build) -> None:
 PSPNET = "slope_filler { type: 'uniform' min: 0.5 max: 2 } bias_filler { type: 'uniform' } momentum: 0.8 eps: 0.01"
 
 
-def normalised(
+def normalized(
     x: np.ndarray, mean: np.ndarray, variance: np.ndarray, eps: float, blobs: list[np.ndarray]
 ) -> np.ndarray:
     return (x - mean) / np.sqrt(variance + eps) * blobs[0] + blobs[1]
@@ -272,7 +272,7 @@ def test_bn_of_pspnet(build: Build, gradcheck: Gradcheck) -> None:
     assert not blobs[3].any()
     values = x.numpy()
     mean, variance = (f(values, axis=(0, 2, 3), keepdims=True) for f in (np.mean, np.var))
-    np.testing.assert_allclose(run(layer, x), normalised(values, mean, variance, 0.01, blobs), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(run(layer, x), normalized(values, mean, variance, 0.01, blobs), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(layer.blobs[2].detach().numpy(), 0.2 * mean, rtol=1e-5)
     np.testing.assert_allclose(layer.blobs[3].detach().numpy(), 0.2 * variance, rtol=1e-5)
     run(layer, x)
@@ -282,7 +282,7 @@ def test_bn_of_pspnet(build: Build, gradcheck: Gradcheck) -> None:
     for mine, theirs in zip(test.blobs, layer.blobs, strict=True):
         mine.data.copy_(theirs.data)
     blobs = [blob.detach().numpy().copy() for blob in layer.blobs]
-    expected = normalised(values, blobs[2], blobs[3], 0.01, blobs)
+    expected = normalized(values, blobs[2], blobs[3], 0.01, blobs)
     np.testing.assert_allclose(run(test, x), expected, rtol=1e-4, atol=1e-5)
     assert all(np.array_equal(blob.detach().numpy(), kept) for blob, kept in zip(test.blobs, blobs, strict=True))
     gradcheck(test, x)
@@ -300,7 +300,7 @@ def test_frozen_bn_uses_and_keeps_its_moving_averages(build: Build) -> None:
     blobs = [blob.detach().numpy().copy() for blob in layer.blobs]
     assert (blobs[3] == 1).all()
     np.testing.assert_allclose(
-        run(layer, x), normalised(x.numpy(), blobs[2], blobs[3], 0.01, blobs), rtol=1e-5, atol=1e-6
+        run(layer, x), normalized(x.numpy(), blobs[2], blobs[3], 0.01, blobs), rtol=1e-5, atol=1e-6
     )
     assert (layer.blobs[3] == 1).all()
     assert layer.not_learned == {0, 1, 2, 3}
@@ -330,7 +330,7 @@ def test_bn_of_segnet(build: Build, gradcheck: Gradcheck) -> None:
         blobs = [blob.detach().numpy() for blob in layer.blobs]
         mean, variance = (f(x.numpy(), axis=(0, 2, 3), keepdims=True) for f in (np.mean, np.var))
         np.testing.assert_allclose(
-            run(layer, x), normalised(x.numpy(), mean, variance, 1e-9, blobs), rtol=1e-4, atol=1e-5
+            run(layer, x), normalized(x.numpy(), mean, variance, 1e-9, blobs), rtol=1e-4, atol=1e-5
         )
     layer = build("blocks", f"type: 'BN' bn_param {{ {SEGNET} bn_mode: INFERENCE }}", x.shape)
     blobs = [blob.detach().numpy() for blob in layer.blobs]

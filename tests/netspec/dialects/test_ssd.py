@@ -403,13 +403,13 @@ def test_a_small_detector_learns_where_two_squares_are() -> None:
     truth = torch.tensor(
         [[0, 1, 0, 5 / 64, 10 / 64, 35 / 64, 40 / 64, 0], [1, 2, 0, 30 / 64, 30 / 64, 50 / 64, 60 / 64, 0]]
     ).reshape(1, 1, 2, 8)
-    optimiser = torch.optim.Adam([p.parameter for p in train.learnable], lr=0.01)
+    optimizer = torch.optim.Adam([p.parameter for p in train.learnable], lr=0.01)
     losses = []
     for _ in range(60):
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss, _ = train.forward_loss(data=image, label=truth)
         loss.backward()
-        optimiser.step()
+        optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.1 * losses[0]
     test.share_weights_with(train)
