@@ -10,6 +10,7 @@ Caffe: src/caffe/layers/inner_product_layer.cpp, base_conv_layer.cpp
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -49,11 +50,20 @@ class Matrix:
         return self._copy
 
 
+class Weights(NamedTuple):
+    """What a layer has learned, and where its gradients are added up, None where there are none."""
+
+    weight: torch.Tensor
+    bias: torch.Tensor | None
+    weight_sums: torch.Tensor | None
+    bias_sums: torch.Tensor | None
+
+
 class BoundVectors:
     """:class:`netspec.exact.products.VectorProducts` of vectors of one shape, and of one matrix.
 
-    ``shape`` is the bottom's, any that has rows of K numbers; the top is ``top_shape``. ``weight_sums`` and
-    ``bias_sums`` are where gradients are added up, None where there are none; ``wanted`` says whether the bottom's is.
+    ``shape`` is the bottom's, any that has rows of K numbers; the top is ``top_shape``. ``wanted`` says whether the
+    bottom's gradient is computed.
     """
 
     def __init__(
@@ -61,19 +71,16 @@ class BoundVectors:
         shape: tuple[int, ...],
         top_shape: tuple[int, ...],
         transposed: bool,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        weight_sums: torch.Tensor | None,
-        bias_sums: torch.Tensor | None,
+        learned: Weights,
         wanted: bool,
     ) -> None:
+        weight, self._bias, weight_sums, bias_sums = learned
         inputs, outputs = weight.shape if transposed else (weight.shape[1], weight.shape[0])
         rows = math.prod(shape) // inputs
         self._matrix, self._transposed = weight.numpy().T, transposed
         self._top = torch.empty(top_shape, dtype=weight.dtype)
         self._rows = self._top.view(rows, outputs)
         self._shown = self._rows.numpy().T
-        self._bias = bias
         self._vectors, self._diffs = Matrix(inputs), Matrix(outputs)
         self._weight_sums = None if weight_sums is None else weight_sums.numpy().T
         self._bias_sums = None if bias_sums is None else bias_sums.numpy()
@@ -115,13 +122,11 @@ class BoundColumns:
         shape: tuple[int, ...],
         sliding: Filter,
         group: int,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        weight_sums: torch.Tensor | None,
-        bias_sums: torch.Tensor | None,
+        learned: Weights,
         wanted: bool,
         steady: bool,
     ) -> None:
+        weight, bias, weight_sums, bias_sums = learned
         count, channels, *size = shape
         self._size, self._sliding = tuple(size), sliding
         fits = sliding.fits(self._size)
@@ -135,16 +140,9 @@ class BoundColumns:
             columns_of_shape((min(self._at_once, count - start), channels, *size), weight.dtype, sliding, fits)
             for start in range(0, count, self._at_once)
         ]
-        self._groups = [
-            (
-                slice(g * len(weight) // group, (g + 1) * len(weight) // group),
-                slice(
-                    g * channels // group * math.prod(sliding.kernel),
-                    (g + 1) * channels // group * math.prod(sliding.kernel),
-                ),
-            )
-            for g in range(group)
-        ]
+        area = math.prod(sliding.kernel)
+        outputs, rows = len(weight) // group, channels // group * area
+        self._groups = [(slice(g * outputs, (g + 1) * outputs), slice(g * rows, (g + 1) * rows)) for g in range(group)]
         self._filters = weight.flatten(1).numpy()
         self._weight_sums = None if weight_sums is None else weight_sums.flatten(1).numpy()
         self._bias_sums = None if bias_sums is None else bias_sums.numpy()
@@ -152,8 +150,7 @@ class BoundColumns:
         self._ones = np.ones(positions, self._filters.dtype)
         self._spread = None
         if wanted:
-            rows = channels * math.prod(sliding.kernel)
-            self._spread = torch.empty((self._at_once, rows, positions), dtype=weight.dtype)
+            self._spread = torch.empty((self._at_once, channels * area, positions), dtype=weight.dtype)
         self._gemm, self._gemv = gemm_routine(self._filters), gemv_routine(self._filters)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:

@@ -44,10 +44,10 @@ class ImageNet:
 
     The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
     None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning;
-    something in them must fit. ``steps``, if any are given, are done to
-    the pixels in the place of what the data layer's transform_param says. ``choice`` is the engine that runs the net:
-    with another than torch, whose model the cache has, torch is not imported. Raises SpecError for faults of the files;
-    warns where the weights were trained on other pixels.
+    something in them must fit. ``steps``, if any are given, are done to the pixels in the place of what the data
+    layer's transform_param says. ``choice`` is the engine that runs the net: with another than torch, whose model the
+    cache has, torch is not imported. Raises SpecError for faults of the files; warns where the weights were trained on
+    other pixels. (Its parameters are many: what one command line says of images, blob by blob.)
     """
 
     def __init__(
@@ -73,8 +73,7 @@ class ImageNet:
         self.blob, self.input, self.file = blob, input_blob, source.file
         self.shape: Shape = tuple(shape[1:])
         self.zooms = tuple(zooms)
-        transforming = [layer for layer in before.layer if layer.HasField("transform_param")]
-        steps = steps or Steps()
+        transforming, steps = [layer for layer in before.layer if layer.HasField("transform_param")], steps or Steps()
         self.scaling = scaling_of(steps, transforming[0] if transforming else None, self.shape, source.file)
         after, after_source = prune(net, source, [blob], {input_blob: shape})
 
@@ -88,14 +87,16 @@ class ImageNet:
 
         self._build, self._net, self._model = build, None, None
         self._choice = choice or Choice()
-        if self._choice.engine == TORCH or options.device != "cpu":
-            self._use_torch(
-                "" if self._choice.engine == TORCH else f"it runs on the CPU, this net is on {options.device}"
-            )
-            return
         made_of = {"blob": blob, "input": input_blob, "shape": shape, "strict": options.strict, "scaled": bool(steps)}
+        self._open(Origin([model, *weights], made_of), options.device)
+
+    def _open(self, origin: Origin, device: str) -> None:
+        """Open the model of the chosen engine, or let torch run the net."""
+        if self._choice.engine == TORCH or device != "cpu":
+            self._use_torch("" if self._choice.engine == TORCH else f"it runs on the CPU, this net is on {device}")
+            return
         try:
-            self._model = Model(self._choice, Origin([model, *weights], made_of), self._export)
+            self._model = Model(self._choice, origin, self._export)
         except Unable as fault:
             self._use_torch(str(fault))
 

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.bound import BoundVectors
+from netspec.exact.bound import BoundVectors, Weights
 from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts, prepared_vectors
 from netspec.layers import fused
 from netspec.layers.base import Layer, Shape
@@ -102,7 +102,7 @@ class InnerProduct(Layer):
         if math.prod(top_shape) == 0 or inputs == 0:
             return None
         if self.is_exact(weight, self.small):
-            bound = BoundVectors(self.bottom_shapes[0], top_shape, transposed, weight, bias, *sums, wanted)
+            bound = BoundVectors(self.bottom_shapes[0], top_shape, transposed, Weights(weight, bias, *sums), wanted)
             return bound.forward, bound.backward
         tops = weight.new_empty(math.prod(top_shape[:-1]), top_shape[-1])
         top, matrix = tops.view(top_shape), weight if transposed else weight.t()

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.bound import BoundColumns
+from netspec.exact.bound import BoundColumns, Weights
 from netspec.exact.products import (
     ColumnProducts,
     Filter,
@@ -177,7 +177,7 @@ class Convolution(SlidingFilter):
         (weight, bias), sums = weight_and_bias(self, learning)
         if self.is_exact(weight, self.small):
             asked = (learning.wanted[0], learning.steady)
-            bound = BoundColumns(shape, sliding, self.group, weight, bias, *sums, *asked)
+            bound = BoundColumns(shape, sliding, self.group, Weights(weight, bias, *sums), *asked)
             return bound.forward, bound.backward
         lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else torch.Tensor.contiguous
         return self.convolutions(sliding, weight, bias, sums, learning.wanted[0], lay_out)
