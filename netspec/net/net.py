@@ -116,8 +116,9 @@ class Net(torch.nn.Module):
 
     @override
     def __call__(self, /, *values: Any, **inputs: Any) -> Any:
-        # torch's own has a parameter called self, which may be the name of an input too
-        return super().__call__(inputs) if "self" in inputs and not values else super().__call__(*values, **inputs)
+        if "self" in inputs and not values:  # the name of a parameter of torch's own, and of an input
+            return super().__call__(inputs)
+        return super().__call__(*values, **inputs)
 
     @override
     def forward(self, /, *values: Array | Mapping[str, Array], **inputs: Array) -> dict[str, torch.Tensor]:
@@ -125,16 +126,18 @@ class Net(torch.nn.Module):
 
         They may be one mapping. The value of a net's only input needs no name: ``net(images)``.
         """
-        given: dict[str, Any] = {**inputs}
-        if len(values) == 1 and not inputs and isinstance(values[0], Mapping):
-            given.update(values[0])
-        elif values and (len(values) > 1 or len(self.inputs) != 1 or inputs):
+        return self.forward_loss(**(self._named(values, inputs) if values else inputs))[1]
+
+    def _named(self, values: tuple[Any, ...], inputs: Mapping[str, Array]) -> Mapping[str, Array]:
+        """Return the values of inputs that were given without names, by name."""
+        first, *more = values
+        if not more and not inputs and isinstance(first, Mapping):
+            return first
+        if more or len(self.inputs) != 1 or inputs:
             known = ", ".join(f"{name}=..." for name in self.inputs) or "none (it reads its own data)"
-            found = f"{len(values)} values" if len(values) > 1 else "a value"
+            found = f"{len(values)} values" if more else "a value"
             raise SpecError(f"found {found} without a name; give inputs by name: {known}", Where(self.plan.source.file))
-        else:
-            given.update(zip(self.inputs, values, strict=False))
-        return self.forward_loss(**given)[1]
+        return {self.inputs[0]: first}
 
     def forward_loss(self, /, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
