@@ -393,15 +393,16 @@ def _cost_text(box: Box) -> str:
 
 
 def _badges_width(phases: Sequence[str]) -> float:
-    return sum(text_width(phase, 9, True) + 16 for phase in phases)
+    return sum(text_width(phase, SMALL, True) + 16 for phase in phases)
 
 
 def _badges(phases: Sequence[str], x: float, baseline: float) -> list[Mark]:
     marks: list[Mark] = []
     for phase in phases:
-        width = text_width(phase, 9, True) + 8
+        width = text_width(phase, SMALL, True) + 8
         color = "#9c4221" if phase == "TRAIN" else "#2b6cb0"
-        marks += [Rect(x, baseline - 10, width, 13, color, radius=3), Text(x + 4, baseline, phase, 9, "#ffffff", True)]
+        marks += [Rect(x, baseline - 11, width, 14, color, radius=3)]
+        marks.append(Text(x + 4, baseline, phase, SMALL, "#ffffff", True))
         x += width + 4
     return marks
 

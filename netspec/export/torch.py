@@ -7,6 +7,7 @@ of this project but the line that says where it came from. It computes what the 
 from __future__ import annotations
 
 import inspect
+import json
 import re
 import textwrap
 from collections import Counter
@@ -58,11 +59,22 @@ def export_torch(net: Net, path: str | Path, origin: str = "a prototxt") -> list
 
 
 def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: Mapping[str, str]) -> None:
-    """Write tensors as a .safetensors file."""
+    """Write tensors as a .safetensors file, with the same bytes each time.
+
+    The library writes metadata in the order of a hash table, another in each process.
+    """
     from safetensors.torch import save
 
-    with whole_file(path) as unfinished:
-        unfinished.write_bytes(save(dict(state), dict(metadata)))
+    data = memoryview(save(dict(state), dict(metadata)))
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(bytes(data[8:end]))
+    if "__metadata__" in header:
+        header = {"__metadata__": dict(sorted(header.pop("__metadata__").items())), **header}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # tensors begin at a multiple of 8
+    with whole_file(path) as unfinished, unfinished.open("wb") as file:
+        for part in (len(text).to_bytes(8, "little"), text, data[end:]):
+            file.write(part)
 
 
 def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, torch.Tensor], list[str]]:

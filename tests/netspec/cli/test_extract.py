@@ -41,6 +41,15 @@ def test_extract_writes_blobs_and_keys_over_all_records(run: Run) -> None:
     np.testing.assert_array_equal(found["sim"][:50, 0], first["sim"])
 
 
+def test_the_same_bytes_are_written_twice_where_no_time_is_wanted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
+    for name in ("a.npz", "b.npz"):
+        words = ["--model", NET, "--weights", INIT, "--blob", "feat", "--iterations", "1", "--out", name]
+        assert run("extract", *words).status == 0
+    assert Path("a.npz").read_bytes() == Path("b.npz").read_bytes()
+    assert np.isnan(np.load("a.npz")["seconds_per_record"])
+
+
 def test_extract_reads_another_database_and_as_many_batches_as_asked(run: Run) -> None:
     words = [
         "--model",

@@ -192,6 +192,18 @@ def test_files_of_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["draw", str(tmp_path / "none.prototxt"), "--out", str(tmp_path / "net.svg")]) == 1
 
 
+def test_text_can_be_read_on_a_phone() -> None:
+    """The page draws no smaller than 9 / 10.5 of the picture at first: no text is below 9 pixels."""
+    diagram = read(residual(3) + layer("only", "ReLU", "end", "only", "include { phase: TEST }"))
+    page = html_of(diagram, picture_of(diagram))
+    sizes = [float(size) for size in re.findall(r'font-size="([\d.]+)"', page)]
+    assert "TEST" in page
+    assert min(sizes) >= 10.5
+    assert "Math.max(9 / 10.5" in page
+    assert "prefers-color-scheme: dark" in page
+    assert "a click on a box" in page
+
+
 def test_a_solver_is_drawn_by_its_training_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("net.prototxt").write_text('name: "trained"\n' + residual(1))
