@@ -284,3 +284,30 @@ def test_shapes_are_known_without_data() -> None:
         assert cls is not None
         layer = cls(net.layer[0], [], Context(options=BuildOptions(open_data=False)))
         assert layer.top_shapes == [shape, (1, 1, 1, 8)]
+
+
+def test_of_several_sizes_one_is_drawn_for_ten_batches(tmp_path: Path) -> None:
+    source = write(tmp_path, annotated(noise(8, 12), OBJECTS), annotated(noise(10, 10), OBJECTS))
+    sizes = " ".join(f"resize_param {{ prob: 0.5 height: {size} width: {size} }}" for size in (6, 9))
+    layer = reading(source, sizes, batch=2)
+    seen = [batch_of(layer)[0].shape[2] for _ in range(80)]
+    assert set(seen) == {6, 9}
+    assert all(len(set(seen[i : i + 10])) == 1 for i in range(0, 80, 10))
+    with pytest.raises(SpecError, match="found 2 resize_param whose prob add up to 2, expected 1"):
+        reading(source, sizes.replace("0.5", "1"))
+
+
+def test_boxes_as_yolo_has_them(tmp_path: Path) -> None:
+    source = write(tmp_path, annotated(noise(8, 12), OBJECTS))
+    _, label = batch_of(reading(source, more="yolo_data_type: 1 yolo_data_jitter: 0 train_diffcult: false"))
+    assert label.shape == (1, 1, 300, 5)
+    expected = [(2, 0.3, 0.475, 0.4, 0.55), (4, 0.75, 0.625, 0.5, 0.75)]
+    np.testing.assert_allclose(label[0, 0, :2], expected, atol=1e-6)
+    assert not label[0, 0, 2:].any()
+
+
+def test_a_jitter_cuts_windows_of_its_own(tmp_path: Path) -> None:
+    source = write(tmp_path, annotated(noise(40, 40), OBJECTS))
+    layer = reading(source, "resize_param { height: 20 width: 20 }", more="yolo_data_type: 1 yolo_data_jitter: 0.5")
+    sums = {float(batch_of(layer)[0].sum()) for _ in range(10)}
+    assert len(sums) > 5

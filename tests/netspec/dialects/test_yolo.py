@@ -121,3 +121,64 @@ def test_what_does_not_fit_is_refused(build: Build, text: str, shapes: list[tupl
 
 def test_the_dialect_is_found_by_the_layer_type() -> None:
     assert use_dialects_of(f"layer {{ {V3 % 1} }}", "net.prototxt") == ["yolo"]
+
+
+LOSS = """type: 'RegionLoss' region_loss_param { num_class: 2 num: 2 object_scale: 5 noobject_scale: 1 class_scale: 1
+    coord_scale: 1 thresh: 0.6 biases: 0.5 biases: 1 biases: 2 biases: 1.5 rescore: %d bias_match: %d }"""
+
+
+def moves(maps: np.ndarray, truth: np.ndarray, rescore: bool, bias_match: bool) -> np.ndarray:
+    """Return by loops the gradient times the number of images, for maps (2 (5 + 2), S, S) and true boxes (n, 5)."""
+    side, anchors, found = maps.shape[-1], [(0.5, 1.0), (2.0, 1.5)], np.zeros_like(maps)
+
+    def predicted(n: int, row: int, column: int) -> Row:
+        x, y, w, h = maps[7 * n : 7 * n + 4, row, column]
+        sizes = (math.exp(w) * anchors[n][0] / side, math.exp(h) * anchors[n][1] / side)
+        return box((column + sigmoid(x)) / side, (row + sigmoid(y)) / side, *sizes)
+
+    boxes = [each for each in truth.tolist() if each[3]]
+    for n, row, column in np.ndindex(2, side, side):
+        o = sigmoid(maps[7 * n + 4, row, column])
+        best = max((overlap(predicted(n, row, column), box(*each[1:])) for each in boxes), default=0)
+        found[7 * n + 4, row, column] = 0 if best > 0.6 else o * o * (1 - o)
+    for label, x, y, w, h in boxes:
+        column, row = int(x * side), int(y * side)
+        shapes = []
+        for n in range(2):
+            sizes = [
+                a / side * (1 if bias_match else math.exp(maps[7 * n + 2 + i, row, column]))
+                for i, a in enumerate(anchors[n])
+            ]
+            shapes.append(overlap(box(0, 0, *sizes), box(0, 0, w, h)))
+        n = shapes.index(max(shapes))
+        numbers, move = maps[7 * n : 7 * n + 7, row, column], found[7 * n : 7 * n + 7, row, column]
+        scale = 1 if rescore else 2 - w * h
+        for i, goal in ((0, x * side - column), (1, y * side - row)):
+            s = sigmoid(numbers[i])
+            move[i] = -scale * (goal - s) * s * (1 - s)
+        for i, goal in ((2, math.log(w * side / anchors[n][0])), (3, math.log(h * side / anchors[n][1]))):
+            move[i] = -scale * (goal - numbers[i])
+        o, goal = sigmoid(numbers[4]), overlap(predicted(n, row, column), box(x, y, w, h)) if rescore else 1
+        move[4] = -5 * (goal - o) * o * (1 - o)
+        p = np.exp(numbers[5:]) / np.exp(numbers[5:]).sum()
+        move[5:] = p - (np.arange(2) == label)
+    return found
+
+
+@pytest.mark.parametrize("bias_match", [0, 1])
+@pytest.mark.parametrize("rescore", [0, 1])
+def test_the_gradient_of_region_loss_is_what_it_moves_not_its_derivative(
+    build: Build, rescore: int, bias_match: int
+) -> None:
+    maps = torch.randn(2, 14, 3, 3, requires_grad=True)
+    truth = torch.zeros(2, 1, 4, 5)
+    truth[0, 0, :2] = torch.tensor([[1, 0.4, 0.45, 0.5, 0.6], [0, 0.9, 0.1, 0.2, 0.3]])
+    truth[1, 0, :1] = torch.tensor([[1, 0.7, 0.72, 0.6, 0.5]])
+    layer = build("yolo", LOSS % (rescore, bias_match), maps.shape, truth.shape)
+    (loss,) = layer.run(maps, truth)
+    values = maps.detach().numpy().astype(float)
+    pairs = zip(values, truth[:, 0].numpy(), strict=True)
+    expected = np.stack([moves(m, t, bool(rescore), bool(bias_match)) for m, t in pairs])
+    np.testing.assert_allclose(loss.item(), (expected**2).sum() / 2, rtol=1e-5)
+    (found,) = torch.autograd.grad(loss, maps)
+    np.testing.assert_allclose(found, expected / 2, atol=1e-5)
