@@ -4,12 +4,13 @@ The best k references of each query are compared by local features and a fundame
 the camera is known). What is verified comes before all that is not; within both the inner method's order stays. Where
 images are too small, too dark or too different to be verified, the inner method's answer is passed through. To come
 before a better score takes half as many inliers again as rule out chance: two views of other parts of one corridor have
-just enough. On top of SeqSLAM a sequence is verified, not a single image:
-a pair is verified if any pair on one of its trajectories is.
+just enough. On top of SeqSLAM a sequence is verified, not a single image: a pair is verified if it is itself, or lies
+between two that are, on its trajectories.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,8 +76,10 @@ class Verified:
         if self.order == "inliers":
             return MethodResult(np.where(verified, inliers, np.nan), seconds, notes, found.training_stages)
         if isinstance(self.inner, SeqSlam):
-            verified = on_trajectories(verified, self.inner.settings.offsets())
-            notes.append("a pair is verified if any pair on one of its trajectories is")
+            offsets, half = self.inner.settings.offsets(), self.inner.settings.length // 2
+            before, after = range(half + 1), range(half, self.inner.settings.length + 1)
+            verified = on_trajectories(verified, offsets, before) & on_trajectories(verified, offsets, after)
+            notes.append("a pair is verified if it lies between two that are, on its trajectories")
         if not verified.any():
             notes.append("these images cannot be verified: the scores are those of the inner method")
         known = ~np.isneginf(candidates)
@@ -103,11 +106,12 @@ class Verified:
         return inliers
 
 
-def on_trajectories(accepted: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+def on_trajectories(accepted: np.ndarray, offsets: np.ndarray, part: Iterable[int] | None = None) -> np.ndarray:
     """Return the pairs (Q, R) that have an accepted one on a trajectory through them.
 
     offsets  (T, steps) the reference of each trajectory at each step, relative to that of the pair, which is at step
              (steps - 1) // 2
+    part     the steps that are looked at; all by default
     """
     queries, references = accepted.shape
     steps = offsets.shape[1]
@@ -115,7 +119,7 @@ def on_trajectories(accepted: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     reach = int(np.abs(offsets).max())
     padded = np.pad(accepted, ((half, steps - 1 - half), (reach, reach)))
     supported = np.zeros_like(accepted)
-    for step in range(steps):
+    for step in range(steps) if part is None else part:
         for offset in np.unique(offsets[:, step]):
             supported |= padded[step : step + queries, reach + offset : reach + offset + references]
     return supported

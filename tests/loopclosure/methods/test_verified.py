@@ -123,6 +123,8 @@ def test_on_top_of_seqslam_a_sequence_is_verified(walls):
     together = first(sequences.score(Images(partly), silent).scores, given)
     assert {(i, i - WALLS) for i in range(WALLS, 2 * WALLS)} <= set(together)
     assert (11, 1) not in together
+    ended = [*walls[:11], blank]  # past the last verified pair the line goes on, but not the loop
+    assert (11, 5) not in first(sequences.score(Images(ended), silent).scores, given)
 
 
 def test_trajectories_support_what_is_on_them():
