@@ -69,6 +69,14 @@ def caffe_names() -> frozenset[str]:
     return frozenset(field.name for found in messages for field in found.fields)
 
 
+@cache
+def fields_with(message: str) -> frozenset[str]:
+    """Return the names of the fields of Caffe's own messages that hold a message (full name)."""
+    messages = pool.FindFileByName("caffe.proto").message_types_by_name.values()
+    fields = (field for found in messages for field in found.fields if field.message_type is not None)
+    return frozenset(field.name for field in fields if field.message_type.full_name == message)
+
+
 if TYPE_CHECKING:
     from netspec.proto import caffe_pb2  # a stub; import-linter knows it as part of the package
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from netspec.proto.dialect.files import announce_known, find_file, known_files, switch_on
 from netspec.proto.dialect.registry import Dialect, active, known
-from netspec.proto.lexer import NAME, STRING, Lexer
-from netspec.proto.schema import caffe_names
+from netspec.proto.lexer import NAME, STRING, SYMBOL, Lexer
+from netspec.proto.schema import caffe_names, fields_with
 from netspec.terminal import log
 
 
@@ -13,9 +13,9 @@ def use_dialects_of(text: str, file: str) -> list[str]:
     """Switch on the dialects whose fields, values of enums or layer types a prototxt has; return their names.
 
     The dialect that has most of them comes first, of equal ones that whose messages have more of the fields; what it
-    has is not looked for in others. Where two have the same all the same, neither is switched on. A name that Caffe has
-    too, in whichever message (``bias_filler``), switches nothing on. ``file`` is what errors call the text. Raises
-    SpecError for text that is no prototxt at all.
+    has is not looked for in others. Where two have the same all the same, neither is switched on. A field whose name
+    Caffe has too, in another message, is known by the message around it (``data_param { shuffle: true }``). ``file`` is
+    what errors call the text. Raises SpecError for text that is no prototxt at all.
     """
     words = _words(text, file) - caffe_names()
     announce_known()
@@ -42,18 +42,28 @@ def use_dialects_of(text: str, file: str) -> list[str]:
 
 
 def _own_words(dialect: Dialect) -> set[str]:
-    """Return the names of a dialect's fields, of the values that it adds to Caffe's enums, and of its layer types."""
+    """Return the names of a dialect's fields, of the values that it adds to Caffe's enums, and of its layer types.
+
+    A field is there with the message around it too, ``data_param.shuffle``.
+    """
     values = {value for names in dialect.values().values() for value in names}
-    return {field for _, field in dialect.fields()} | values | set(dialect.layer_types)
+    fields = {field for _, field in dialect.fields()}
+    inside = {f"{outer}.{field}" for message, field in dialect.fields() for outer in fields_with(message)}
+    return fields | inside | values | set(dialect.layer_types)
 
 
 def _words(text: str, file: str) -> set[str]:
-    """Return the names of fields and of values, and the layer types, in a prototxt."""
+    """Return the names of fields, alone and with that of the message around them, of values, and of layer types."""
     lexer = Lexer(text, file)
-    words, before = set(), ["", ""]
+    words, before, last, around = set(), ["", ""], "", [""]
     for token in lexer:
         if token.kind == NAME:
-            words.add(token.text)
+            last = token.text
+            words.update((last, f"{around[-1]}.{last}"))
+        elif token.kind == SYMBOL and token.text in "{<":
+            around.append(last)
+        elif token.kind == SYMBOL and token.text in "}>" and len(around) > 1:
+            around.pop()
         elif token.kind == STRING and before == ["type", ":"]:
             words.add(lexer.unquote(token).decode(errors="replace"))
         before = [before[1], token.text]

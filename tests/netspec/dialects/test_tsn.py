@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.dialects import use_dialect
+from netspec.dialects import use_dialect, use_dialects_of
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer
 from netspec.net.one_layer import make_layer
@@ -104,3 +104,11 @@ def test_a_line_has_a_folder_frames_and_a_label(videos: Path) -> None:
     (videos / "list.txt").write_text("one 12\n")
     with pytest.raises(SpecError, match='found "one 12", expected the folder of a video, how many frames it has'):
         video(videos, "")
+
+
+def test_a_field_is_known_by_the_message_around_it() -> None:
+    """Caffe has a field shuffle too, in image_data_param and hdf5_data_param."""
+    text = """layer { name: "data" type: "Data" top: "data" data_param { source: "x" %s } }
+        layer { name: "image" type: "ImageData" top: "image" image_data_param { source: "x" shuffle: true } }"""
+    assert use_dialects_of(text % "", "net.prototxt") == []
+    assert use_dialects_of(text % "shuffle: true", "net.prototxt") == ["tsn"]
