@@ -7,13 +7,13 @@ import sys
 import threading
 import time
 
-import cv2
 import numpy as np
-import rospy
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path
-from sensor_msgs.msg import Image
+import rospy  # pyright: ignore[reportMissingImports]
+from geometry_msgs.msg import PoseWithCovarianceStamped  # pyright: ignore[reportMissingImports]
+from nav_msgs.msg import Odometry, Path  # pyright: ignore[reportMissingImports]
+from sensor_msgs.msg import Image  # pyright: ignore[reportMissingImports]
 
+from loopclosure.places.frames import read_bgr
 from loopclosure.places.sequences import read_sequence
 
 SECONDS = 60  # in which the node must have looked at all images
@@ -25,7 +25,7 @@ def numbers(pose):
 
 
 def image_message(path, stamp):
-    image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    image = read_bgr(path)[..., ::-1]
     made = Image(height=image.shape[0], width=image.shape[1], encoding="rgb8", step=3 * image.shape[1])
     made.data, made.header.stamp = image.tobytes(), stamp
     return made

@@ -91,7 +91,6 @@ def add_to(commands: Commands) -> None:
         "--consistency-window", type=int, metavar="FRAMES", help=f"how near (default: {of.consistency_window})"
     )
     p.add_argument("--verify", action="store_true", help="verify candidates by SIFT matches and RANSAC")
-    p.add_argument("--min-inliers", type=int, help=f"of --verify (default: {GeometricCheck().min_inliers})")
     p.add_argument(
         "--odometry", metavar="FILE", help="poses (TUM, KITTI, EuRoC): frames that they put far apart are no loop"
     )
@@ -187,8 +186,6 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
         check_rerun()
     if a.resume and (_changes(a) or a.verify):
         raise WrongUsage("--resume continues with the settings of the saved detector; leave out others")
-    if a.min_inliers is not None and not a.verify:
-        raise WrongUsage("--min-inliers means nothing without --verify")
     given = [f"--{name.replace('_', '-')}" for name in ONLINE if getattr(a, name) is not None]
     given += ["--verify"] if a.verify else []
     if given and a.threshold is None and not a.video:
@@ -219,5 +216,5 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     if a.video:
         changes.setdefault("exclude_seconds", RECENT_SECONDS)
     if a.verify or (a.video and a.threshold is None):
-        check = GeometricCheck() if a.min_inliers is None else GeometricCheck(min_inliers=a.min_inliers)
+        check = GeometricCheck()
     return LoopDetector(describe, check=check, views=views, **changes)

@@ -234,6 +234,10 @@ class LoopDetector:
         """Return the points that the geometric check found in a frame, to measure a loop by."""
         return self._frames.local[frame]
 
+    def arrays_since(self, frame: int) -> dict[str, np.ndarray]:
+        """Return what a file has of the frames from this one on, but their descriptors."""
+        return self._frames.arrays(self.check is not None, frame)
+
     def decided(self, loops: Sequence[LoopResult], threshold: float | None) -> None:
         """Take loops that were found with all frames in view, and a threshold for frames to come."""
         self.loops = list(loops)
@@ -249,7 +253,7 @@ class LoopDetector:
             "loops": [asdict(loop) for loop in self.loops],
             "sessions": self._sessions,
         }
-        arrays = {"rows": self._frames.rows(), **self._frames.arrays(self.check is not None)}
+        arrays: dict[str, Any] = {"rows": self._frames.rows(), **self._frames.arrays(self.check is not None)}
         with whole_file(path) as unfinished, unfinished.open("wb") as stream:
             np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 

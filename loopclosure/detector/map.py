@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -134,7 +135,7 @@ class Map:
             results = run_detector(detector, recording, progress=progress)
             rows = np.array(described.kept)
             folder = self.folder / f"{len(self.sessions):06d}"
-            arrays = detector._frames.arrays(True, before)
+            arrays: dict[str, Any] = detector.arrays_since(before)
             with whole_folder(folder) as unfinished:
                 np.save(unfinished / "rows.npy", rows)
                 np.save(unfinished / "points.npy", arrays.pop("points"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from netspec.files.opencv import cv2
 Image = tuple[float, np.ndarray]
 
 
-def live_frames(source: str) -> Iterator[Image]:
+def live_frames(source: str) -> Generator[Image, None, None]:
     """Yield (seconds from the start, image (H, W, 3) uint8 BGR) until the source ends, or the caller stops.
 
     source  the number of a camera; the address of a stream, as in ``rtsp://HOST/PATH``; or a video file

@@ -237,7 +237,6 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
         ("detect LAPS --top-k 3 --out OUT", "--top-k means nothing without --threshold"),
         ("detect LAPS --verify --out OUT", "--verify means nothing without --threshold"),
         ("detect LAPS --threshold 1 --odometry O --out OUT", "--odometry means nothing to a search frame by frame"),
-        ("detect LAPS --threshold 1 --min-inliers 9 --out OUT", "--min-inliers means nothing without --verify"),
         ("similarity FEATURES --exclude-frames 3 --out OUT", "belongs to --top-k"),
         ("similarity FEATURES --references FEATURES --top-k 1 --exclude-frames 3 --out OUT", "one sequence"),
     ],

@@ -1,5 +1,7 @@
 """Sessions: of the detector itself, and of visitors, which leave it as it is."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ def near(rows: np.ndarray, seed: int) -> np.ndarray:
     return rows + 0.02 * np.random.default_rng(seed).normal(size=rows.shape).astype(np.float32)
 
 
-def filled(**settings: object) -> LoopDetector:
+def filled(**settings: Any) -> LoopDetector:
     detector = LoopDetector(threshold=-0.5, **settings)
     for i, row in enumerate(LAP):
         detector.add_descriptor(row, float(i))

@@ -26,9 +26,9 @@ def test_recordings_of_detect_and_close(folder: Path) -> None:
     assert main(["detect", "laps", *KNOWN, "--rerun", "found.rrd"]) == 0
     closing = ["close", "laps", "--loops", "found/loops.csv", "--drift", "2", "--camera", "60,60,32,24"]
     assert main([*closing, "--out", "closed", "--rerun", "closed.rrd"]) == 0
-    import rerun_cli
-
-    program = Path(rerun_cli.__file__).with_name("rerun")
+    found = find_spec("rerun_cli")
+    assert found is not None
+    program = Path(str(found.origin)).with_name("rerun")
     for name, entities in (
         ("found.rrd", ("/image", "/match", "/score", "/loop", "/path/before", "/path/loops", "/path/camera")),
         ("closed.rrd", ("/image", "/path/before", "/path/after", "/path/true", "/path/camera/after")),
