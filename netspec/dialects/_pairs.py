@@ -37,7 +37,7 @@ def read_pairs(path: str, where: Where | None = None) -> list[Pair]:
         names = line.split()
         if len(names) != 2:
             raise SpecError(f'found "{line}", expected the names of an image and of its labels', place)
-        pairs.append(Pair(*names, place))
+        pairs.append(Pair(names[0], names[1], place))
     if not pairs:
         raise SpecError(f'the list "{path}" is empty', where or Where(path))
     return pairs

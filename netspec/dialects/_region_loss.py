@@ -64,7 +64,7 @@ class RegionLoss(Loss):
         cells = as_array(maps).reshape(items, self.settings.num, -1, side, side)
         boxes = as_array(truth).reshape(items, -1, 5)
         moves = np.stack([self._moves(*each) for each in zip(cells, boxes, strict=True)])
-        return _Moved.apply(maps, torch.from_numpy(moves.reshape(maps.shape)).to(maps))  # type: ignore[no-any-return]
+        return _Moved.apply(maps, torch.from_numpy(moves.reshape(maps.shape)).to(maps))
 
     def _moves(self, cells: Array, truth: Array) -> Array:
         """Return what the numbers (num, 5 + num_class, S, S) of an image are to be moved by, in the opposite direction.

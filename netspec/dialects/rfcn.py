@@ -126,7 +126,7 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
     bottom[1]  labels, one per prediction
     top[0]     the loss, ()
     top[1]     optional: the softmax, bottom[0]'s shape; as top[2] it brings no gradient
-    top[2]     optional: the loss of each prediction, bottom[1]'s shape
+    top[2]     optional: the loss of each prediction, bottom[1]'s shape; (N, 1, 1, 1) for (N,), as R-FCN's labels are
     Fork: intel/caffe, src/caffe/layers/softmax_loss_ohem_layer.cpp
     """
 
@@ -135,13 +135,13 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return [*super().reshape(bottom_shapes), bottom_shapes[1]][: self.num_tops]
+        return [*super().reshape(bottom_shapes), _four(bottom_shapes[1])][: self.num_tops]
 
     @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss, the softmax, and the losses."""
         tops = super().forward(scores, labels)
-        return (*tops, self._losses.reshape(labels.shape))[: self.num_tops]
+        return (*tops, self._losses.reshape(_four(tuple(labels.shape))))[: self.num_tops]
 
     @override
     def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:

@@ -445,7 +445,7 @@ class Lstm(Layer):
     not_exported = "its steps are a loop"
 
     @property
-    def remembers(self) -> bool:  # type: ignore[override]
+    def remembers(self) -> bool:
         """Whether it goes on from one pass to the next."""
         return len(self.bottom_shapes) > 1
 

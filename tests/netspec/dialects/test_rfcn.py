@@ -64,7 +64,7 @@ def test_softmax_loss_of_each_region(build: Build, given: str, divisor: int) -> 
     layer = build("rfcn", text, (4, 3), (4,), tops=3)
     loss, p, each = layer.run(scores.requires_grad_(), labels)
     expected = F.cross_entropy(scores, labels.long(), reduction="none", ignore_index=-1)
-    torch.testing.assert_close(each, expected.detach())
+    torch.testing.assert_close(each, expected.detach().reshape(4, 1, 1, 1))
     torch.testing.assert_close(p, F.softmax(scores, 1).detach())
     torch.testing.assert_close(loss, expected.sum() / divisor)
     (found,) = torch.autograd.grad(loss, scores)

@@ -10,6 +10,7 @@ import torch
 from netspec.dialects import use_dialect, use_dialects_of
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer
+from netspec.layers.data.files import ReadingLayer
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST, TRAIN
 from paths import GOLDEN
@@ -77,6 +78,8 @@ def test_windows_of_several_sizes_and_places() -> None:
 def test_the_first_epoch_is_read_in_order_and_later_ones_are_shuffled() -> None:
     text = f"type: 'Data' data_param {{ source: '{GOLDEN}/pairs/train_lmdb' backend: LMDB batch_size: 1 %s }}"
     layer, plain = (layer_of(text % given, TRAIN) for given in ("shuffle: true", ""))
+    assert isinstance(layer, ReadingLayer)
+    assert isinstance(plain, ReadingLayer)
     count = layer.num_records
     first, second = ([layer.keys(i)[0] for i in range(n * count, (n + 1) * count)] for n in (0, 1))
     assert first == [plain.keys(i)[0] for i in range(count)] == sorted(second)
