@@ -271,7 +271,8 @@ def _table(message: str) -> str:
 
 def _prose(text: str) -> str:
     """Return text of a docstring or a comment as Markdown."""
-    return re.sub(r"([*_<>\[\]])", r"\\\1", text.replace("``", "`")) if "`" not in text else text.replace("``", "`")
+    parts = re.split(r"(`[^`]*`)", text.replace("``", "`"))  # code stays as it is
+    return "".join(re.sub(r"([*_<>\[\]])", r"\\\1", part) if k % 2 == 0 else part for k, part in enumerate(parts))
 
 
 def setup(app: Any) -> dict[str, Any]:

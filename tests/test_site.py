@@ -105,8 +105,9 @@ def test_every_layer_is_drawn_with_its_shapes(site: Path) -> None:
         )
     }
     assert set(pictures) == set(layer_types()) - {"Python"}, "the class of a Python layer says its shapes"
-    shown = "data 1 × 3 × 227 × 227 and gives conv1 1 × 96 × 55 × 55; learned: 96 × 3 × 11 × 11, 96"
-    assert pictures["Convolution"]["caption"] == shown
+    read = "left 2 × 4 × 5 × 6, right 2 × 4 × 5 × 6"  # the example in docs/reference/layers.prototxt
+    gives = "conv_left 2 × 4 × 3 × 3, conv_right 2 × 4 × 3 × 3"
+    assert pictures["Convolution"]["caption"] == f"{read} and gives {gives}; learned: 4 × 2 × 3 × 3, 4"
     for kind, picture in pictures.items():
         width, height = float(picture["width"]), float(picture["height"])
         for box in re.findall(r'<rect class="\w+" x="(\S+)" y="(\S+)" width="(\S+)" height="(\S+)"', picture["parts"]):
