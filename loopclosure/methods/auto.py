@@ -132,12 +132,14 @@ def answer(
         least = max(SURE, threshold(evidence, unlike, precision))
         if np.count_nonzero(unlike >= DOUBTLESS) <= LEAST_SHARE * len(unlike):
             least = min(least, DOUBTLESS)
-        sure = evidence >= least
+        # From afar a place is seen before the camera is there: other queries fit it better.
+        near = np.ones(len(match), bool) if found is None else found.near
+        sure = near & (evidence >= least)
         if np.count_nonzero(unlike >= 1) > LEAST_SHARE * len(unlike):
             verified = sure | (accepted & keeps)
         kept = sure | (accepted & _between(match, verified, found))
         rare = np.count_nonzero(unlike >= 1) <= RARELY * len(unlike)
-        while rare and np.any(more := verified & np.any(_beside(match, kept, found), axis=0) & ~kept):
+        while rare and np.any(more := verified & near & np.any(_beside(match, kept, found), axis=0) & ~kept):
             kept |= more
         verdicts[accepted & ~kept] = "not verified"
         verdicts[there & ~accepted & ~kept] = "not verified" if found is None else "below threshold"
