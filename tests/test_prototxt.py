@@ -281,8 +281,9 @@ def test_the_net_with_edges_contains_the_net_of_256() -> None:
 
 def test_edges_are_the_same_in_the_negative_of_an_image() -> None:
     """Dark ground becomes bright under snow: the words change, the directions without sign do not."""
-    weights = [folder / f"{folder.name}.caffemodel" for folder in (WORDS, EDGES)]
-    net = netspec.load_net(EDGES / "deploy.prototxt", weights=weights)
+    net = load_net(EDGES / "deploy.prototxt")
+    for folder in (WORDS, EDGES):
+        load_weights(net, folder / f"{folder.name}.caffemodel")
     net.keep = ["edges", "whole"]
     image = cv2.resize(np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8), (160, 120))
     seen = []
