@@ -73,8 +73,8 @@ def caffe_names() -> frozenset[str]:
 def fields_with(message: str) -> frozenset[str]:
     """Return the names of the fields of Caffe's own messages that hold a message (full name)."""
     messages = pool.FindFileByName("caffe.proto").message_types_by_name.values()
-    fields = (field for found in messages for field in found.fields if field.message_type is not None)
-    return frozenset(field.name for field in fields if field.message_type.full_name == message)
+    kinds = ((field.name, field.message_type) for found in messages for field in found.fields)
+    return frozenset(name for name, kind in kinds if kind is not None and kind.full_name == message)
 
 
 if TYPE_CHECKING:
@@ -205,8 +205,9 @@ def value(message: Message, name: str) -> Any:
 def added_value(message: Message, name: str) -> str:
     """Return the value that a field of an enum was given, if it is one that a dialect adds to the enum; else ""."""
     field = fields_of(message.DESCRIPTOR).get(name + MORE)
-    given = field is not None and field.present(message)
-    return field.descriptor.enum_type.values_by_number[field.get(message)].name if given else ""
+    if field is None or not field.present(message):
+        return ""
+    return field.descriptor.enum_type.values_by_number[field.get(message)].name
 
 
 def has(message: Message, name: str) -> bool:

@@ -38,7 +38,7 @@ def test_a_route_in_another_season_has_the_same_places(tmp_path: Path) -> None:
     assert made["comes back"].truth.queries_with_a_loop.sum() == 20
     assert made["shares nothing"].truth.positives == 0
     again = drives.in_season(made["season 2"].references, tmp_path / "other", 2)
-    assert np.array_equal(cv2.imread(str(again[5])), cv2.imread(str(made["season 2"].query_images[5])))
+    assert Path(again[5]).read_bytes() == Path(made["season 2"].query_images[5]).read_bytes()
 
 
 def test_what_auto_should_reach() -> None:

@@ -138,7 +138,7 @@ def moves(maps: np.ndarray, truth: np.ndarray, rescore: bool, bias_match: bool) 
 
     boxes = [each for each in truth.tolist() if each[3]]
     for n, row, column in np.ndindex(2, side, side):
-        o = sigmoid(maps[7 * n + 4, row, column])
+        o = sigmoid(float(maps[7 * n + 4, row, column]))
         best = max((overlap(predicted(n, row, column), box(*each[1:])) for each in boxes), default=0)
         found[7 * n + 4, row, column] = 0 if best > 0.6 else o * o * (1 - o)
     for label, x, y, w, h in boxes:
