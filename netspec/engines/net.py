@@ -35,7 +35,7 @@ Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path, with
 def load_net(
     path: str | Path,
     phase: str | int = "TEST",
-    weights: str | Path | None = None,
+    weights: str | Path | Iterable[str | Path] | None = None,
     level: int = 0,
     stages: Iterable[str] = (),
     device: str | torch.device = "cpu",
@@ -49,7 +49,7 @@ def load_net(
     cache: str | Path | bool | None = None,
     limit: int | None = None,
 ) -> Net:
-    """Build the net of a prototxt for a phase, level and stages; ``weights`` names a .caffemodel or .caffemodel.h5.
+    """Build the net of a prototxt for a phase, level and stages; ``weights`` names one file of weights or several.
 
     It takes what a user may choose as keywords; from here on that is one BuildOptions (netspec/graph/options.py).
     A warning names the layers that the weights lack; with ``strict`` that is an error.
@@ -76,7 +76,7 @@ def load_net(
         strict=strict,
         limit=limit,
     )
-    files = [] if weights is None else [weights]
+    files = [] if weights is None else [weights] if isinstance(weights, (str, Path)) else list(weights)
     return with_engine(build.load_net(path, phase_of(phase), options, files), choice, path, files)
 
 

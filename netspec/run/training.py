@@ -148,7 +148,7 @@ class TrainingStep:
             raise
 
     def _run(self, prepared: _Prepared, values: Values) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        # Not netspec/run/walk.py, which took up to 1.1 of the time: values lie in a list, a loss of weight 1 is as it is.
+        # Not netspec/run/walk.py, which took up to 1.1 of the time: values lie in a list, a loss may be taken as it is.
         self._values = values
         loss: torch.Tensor | None = None
         for kernel, bottoms, tops, losses in prepared.forward:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import netspec
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
@@ -354,3 +355,14 @@ def test_layers_without_blobs_and_weights_in_the_prototxt_are_not_missed(tmp_pat
     load_weights(net, holding(tmp_path, "one"), strict=True)
     assert warnings() == []
     assert blobs_of(net)["two"][1].tolist() == [1, 2, 3, 4]
+
+
+def test_load_net_takes_several_files_of_weights(tmp_path: Path) -> None:
+    (tmp_path / "net.prototxt").write_text(TOWERS)
+    files = [tmp_path / f"{seed}.caffemodel" for seed in (2, 3)]
+    for seed, file in zip((2, 3), files, strict=True):
+        save_weights(net_of(TOWERS, seed), file)
+    loaded = netspec.load_net(tmp_path / "net.prototxt", weights=files)
+    assert torch.equal(
+        loaded.params["ip"][0], netspec.load_net(tmp_path / "net.prototxt", weights=files[1]).params["ip"][0]
+    )
