@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from netspec.engines.cache import Cache, fill, note
+from netspec.engines.cache import entry, fill, note
 from netspec.engines.choice import BF16, FP32, Choice
 from netspec.engines.key import key_of
 from netspec.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
@@ -71,7 +71,7 @@ class Model:
         if self.choice.cache is not None and origin is not None:
             key = key_of(origin.files, {**origin.options, **given})
             try:
-                folder, about, made = Cache(self.choice.cache).entry(key, make)
+                folder, about, made = entry(self.choice.cache, key, make)
             except OSError as fault:
                 where = self.choice.cache
                 log.logger.warning(f"{where}: cannot be written: {fault.strerror}; the exported model is not kept")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from netspec.engines.cache import ABANDONED, ABOUT, UNFINISHED, Cache
+from netspec.engines.cache import ABANDONED, ABOUT, UNFINISHED, entry
 from netspec.engines.choice import Choice, user_folder
 from netspec.engines.key import key_of
 from netspec.errors import SpecError
@@ -26,14 +26,14 @@ class Maker:
 
 
 def test_an_entry_is_made_once(tmp_path: Path) -> None:
-    make, cache = Maker(), Cache(tmp_path / "new" / "cache")
-    folder, about, made = cache.entry("key", make)
+    make, cache = Maker(), tmp_path / "new" / "cache"
+    folder, about, made = entry(cache, "key", make)
     assert (folder / "model").read_bytes() == b"m" * 10
     assert (about["said"], made) == ("something", True)
-    assert cache.entry("key", make) == (folder, about, False)
-    assert cache.entry("other", make)[0] != folder
+    assert entry(cache, "key", make) == (folder, about, False)
+    assert entry(cache, "other", make)[0] != folder
     assert make.calls == 2
-    assert sorted(path.name for path in cache.folder.iterdir()) == ["key", "other"]
+    assert sorted(path.name for path in cache.iterdir()) == ["key", "other"]
 
 
 @pytest.mark.parametrize(
@@ -48,14 +48,14 @@ def test_an_entry_is_made_once(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_entry_is_made_again(damage, tmp_path: Path) -> None:
-    make, cache = Maker(), Cache(tmp_path)
-    folder, about, _ = cache.entry("key", make)
+    make = Maker()
+    folder, about, _ = entry(tmp_path, "key", make)
     time.sleep(0.01)  # a file system's clock is coarse
     damage(folder)
-    again = cache.entry("key", make)
+    again = entry(tmp_path, "key", make)
     assert (again[0], again[1]["said"], again[2]) == (folder, about["said"], True)
     assert (folder / "model").read_bytes() == b"m" * 10
-    assert cache.entry("key", make)[2] is False
+    assert entry(tmp_path, "key", make)[2] is False
 
 
 def test_a_maker_that_fails_leaves_nothing(tmp_path: Path) -> None:
@@ -64,19 +64,18 @@ def test_a_maker_that_fails_leaves_nothing(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Cache(tmp_path).entry("key", make)
+        entry(tmp_path, "key", make)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_least_recently_used_go_first(tmp_path: Path) -> None:
-    cache = Cache(tmp_path, limit=3500)
     for age, key in enumerate("abc"):
-        folder = cache.entry(key, Maker(1000))[0]
+        folder = entry(tmp_path, key, Maker(1000), 3500)[0]
         os.utime(folder / ABOUT, (1000 + age, 1000 + age))
-    cache.entry("a", Maker(1000))  # used again
-    cache.entry("d", Maker(1000))
+    entry(tmp_path, "a", Maker(1000), 3500)  # used again
+    entry(tmp_path, "d", Maker(1000), 3500)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c", "d"]
-    cache.entry("large", Maker(5000))
+    entry(tmp_path, "large", Maker(5000), 3500)
     assert [path.name for path in tmp_path.iterdir()] == ["large"]
 
 
@@ -85,16 +84,16 @@ def test_what_a_dead_process_left_goes(tmp_path: Path) -> None:
         folder = tmp_path / f"{UNFINISHED}{name}"
         folder.mkdir()
         os.utime(folder, (time.time() - age, time.time() - age))
-    Cache(tmp_path).entry("key", Maker())
+    entry(tmp_path, "key", Maker())
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{UNFINISHED}new", "key"]
 
 
 def test_an_entry_that_another_process_made_meanwhile_is_used(tmp_path: Path) -> None:
     def make(folder: Path) -> dict[str, str]:
-        Cache(tmp_path).entry("key", Maker(20))
+        entry(tmp_path, "key", Maker(20))
         return Maker(20)(folder)
 
-    folder, _, _ = Cache(tmp_path).entry("key", make)
+    folder, _, _ = entry(tmp_path, "key", make)
     assert (folder / "model").stat().st_size == 20
     assert [path.name for path in tmp_path.iterdir()] == ["key"]
     assert set(json.loads((folder / ABOUT).read_text())["files"]) == {"model"}
