@@ -75,6 +75,7 @@ LESS = {
     "docs/seeing.md": {"--start 1000": "--start 10"},
 }
 BENCH = "tests/benchmarks/test_bench.py runs it on less"
+LOOPS = "needs public sequences, and hours; tests/benchmarks/test_loops.py runs its parts"
 # How a command begins that does not run here, and why.
 NOT_RUN = {
     "README.md": {
@@ -90,6 +91,8 @@ NOT_RUN = {
         "tools/bench waiting": "a minute of two trainings side by side",
         "tools/bench feeding": BENCH,
         "tools/bench growth": BENCH,
+        "tools/bench settings": LOOPS,
+        "tools/bench tables": LOOPS,
         "benchmarks/gpu_steps": "needs a GPU; tests/benchmarks/test_gpu_steps.py runs it without one",
     },
     "prototxt/README.md": {
@@ -107,6 +110,7 @@ NOT_RUN = {
     },
     "docs/growth.md": {"tools/bench growth layers": BENCH, "tools/bench growth batch": BENCH},
     "docs/performance.md": {"tools/bench": "times are measured, for minutes; " + BENCH},
+    "docs/results.md": {"tools/bench": LOOPS},
     "docs/start.md": {
         "python3 -m venv": "tests/test_wheel.py makes an environment",
         "pip install": "needs a package index; tests/test_wheel.py installs the wheel",

@@ -168,7 +168,7 @@ _CHOSEN |= {"allow_python_layers": "allow_python", "data": "open_data", "compile
 
 def options(arguments: argparse.Namespace, **chosen: Any) -> BuildOptions:
     """Return how a command's nets are built: as its options say, and as ``chosen``."""
-    said = {_CHOSEN[name]: value for name, value in vars(arguments).items() if name in _CHOSEN}
+    said = {field: getattr(arguments, name) for name, field in _CHOSEN.items() if name in arguments}
     if "stage" in arguments:
         said["stages"] = stages(arguments)
     return BuildOptions(**{**said, **chosen})

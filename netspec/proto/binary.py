@@ -90,8 +90,8 @@ def check_readable(paths: Iterable[str]) -> None:
     for path in paths:
         try:
             open(path, "rb").close()
-        except OSError as fault:
-            raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(path)) from None
+        except (OSError, ValueError) as fault:  # ValueError: a NUL in the name
+            raise SpecError(f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(path)) from None
 
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"

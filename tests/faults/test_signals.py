@@ -105,7 +105,8 @@ def test_one_line_where_an_import_makes_another_error_of_it() -> None:
 def test_one_line_from_the_first_line_of_the_program(package: str) -> None:
     """Whenever it comes, once Python runs the program: also where the arguments are read, and after the command."""
     code = (
-        f"import os, signal, sys\nfrom {package}.__main__ import main\nfrom random import uniform\n"
+        f"import atexit, os, signal, sys\nfrom {package}.__main__ import main\n"
+        "atexit.register(signal.setitimer, signal.ITIMER_REAL, 0)\n"  # Python's end forgets the handler
         "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGTERM))\n"
         "signal.setitimer(signal.ITIMER_REAL, float(sys.argv.pop()))\nsys.exit(main())\n"
     )

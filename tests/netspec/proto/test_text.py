@@ -263,7 +263,8 @@ def test_damaged_text_is_refused_or_read_alike(seed: int) -> None:
 
 
 def prototxts() -> list[Path]:
-    forks = {GOLDEN / "dnn" / "detect.prototxt", *(GOLDEN / "ssd").rglob("*.prototxt")}  # with fields of their own
+    folders = (GOLDEN / "ssd", GOLDEN / "forks")  # with fields of their own
+    forks = {GOLDEN / "dnn" / "detect.prototxt", *(path for each in folders for path in each.rglob("*.prototxt"))}
     own = sorted(set(GOLDEN.rglob("*.prototxt")) - forks)
     return [*own, *sorted((SHARED / "corpus").rglob("*.prototxt"))]
 
