@@ -36,6 +36,7 @@ SUPPOSED = {
     "docs/methods.md": "SEQUENCE net.pt2 A B",
     "docs/nets.md": "prototxt a.caffemodel b.caffemodel",
     "docs/paper.md": "prototxt",
+    "docs/results.md": "prototxt rgbd_dataset_freiburg1_xyz",
     "docs/robot.md": "drive.mp4",
     "docs/seeing.md": "train.log old_caffe.log solver.prototxt train_val.prototxt train_lmdb deploy.prototxt "
     "x.caffemodel a.png b.png FOLDER",
