@@ -2,6 +2,7 @@
 
 import os
 import sys
+from functools import partial
 
 # python -m puts the working directory first, where a file may be called torch.py; the package itself may lie there.
 HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
@@ -10,11 +11,7 @@ if __name__ == "__main__" and sys.path[:1] == [os.getcwd()] != [HERE] and not ge
 
 from netspec.terminal.main import program  # noqa: E402
 
-
-def main() -> int:
-    """Run one command of lmdb-build."""
-    return program("lmdb_build.cli")
-
+main = partial(program, "lmdb_build.cli")
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -34,14 +34,8 @@ class Commands(commands.Commands):
         A command of Caffe shows Caffe's log. A ``quiet`` command shows only warnings, and if it makes nets the log with
         ``-v``. ``net`` is READ, BUILT or 0.
         """
-
-        def with_dialects(arguments: argparse.Namespace) -> int | None:
-            for plugin in arguments.plugin:
-                use_dialect(plugin)
-            return function(arguments)
-
-        added = super().add(name, with_dialects, summary)
-        added.set_defaults(plugin=[], limit=None)
+        added = super().add(name, function, summary)
+        added.set_defaults(plugin=[], limit=None, begin=_use_dialects)
         if quiet:
             added.set_defaults(log_level=logging.WARNING, log_form=logging.Formatter("warning: %(message)s"))
         if quiet and net == BUILT:
@@ -57,6 +51,11 @@ class Commands(commands.Commands):
                 help="memory that a net may need, e.g. 64GiB; more is refused (default: this machine's)",
             )
         return added
+
+
+def _use_dialects(arguments: argparse.Namespace) -> None:
+    for plugin in arguments.plugin:
+        use_dialect(plugin)
 
 
 def _amount(text: str) -> int:

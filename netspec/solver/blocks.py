@@ -9,7 +9,7 @@ Caffe's rules work number by number, so this changes no number.
 # pyright: reportPrivateImportUsage=false
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import is_
 from typing import Any, Protocol
@@ -156,19 +156,17 @@ class Blocks:
             found.append(torch.zeros_like(values_of(blob)) if blob.grad is None else blob.grad)
         return found
 
-    def move(self, rule: update.Rule, param: Any, rate: float, iteration: int) -> None:
-        """Update the weights (:func:`netspec.solver.update.move`); gradients then contain what was subtracted."""
-        if not self._are_in_place():
-            learnable = self._learnable
-            weights = [values_of(item.parameter) for item in learnable]
-            rates = [rate * item.lr_mult for item in learnable]
-            decays = [param.weight_decay * item.decay_mult for item in learnable]
-            update.move(rule, param, weights, self.diffs(), self.history, rates, decays, iteration)
+    def pieces(self, rate: float, decay: float) -> Iterator[update.Piece]:
+        """Yield what an iteration updates, part by part, for the rate and the decay before their multipliers."""
+        if self._are_in_place():
+            for block in self._blocks:
+                own = [rate * block.lr_mult], [decay * block.decay_mult]
+                yield update.Piece([block.weights], [block.diffs], block.history, *own)
             return
-        decay = param.weight_decay
-        for block in self._blocks:
-            rates, decays = [rate * block.lr_mult], [decay * block.decay_mult]
-            update.move_block(rule, param, [block.weights], [block.diffs], block.history, rates, decays, iteration)
+        learnable = self._learnable
+        rates, decays = [rate * item.lr_mult for item in learnable], [decay * item.decay_mult for item in learnable]
+        weights = [values_of(item.parameter) for item in learnable]
+        yield from update.cut(update.Piece(weights, self.diffs(), self.history, rates, decays))
 
 
 def _lines(blob: torch.Tensor) -> int:

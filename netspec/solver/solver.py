@@ -244,7 +244,8 @@ class Solver(Tested):
             limit = log.number(self.param.clip_gradients)
             message = f"Gradient clipping: scaling down gradients (L2 norm {norm} > {limit}) by scale factor {factor}"
             log.info("sgd_solver.cpp:99", message)
-        self.blocks.move(self.rule, self.param, rate, self.iteration)
+        for piece in self.blocks.pieces(rate, self.param.weight_decay):
+            update.move(self.rule, self.param, piece, self.iteration)
         self.replicas.update()
         self.iteration += 1
 

@@ -2,8 +2,8 @@
 
 As in Caffe, a solver overwrites the gradients step by step until they contain what is subtracted from the weights.
 The lists are in the order of the net's learnable parameters. ``torch._foreach_*`` does the same to each tensor of a
-list; on a GPU in one kernel. All rules work number by number, so :func:`move` cuts the tensors into blocks that
-fit into a CPU's cache, and does all steps to one block before the next: memory is passed over only once.
+list; on a GPU in one kernel. All rules work number by number, so :func:`cut` makes pieces that fit into a CPU's cache,
+and all steps are done to one piece before the next: memory is passed over only once.
 
 Caffe: src/caffe/solvers/*.cpp
 """
@@ -70,11 +70,6 @@ def regularize(diffs: Tensors, weights: Tensors, decays: Sequence[float], kind: 
     _add_scaled(pulled, pull, [decays[i] for i in chosen])
 
 
-def subtract(weights: Tensors, diffs: Tensors) -> None:
-    """Update the weights (Net::Update)."""
-    torch._foreach_sub_(weights, diffs)
-
-
 Compute = Callable[[Any, Tensors, Sequence[float], Tensors, int], None]
 
 
@@ -92,45 +87,44 @@ class Rule:
     momentum: bool = True
 
 
-def move(
-    rule: Rule,
-    param: Any,
-    weights: Tensors,
-    diffs: Tensors,
-    history: Tensors,
-    rates: Sequence[float],
-    decays: Sequence[float],
-    iteration: int,
-) -> None:
-    """Update the weights by their gradients, summed over ``iter_size`` passes (SGDSolver::ApplyUpdate).
+@dataclass(frozen=True)
+class Piece:
+    """Weights that are updated together, their gradients, and their history: one list like theirs for each set.
 
-    The gradients then contain what was subtracted. ``rates`` and ``decays`` are each parameter's own.
+    ``rates`` and ``decays`` are each tensor's own.
     """
-    flat = [[tensor.view(-1) for tensor in tensors] for tensors in (weights, diffs, history)]
-    for block in _blocks(flat[0]):
-        own_weights, own_diffs, own_history = (
-            [tensors[first + i][part] for first in range(0, len(tensors), len(weights)) for i, part in block]
-            for tensors in flat
+
+    weights: Tensors
+    diffs: Tensors
+    history: Tensors
+    rates: Sequence[float]
+    decays: Sequence[float]
+
+
+def move(rule: Rule, param: Any, piece: Piece, iteration: int) -> None:
+    """Update the weights by their gradients, summed over ``iter_size`` passes (SGDSolver::ApplyUpdate, Net::Update).
+
+    The gradients then contain what was subtracted.
+    """
+    normalize(piece.diffs, param.iter_size)
+    regularize(piece.diffs, piece.weights, piece.decays, param.regularization_type)
+    rule.compute(param, piece.diffs, piece.rates, piece.history, iteration)
+    torch._foreach_sub_(piece.weights, piece.diffs)
+
+
+def cut(piece: Piece) -> Iterator[Piece]:
+    """Yield parts of about ``BLOCK`` numbers, which fit into a CPU's cache."""
+    weights, diffs, history = (
+        [tensor.view(-1) for tensor in each] for each in (piece.weights, piece.diffs, piece.history)
+    )
+    for block in _blocks(weights):
+        yield Piece(
+            [weights[i][part] for i, part in block],
+            [diffs[i][part] for i, part in block],
+            [history[first + i][part] for first in range(0, len(history), len(weights)) for i, part in block],
+            [piece.rates[i] for i, _ in block],
+            [piece.decays[i] for i, _ in block],
         )
-        own_rates, own_decays = ([numbers[i] for i, _ in block] for numbers in (rates, decays))
-        move_block(rule, param, own_weights, own_diffs, own_history, own_rates, own_decays, iteration)
-
-
-def move_block(
-    rule: Rule,
-    param: Any,
-    weights: Tensors,
-    diffs: Tensors,
-    history: Tensors,
-    rates: Sequence[float],
-    decays: Sequence[float],
-    iteration: int,
-) -> None:
-    """Do all steps of :func:`move` to what fits into a CPU's cache."""
-    normalize(diffs, param.iter_size)
-    regularize(diffs, weights, decays, param.regularization_type)
-    rule.compute(param, diffs, rates, history, iteration)
-    subtract(weights, diffs)
 
 
 def _blocks(tensors: Tensors) -> Iterator[list[tuple[int, slice]]]:

@@ -84,11 +84,13 @@ class Commands:
 
         An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. A command that shows no
         log itself sets the default ``log_form`` to None, one whose faults are no FAULT sets ``fault_status``.
+        ``begin`` is called before ``function``.
         """
         self._list(name, summary)
         added = self._parsers.add_parser(name, help=summary, description=summary)
         level, form = self._log
         added.set_defaults(prog=added.prog, run=function, log_level=level, log_form=form, fault_status=FAULT)
+        added.set_defaults(begin=lambda arguments: None)
         added.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
         added.add_argument("-q", dest="minloglevel", action="store_const", const=2, help=argparse.SUPPRESS)
         for name in ("--logtostderr", "--alsologtostderr"):  # it always does
@@ -110,6 +112,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
     try:
         shown = _logging(_level(arguments), arguments.log_form) if arguments.log_form else nullcontext()
         with interruptible(), shown:
+            arguments.begin(arguments)
             return arguments.run(arguments) or DONE
     except SpecError as fault:
         print(fault, file=sys.stderr)

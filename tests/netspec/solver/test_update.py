@@ -8,7 +8,7 @@ from netspec.errors import Where
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.solver import update
-from netspec.solver.update import RULES, Tensors, clip, find_rule, move, normalize, regularize, rule_faults
+from netspec.solver.update import RULES, Piece, Tensors, clip, cut, find_rule, move, normalize, regularize, rule_faults
 
 NOWHERE = Place(Where("s.prototxt"))
 SHAPES = [(3, 2), (4,)]
@@ -152,7 +152,8 @@ def test_an_update_in_blocks_is_the_update(name, size, gradients, monkeypatch):
         history = [torch.zeros(shape) for shape in SHAPES * RULES[name].sets]
         for iteration, diffs in enumerate(gradients):
             diffs = [diff.clone() for diff in diffs]
-            move(RULES[name], param, weights, diffs, history, [0.1, 0.2], [0.01, 0], iteration)
+            for piece in cut(Piece(weights, diffs, history, [0.1, 0.2], [0.01, 0])):
+                move(RULES[name], param, piece, iteration)
         return [weights, history, diffs]
 
     whole = moved()
