@@ -1,4 +1,8 @@
-"""Fields that forks added to Caffe's layers: DeepLab's holes; a pad for each side, AVE_EXC_PAD and relu6 (Synopsys)."""
+"""Fields that forks added to Caffe's layers.
+
+DeepLab's holes; a pad for each side, AVE_EXC_PAD and relu6 (Synopsys); a Dropout that scales in testing (Fast R-CNN) or
+draws in testing (SegNet).
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,13 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.dialects._relu6 import Capped
-from netspec.layers import activation, register
+from netspec.layers import activation, common, register
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.preparing import Kernel, Preparation
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision import convolution, pooling, windows
-from netspec.proto.schema import added_value, has, value
+from netspec.proto.schema import TRAIN, added_value, has, value
 
 DECLARATIONS = """
 extend ConvolutionParameter {
@@ -39,6 +43,10 @@ extend PoolingParameter {
 }
 extend ReLUParameter {
   optional bool relu6 = 1003 [default = false];
+}
+extend DropoutParameter {
+  optional bool scale_train = 1002 [default = true];
+  optional bool sample_weights_test = 1003 [default = false];
 }
 """
 
@@ -238,3 +246,49 @@ class ReLU(Capped):
     @override
     def setup(self) -> None:
         self.slope: float = self.param.relu_param.negative_slope
+
+
+@register(
+    "Dropout",
+    "dropout_param",
+    "dropout_param.scale_train",
+    "dropout_param.sample_weights_test",
+    replaces=common.Dropout,
+)
+class Dropout(common.Dropout):
+    """As Caffe's; with scale_train: false it does not scale in training but, by 1 - p, in testing.
+
+    With sample_weights_test it is in testing as it is in training: Bayesian SegNet's samples of what a net may say.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: rbgirshick/caffe-fast-rcnn; alexgkendall/caffe-segnet, src/caffe/layers/dropout_layer.cpp
+    """
+
+    @override
+    def setup(self) -> None:
+        super().setup()
+        if value(self.param.dropout_param, "sample_weights_test"):
+            self.phase = TRAIN
+
+    @override
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        top = super().forward(data)
+        return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        top = super().to_onnx(graph, *bottoms)
+        if value(self.param.dropout_param, "scale_train"):
+            return top
+        return graph.node("Mul", *bottoms, graph.constant(1 - self.ratio))
+
+    @property
+    def passes_on(self) -> bool:
+        return super().passes_on and bool(value(self.param.dropout_param, "scale_train"))
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if value(self.param.dropout_param, "scale_train"):
+            return super().to_torch(code, *bottoms)
+        if self.phase == TRAIN:
+            raise refusal(self, "PyTorch", "torch's dropout scales in training, this one in testing")
+        return code.call("{x} * {kept}", x=bottoms[0], kept=1 - self.ratio)

@@ -20,7 +20,7 @@ from netspec.dialects._boxes import as_array
 from netspec.dialects._faster import RATIOS, SCALES, AnchorTarget, ProposalTarget, RoIData, settings
 from netspec.dialects._proposals import all_anchors, base_anchors, moved, suppress
 from netspec.dialects._regions import RegionPooling, whole
-from netspec.layers import Layer, common, register
+from netspec.layers import Layer, register
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.loss.base import BATCH_SIZE, Loss, onnx_normalized_sum
@@ -51,42 +51,7 @@ extend LayerParameter {
   optional ROIPoolingParameter roi_pooling_param = 8266711;
   optional SmoothL1LossParameter smooth_l1_loss_param = 8266712;
 }
-extend DropoutParameter {
-  optional bool scale_train = 2 [default = true];
-}
 """
-
-
-@register("Dropout", "dropout_param", "dropout_param.scale_train", replaces=common.Dropout)
-class Dropout(common.Dropout):
-    """As Caffe's; with scale_train: false it does not scale in training but, by 1 - p, in testing.
-
-    bottom[0]  any shape
-    top[0]     the same shape
-    Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/dropout_layer.cpp
-    """
-
-    @override
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        top = super().forward(data)
-        return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        top = super().to_onnx(graph, *bottoms)
-        if value(self.param.dropout_param, "scale_train"):
-            return top
-        return graph.node("Mul", *bottoms, graph.constant(1 - self.ratio))
-
-    @property
-    def passes_on(self) -> bool:
-        return super().passes_on and bool(value(self.param.dropout_param, "scale_train"))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if value(self.param.dropout_param, "scale_train"):
-            return super().to_torch(code, *bottoms)
-        if self.phase == TRAIN:
-            raise refusal(self, "PyTorch", "torch's dropout scales in training, this one in testing")
-        return code.call("{x} * {kept}", x=bottoms[0], kept=1 - self.ratio)
 
 
 @register("ROIPooling", "roi_pooling_param")

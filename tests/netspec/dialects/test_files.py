@@ -96,7 +96,7 @@ FAULTS = {
     "nothing like it": (
         None,
         "x" * 20,
-        f'unknown dialect "{"x" * 20}"; expected one of: blocks, filters, hed, layout, nvidia, rcf, rcnn,',
+        f'unknown dialect "{"x" * 20}"; expected one of: blocks, filters, flownet, hed, layout, nvidia, rcf, rcnn,',
     ),
     "no such file": (None, "{path}", "{path}: cannot be read: No such file or directory"),
     "not text": (b"\xff\xfe", "{path}", "{path}: cannot be read: 'utf-8' codec can't decode"),
@@ -190,7 +190,7 @@ def test_an_unknown_field_switches_its_dialect_on_without_torch() -> None:
     ]
     command = [sys.executable, "-c", FOUND, *texts]
     said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert said == "['blocks', 'rcnn', 'ssd'] False\n"
+    assert said == "['blocks', 'filters', 'ssd'] False\n"
 
 
 def test_an_unknown_type_switches_its_dialect_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from netspec.errors import SpecError
 from netspec.layers import Layer, activation
 from netspec.layers.vision import pooling
 from netspec.net.build import build_net
-from netspec.proto.schema import TRAIN
+from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
 
 Build = Callable[..., Layer]
@@ -156,3 +156,24 @@ def test_relu6(build: Build, gradcheck: Gradcheck, slope: float) -> None:
     layer = build("filters", f"type: 'ReLU' relu_param {{ relu6: true negative_slope: {slope} }}", data.shape)
     assert layer.run(data)[0].tolist() == [[-4 * slope, -slope, 0, 2, 6, 6]]
     gradcheck(layer, torch.tensor([[-4.0, -1, 0.5, 2, 5, 7]]))
+
+
+@pytest.mark.parametrize(("phase", "factor"), [(TRAIN, 1), (TEST, 0.75)])
+def test_dropout_that_scales_in_testing(build: Build, phase: int, factor: float) -> None:
+    x = torch.rand(1000) + 1
+    text = "type: 'Dropout' dropout_param { dropout_ratio: 0.25 scale_train: false }"
+    top = build("filters", text, x.shape, phase=phase).run(x)[0].numpy()
+    kept = top != 0
+    np.testing.assert_allclose(top[kept], factor * x.numpy()[kept], rtol=1e-6)
+    assert kept.all() == (phase == TEST)
+    plain = build("filters", "type: 'Dropout' dropout_param { dropout_ratio: 0.25 }", x.shape, phase=phase)
+    usual = plain.run(x)[0].numpy()
+    np.testing.assert_allclose(usual[usual != 0], x.numpy()[usual != 0] / (0.75 if phase == TRAIN else 1), rtol=1e-6)
+
+
+def test_dropout_that_draws_in_testing(build: Build) -> None:
+    text = "type: 'Dropout' dropout_param { sample_weights_test: true }"
+    layer = build("filters", text, (1000,), phase=TEST)
+    first, second = (layer.run(torch.ones(1000))[0] for _ in range(2))
+    assert set(first.tolist()) == {0, 2}
+    assert not torch.equal(first, second)

@@ -13,7 +13,6 @@ from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
 from netspec.net.build import build_net
-from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
 
 pytestmark = pytest.mark.slow
@@ -159,20 +158,9 @@ def test_smooth_l1_loss_refuses(build: Build) -> None:
         build("rcnn", "type: 'SmoothL1Loss' smooth_l1_loss_param { sigma: 0 }", (3, 4), (3, 4))
 
 
-@pytest.mark.parametrize(("phase", "factor"), [(TRAIN, 1), (TEST, 0.75)])
-def test_dropout_that_scales_in_testing(build: Build, phase: int, factor: float) -> None:
-    x = torch.rand(1000) + 1
-    text = "type: 'Dropout' dropout_param { dropout_ratio: 0.25 scale_train: false }"
-    top = run(build("rcnn", text, x.shape, phase=phase), x)
-    kept = top != 0
-    np.testing.assert_allclose(top[kept], factor * x.numpy()[kept], rtol=1e-6)
-    assert kept.all() == (phase == TEST)
-    usual = run(build("rcnn", "type: 'Dropout' dropout_param { dropout_ratio: 0.25 }", x.shape, phase=phase), x)
-    np.testing.assert_allclose(usual[usual != 0], x.numpy()[usual != 0] / (0.75 if phase == TRAIN else 1), rtol=1e-6)
-
-
 def test_fields_that_a_dialects_layers_read_are_not_warned_of(caplog: pytest.LogCaptureFixture) -> None:
     use_dialect("rcnn")
+    use_dialect("filters")
     text = """
       layer { name: 'in' type: 'Input' top: 'x' input_param { shape { dim: 4 } } }
       layer { name: 'd' type: 'Dropout' bottom: 'x' top: 'y' dropout_param { scale_train: false } }

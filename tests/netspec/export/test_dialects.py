@@ -96,7 +96,7 @@ CASES: dict[str, tuple[str, str, dict[str, Shape]]] = {
         {"x": MAP},
     ),
     "BatchNorm of NVIDIA": ("nvidia", "type: 'BatchNorm' batch_norm_param { scale_bias: true }", {"x": MAP}),
-    "Dropout": ("rcnn", "type: 'Dropout' dropout_param { dropout_ratio: 0.25 scale_train: false }", {"x": MAP}),
+    "Dropout": ("filters", "type: 'Dropout' dropout_param { dropout_ratio: 0.25 scale_train: false }", {"x": MAP}),
     "SmoothL1Loss": (
         "rcnn",
         "type: 'SmoothL1Loss' smooth_l1_loss_param { sigma: 2 }",
