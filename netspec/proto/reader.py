@@ -20,6 +20,7 @@ from netspec.proto.dialect.files import announce_known
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
 from netspec.proto.schema import MORE, Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Place
+from netspec.terminal import log
 
 _RANGES: dict[int, tuple[int, int]] = {
     Declared.TYPE_INT32: (-(1 << 31), (1 << 31) - 1),
@@ -32,6 +33,7 @@ _BOOLEANS = {"true": True, "True": True, "t": True, "false": False, "False": Fal
 _V1_TYPES = V1LayerParameter.LayerType.keys()
 _LAYERS = ("caffe.LayerParameter", "caffe.V1LayerParameter")
 
+_DEVICES = ("caffe.SolverParameter", "device_id")  # a list in yjxiong/caffe: the GPUs of its processes
 _ALIASES = {("caffe.PoolingParameter", "ceil_mode"): ("round_mode", {True: "CEIL", False: "FLOOR"})}
 
 # What else a file may be, if a field is unknown in its outermost message.
@@ -105,8 +107,11 @@ class _Reader:
         if meaning is not None:
             field.set(message, field.descriptor.enum_type.values_by_name[meaning[self._boolean()]].number)
             nodes.append(Place(self.lexer.where(name.start)))
-        elif field.repeated and self._at("["):
+        elif self._at("[") and (field.repeated or key == _DEVICES):
             self._list(field, message, nodes)
+            if key == _DEVICES:
+                advice = "the first is taken; train --gpu 0,1 takes several"
+                log.logger.warning(f"{self.lexer.where(name.start)}: device_id is a list: {advice}")
         else:
             nodes.append(self._value(field, message, name))
         if self._at(",") or self._at(";"):
@@ -148,7 +153,8 @@ class _Reader:
             self._next()
             return
         while True:
-            nodes.append(self._value(field, message, self.token))
+            first = field.repeated or not nodes
+            nodes.append(self._value(field, message if first else type(message)(), self.token))
             if self._at("]"):
                 self._next()
                 return
