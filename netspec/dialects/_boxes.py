@@ -58,6 +58,7 @@ def shared(first: Array, second: Array) -> Array:
     return np.where((width > 0) & (height > 0), width * height, np.float32(0))
 
 
+@np.errstate(invalid="ignore")  # boxes without bounds, as nets that were not trained give them: not a number
 def overlaps(first: Array, second: Array) -> Array:
     """Return intersection over union of each pair of boxes (..., 4), broadcast against each other."""
     common = shared(first, second)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from netspec.dialects import use_dialect
+from netspec.dialects._boxes import suppress
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
@@ -428,3 +429,10 @@ def test_what_the_solver_of_ssd_has_more_is_named(tmp_path: Path, caplog: pytest
     )
     load_solver(tmp_path / "solver.prototxt")
     assert "solver.prototxt:2:31: eval_type has no effect: it is a fork's" in caplog.text
+
+
+@pytest.mark.filterwarnings("error")
+def test_boxes_without_bounds_suppress_none() -> None:
+    """What a net that was not trained predicts: exp of anything."""
+    without, plain = [-math.inf, -math.inf, math.inf, math.inf], [0.1, 0.1, 0.4, 0.4]
+    assert suppress(np.array([without, plain, without, plain], np.float32), 0.45) == [0, 1, 2]
