@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
+from docutils import nodes
 from pygments.lexer import RegexLexer
 from pygments.token import Comment, Keyword, Name, Number, Punctuation, String, Text
 
@@ -25,7 +26,8 @@ exclude_patterns = ["_build"]
 highlight_language = "commands"
 html_theme = "furo"
 html_title = f"netspec {version}"
-html_copy_source = False
+html_copy_source = html_use_index = False
+smartquotes_action = "qe"  # two hyphens begin an option; they are no dash
 html_show_copyright = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
@@ -108,6 +110,15 @@ def _included(app: Any, relative_path: Path, parent: str, content: list[str]) ->
     content[0] = rewrite(content[0], (HERE / relative_path).resolve().parent)
 
 
+def _captioned(app: Any, doctree: nodes.document) -> None:
+    """Show what the text of a picture says below it; a click opens the picture in its own size."""
+    for number, paragraph in enumerate(list(doctree.findall(nodes.paragraph))):
+        if len(paragraph) == 1 and isinstance(picture := paragraph[0], nodes.image):
+            picture["scale"] = 100
+            caption = nodes.caption("", picture["alt"])
+            paragraph.replace_self(nodes.figure("", picture, caption, ids=[f"picture-{number}"]))
+
+
 def _searched(app: Any, exception: Exception | None) -> None:
     """Write what the search shows of each page where it cannot ask for the page: read from a disk (search.js)."""
     if exception is None and app.builder.format == "html":
@@ -123,9 +134,10 @@ def _on_search_page(app: Any, pagename: str, *_: object) -> None:
 
 
 def setup(app: Any) -> None:
-    """Have pages rewritten, commands told from their comments, prototxt in colors, and a search that shows text."""
+    """Have pages rewritten, code in colors, captions below pictures, and a search that shows text."""
     app.add_lexer("commands", CommandLexer)
     app.add_lexer("prototxt", PrototxtLexer)
+    app.connect("doctree-read", _captioned)
     app.connect("html-page-context", _on_search_page)
     app.connect("build-finished", _searched)
     app.connect("source-read", _page)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -18,7 +18,6 @@ from sphinx.util.docutils import SphinxDirective
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = ROOT / "netspec" / "proto" / "caffe.proto"
 BLOB = re.compile(r"((?:bottom|top|blob)s?\[[^\]]*\](?:\.\.)?|(?:bottom|top|blob)s)\s{2,}(.*)")
-CELL = r"\|"  # a bar within a cell of a table
 FIELD = re.compile(r"(optional|repeated|required) ([\w.]+) (\w+) = \d+(?: \[([^\]]*)\])?;(?:\s*// (.*))?")
 
 
@@ -57,12 +56,12 @@ class CommandReference(FromCode):
             if command.split()[0] not in set().union(*wanted):
                 continue
             lines += [f"## {name} {command}", "", *_paragraphs(made.description or ""), ""]
-            usage = " ".join(made.format_usage().removeprefix("usage: ").split())
-            required = [word for word in re.findall(r"\[[^\]]*\]|\S+", usage) if not word.startswith("[")]
-            lines += ["```text", f"{' '.join(required)} [options]", "```", ""]
+            lines += ["```text", f"{name} {command} {_usage(made)}", "```", ""]
             if example := _example(f"{name} {command}"):
                 lines += ["```", example, "```", ""]
-            lines += ["| | |", "|---|---|", *_options(made), ""]
+            lines += table(("argument", "meaning"), _options(made))
+            if made.epilog:
+                lines += ["```text", made.epilog, "```", ""]
         return "\n".join(lines)
 
 
@@ -85,7 +84,8 @@ class LayerReference(FromCode):
                 lines += ["```prototxt", example.text.rstrip(), "```", ""]
             message = _message_of(kind)
             if message:
-                lines += [f"Its fields, `{message[0]}`:", "", _table(message[1]), ""]
+                lines += [f"Its fields, `{message[0]}`:"]
+                lines += table(("field", "type", "default", "note"), _rows(message[1]))
         return "\n".join(lines)
 
 
@@ -145,14 +145,12 @@ def docstring(found: Any) -> list[str]:
     rows: list[list[str]] = []
     for line in [*(inspect.getdoc(found) or "").splitlines(), ""]:
         if row := re.fullmatch(r"(\w+(?:, \w+)*)\s{2,}(\S.*)", line):
-            rows.append([row[1], row[2]])
+            rows.append([f"`{row[1]}`", _words(row[2])])
         elif rows and line.startswith("  "):
-            rows[-1][1] += f" {line.strip()}"
+            rows[-1][1] += f" {_words(line.strip())}"
         else:
-            if rows:
-                cells = (f"| `{name}` | {_words(text).replace('|', CELL)} |" for name, text in rows)
-                lines += ["", "| name | meaning |", "|---|---|", *cells, ""]
-                rows = []
+            lines += table(("name", "meaning"), rows)
+            rows = []
             code = line.startswith("    ")
             lines.append(line if code or not line.strip() else _words(line))
     blocks = re.sub(
@@ -178,23 +176,28 @@ def _described(text: str) -> list[str]:
     lines, rows = [], []
     for line in text.splitlines():
         if found := BLOB.match(line):
-            rows.append([found[1], found[2]])
+            rows.append([f"`{found[1]}`", _prose(found[2])])
             if len(rows) == 1:
                 lines.append(rows)
         elif rows and line.startswith("  "):
-            rows[-1][1] += f" {line.strip()}"
+            rows[-1][1] += f" {_prose(line.strip())}"
         elif line.startswith("Caffe: "):
             lines += ["", f"Caffe: {line.removeprefix('Caffe: ')}"]
         else:
             lines.append(line)
     done = []
     for line in lines:
-        if isinstance(line, list):
-            cells = (f"| `{name}` | {_prose(words).replace('|', CELL)} |" for name, words in line)
-            done += ["", "| blob | |", "|---|---|", *cells, ""]
-        else:
-            done.append(_prose(line))
+        done += table(("blob", "meaning"), line) if isinstance(line, list) else [_prose(line)]
     return done
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return a table as lines of Markdown, without the columns that are empty; no lines where there are no rows."""
+    rows = list(rows)
+    kept = [k for k in range(len(heads)) if any(row[k] for row in rows)]
+    lines = [heads, ["---"] * len(heads), *rows] if rows else []
+    cells = ([row[k].replace("|", r"\|") for k in kept] for row in lines)
+    return ["", *(f"| {' | '.join(row)} |" for row in cells), ""]
 
 
 def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
@@ -230,17 +233,37 @@ def _paragraphs(text: str) -> list[str]:
 SHARED = ("plugin", "limit", "verbose")  # options of every command, which come last
 
 
-def _options(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """Yield the rows of a table of a command's arguments: its own in their order, then those that all commands have."""
-    for action in sorted(parser._actions, key=lambda action: action.dest in SHARED):
-        if isinstance(action, argparse._HelpAction) or action.help is argparse.SUPPRESS:
-            continue
-        words = [f"`{word}`" for word in action.option_strings if not word.startswith("--no")]
-        if action.nargs != 0 and not isinstance(action, argparse.BooleanOptionalAction):
-            shown = action.metavar or (",".join(map(str, action.choices)) if action.choices else action.dest.upper())
-            words[-1:] = [f"{words[-1]} `{shown}`" if words else f"`{shown}`"]
-        text = parser._get_formatter()._expand_help(action) if action.help else ""
-        yield f"| {', '.join(words)} | {_prose(text).replace('|', CELL)} |".replace("NAME|FILE", f"NAME{CELL}FILE")
+def _arguments_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """Return a command's arguments: its own in their order, then those that all commands have."""
+    shown = [a for a in parser._actions if not isinstance(a, argparse._HelpAction) and a.help is not argparse.SUPPRESS]
+    return sorted(shown, key=lambda action: action.dest in SHARED)
+
+
+def _usage(parser: argparse.ArgumentParser) -> str:
+    """Return a command's positional arguments, and the options that it must have."""
+    words = {True: [], False: []}
+    for action in (found := _arguments_of(parser)):
+        if not action.option_strings:
+            words[True].append(_value(action) if action.required else f"[{_value(action)}]")
+        elif action.required:
+            words[False].append(f"{action.option_strings[-1]} {_value(action)}")
+    more = any(action.option_strings and not action.required for action in found)
+    return " ".join([*words[True], *words[False], *(["[options]"] if more else [])])
+
+
+def _value(action: argparse.Action) -> str:
+    """Return the word that stands for what an argument takes, or the words that it may be."""
+    return str(action.metavar or (",".join(map(str, action.choices)) if action.choices else action.dest.upper()))
+
+
+def _options(parser: argparse.ArgumentParser) -> Iterator[list[str]]:
+    """Yield the rows of a table of a command's arguments."""
+    for action in _arguments_of(parser):
+        off = {f"--no{word[2:]}" for word in action.option_strings}
+        words = [f"`{word}`" for word in action.option_strings if word not in off]
+        if action.nargs != 0:
+            words[-1:] = [f"{words[-1]} `{_value(action)}`" if words else f"`{_value(action)}`"]
+        yield [", ".join(words), _prose(parser._get_formatter()._expand_help(action) if action.help else "")]
 
 
 def _message_of(kind: str) -> tuple[str, str] | None:
@@ -259,14 +282,11 @@ def _fields(message: str) -> list[tuple[str, ...]]:
     return [match.groups(default="") for match in FIELD.finditer(found[1])]
 
 
-def _table(message: str) -> str:
-    rows = ["| field | type | default | |", "|---|---|---|---|"]
+def _rows(message: str) -> Iterator[list[str]]:
     for label, kind, name, options, comment in _fields(message):
         default = re.search(r"default = (\S+)", options)
         many = "any number of " if label == "repeated" else ""
-        value = f"`{default[1].rstrip(',')}`" if default else ""
-        rows.append(f"| `{name}` | {many}{kind} | {value} | {_prose(comment).replace('|', CELL)} |")
-    return "\n".join(rows)
+        yield [f"`{name}`", f"{many}{kind}", f"`{default[1].rstrip(',')}`" if default else "", _prose(comment)]
 
 
 def _prose(text: str) -> str:

@@ -6,11 +6,12 @@ document.addEventListener("DOMContentLoaded", () => {
     button.className = "copy";
     button.type = "button";
     button.textContent = "copy";
+    const code = block.querySelector("pre"), text = code.innerText.replace(/\n$/, "");
     button.onclick = async () => {
-      await navigator.clipboard.writeText(block.querySelector("pre").innerText.replace(/\n$/, ""));
+      await navigator.clipboard.writeText(text);
       button.textContent = "copied";
       setTimeout(() => { button.textContent = "copy"; }, 1500);
     };
-    block.append(button);
+    code.prepend(button);
   }
 });

@@ -68,8 +68,7 @@ class GeometricCheck:
     min_inliers    the least number of inliers of a loop; 0: as many as rule out chance
     least_side     images whose shorter side has fewer pixels are enlarged to this, at most four times
     focal_px       focal length in pixels of the images as they are; 0: not known, a fundamental matrix is used
-    center_x_px    principal point, with focal_px
-    center_y_px
+    center_x_px, center_y_px  principal point, with focal_px
     """
 
     max_features: int = 500
