@@ -13,7 +13,7 @@ from typing_extensions import override
 from netspec.layers import Layer
 from netspec.layers.base import Shape
 from netspec.layers.folding import Affine, blob_in_double
-from netspec.layers.normalization import onnx_normalized, torch_batch_norm
+from netspec.layers.normalization import as_before, onnx_normalized, torch_batch_norm
 from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TRAIN, value
 
@@ -170,11 +170,7 @@ class BN(Layer):
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape; its channels must stay as many."""
-        shape = bottom_shapes[0]
-        if len(shape) < 2 or shape[1] != self.channels:
-            raise self.error(f"found a bottom of shape {shape}, expected {self.channels} channels as before", "bottom")
-        return [shape]
+        return as_before(self, bottom_shapes, self.channels)
 
     @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:

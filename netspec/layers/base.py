@@ -102,13 +102,16 @@ class Layer(torch.nn.Module):
         raise self.error(f"class {type(self).__name__} does not define forward(*bottoms); write it", "type")
 
     @property
-    def small(self) -> bool:
-        """Whether the layer is so small, at its present shapes, that Caffe's order of sums costs next to nothing."""
-        return False
+    def small(self) -> bool | None:
+        """Whether the layer is so small, at its present shapes, that Caffe's order of sums costs next to nothing.
 
-    def is_exact(self, bottom: torch.Tensor, small: bool = False) -> bool:
+        None: it has no sums that ``exact: small`` is about.
+        """
+        return None
+
+    def is_exact(self, bottom: torch.Tensor, small: bool | None = False) -> bool:
         """Return whether to compute in Caffe's order: :func:`netspec.exact.switch.applies`, for one type of numbers."""
-        applies = switch.applies(self.context.options.exact, bottom, small)
+        applies = switch.applies(self.context.options.exact, bottom, bool(small))
         return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
 
     def close(self) -> None:

@@ -62,11 +62,7 @@ class BatchNorm(Layer):
 
     @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape; its channels must stay as many."""
-        shape = bottom_shapes[0]
-        if len(shape) < 2 or shape[1] != self.channels:
-            raise self.error(f"found a bottom of shape {shape}, expected {self.channels} channels as before", "bottom")
-        return [shape]
+        return as_before(self, bottom_shapes, self.channels)
 
     @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
@@ -162,6 +158,14 @@ class BatchNorm(Layer):
         return code.call("{norm}({x})", norm=norm, x=bottoms[0])
 
 
+def as_before(layer: Layer, shapes: Sequence[Shape], channels: int) -> Sequence[Shape]:
+    """Return the shapes of a bottom (N, C) or (N, C, ...); refuse other than so many channels."""
+    shape = shapes[0]
+    if len(shape) < 2 or shape[1] != channels:
+        raise layer.error(f"found a bottom of shape {shape}, expected {channels} channels as before", "bottom")
+    return shapes
+
+
 def _means(means: torch.Tensor, variances: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the sums divided by their weight; 0 where nothing was added yet."""
     factor = torch.where(weight == 0, 0, 1 / weight)
@@ -252,13 +256,11 @@ class LRN(Layer):
 
     @override
     def setup(self) -> None:
-        if self.param.lrn_param.local_size % 2 == 0:
-            message = f"local_size must be odd, found {self.param.lrn_param.local_size}"
-            raise self.error(message, "lrn_param", "local_size")
-        if self.param.lrn_param.local_size > MOST:
-            message = f"local_size must be at most {MOST}, found {self.param.lrn_param.local_size}"
-            raise self.error(message, "lrn_param", "local_size")
-        if self.param.lrn_param.norm_region != ACROSS_CHANNELS:
+        param = self.param.lrn_param
+        if param.local_size % 2 == 0 or param.local_size > MOST:
+            expected = "odd" if param.local_size % 2 == 0 else f"at most {MOST}"
+            raise self.error(f"local_size must be {expected}, found {param.local_size}", "lrn_param", "local_size")
+        if param.norm_region != ACROSS_CHANNELS:
             self.ignores = frozenset({"lrn_param.k"})
 
     @override

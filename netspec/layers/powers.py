@@ -95,8 +95,8 @@ class Power(Rounded):
 
 
 def _log(base: float) -> float:
-    """Return the logarithm of a base, a float as Caffe's."""
-    return libm.log(torch.tensor(base)).item()
+    """Return the logarithm of a base, a float as Caffe's; -1 stands for e."""
+    return 1.0 if base == -1 else libm.log(torch.tensor(base)).item()
 
 
 @register("Exp", "exp_param")
@@ -116,7 +116,7 @@ class Exp(Rounded):
         p = self.param.exp_param
         if p.base <= 0 and p.base != -1:
             raise self.error(f"found base {p.base:g}, expected a positive one, or -1 for e", "exp_param", "base")
-        log_base = 1.0 if p.base == -1 else _log(p.base)
+        log_base = _log(p.base)
         self.scale = log_base * p.scale
         self.shift = log_base * p.shift
 
@@ -162,7 +162,7 @@ class Log(Rounded):
             raise self.error(
                 f"found base {p.base:g}, expected a positive one other than 1, or -1 for e", "log_param", "base"
             )
-        log_base = 1.0 if p.base == -1 else _log(p.base)
+        log_base = _log(p.base)
         self.base_scale = 1 / log_base
         self.slope = p.scale / log_base
         self.scale: float = p.scale

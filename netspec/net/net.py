@@ -32,7 +32,6 @@ from netspec.run.walk import Runner, weighted_sum
 from netspec.terminal import log
 
 Array = np.ndarray | torch.Tensor
-MUCH = 8  # a net that takes more than this part of the limit is first looked at as a whole
 
 
 class Net(torch.nn.Module):

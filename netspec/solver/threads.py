@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from netspec.exact import ALL, NONE
-from netspec.layers.base import Layer
 from netspec.net.net import Net
 
 
@@ -14,7 +13,7 @@ def divided_sums(net: Net) -> list[str]:
     return [
         node.name
         for node, layer in zip(net.plan.nodes, net.layers, strict=True)
-        if type(layer).small is not Layer.small and (net.options.exact == NONE or not layer.small)
+        if layer.small is not None and (net.options.exact == NONE or not layer.small)
     ]
 
 

@@ -109,6 +109,17 @@ class Classified(Layer):
         return valid
 
 
+class ClassLoss(Loss, Classified):
+    """Base of the losses of scores all of whose axes but the first are the classes."""
+
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        shapes = super().reshape(bottom_shapes)
+        data, labels = bottom_shapes
+        self.reshape_scores([(data[0], math.prod(data[1:])), labels], 1)
+        return shapes
+
+
 def ignore_label(param: Any) -> int | None:
     """Return the label that does not count, of a LossParameter or an AccuracyParameter."""
     return param.ignore_label if param.HasField("ignore_label") else None

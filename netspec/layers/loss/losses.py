@@ -21,7 +21,7 @@ from netspec.layers.loss.base import (
     FULL,
     NONE,
     VALID,
-    Classified,
+    ClassLoss,
     Loss,
     ignore_label,
     normalization_mode,
@@ -36,7 +36,7 @@ from netspec.layers.training import Kernels, Learning
 
 
 @register("HingeLoss", "hinge_loss_param")
-class HingeLoss(Loss, Classified):
+class HingeLoss(ClassLoss):
     """One against all: the sum of max(0, 1 - s x) / N, s being 1 at the label and -1 elsewhere.
 
     With norm L2 each term is squared; there is no half.
@@ -48,13 +48,6 @@ class HingeLoss(Loss, Classified):
     """
 
     L2 = 2  # caffe.proto: enum HingeLossParameter.Norm
-
-    @override
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        shapes = super().reshape(bottom_shapes)
-        data, labels = bottom_shapes
-        self.reshape_scores([(data[0], math.prod(data[1:])), labels], 1)
-        return shapes
 
     @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:

@@ -25,6 +25,7 @@ from netspec.layers.loss.base import (
     NONE,
     VALID,
     Classified,
+    ClassLoss,
     Floor,
     Loss,
     ignore_label,
@@ -267,7 +268,7 @@ class InfogainLoss(SoftmaxLoss):
 
 
 @register("MultinomialLogisticLoss")
-class MultinomialLogisticLoss(Loss, Classified):
+class MultinomialLogisticLoss(ClassLoss):
     """-log(probabilities[label]) / N; the probability is floored at 1e-20, for the gradient -1 / p as well.
 
     bottom[0]  probabilities (N, C, ...): all but the first axis are the classes
@@ -275,13 +276,6 @@ class MultinomialLogisticLoss(Loss, Classified):
     top[0]     the loss, ()
     Caffe: src/caffe/layers/multinomial_logistic_loss_layer.cpp
     """
-
-    @override
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        shapes = super().reshape(bottom_shapes)
-        data, labels = bottom_shapes
-        self.reshape_scores([(data[0], math.prod(data[1:])), labels], 1)
-        return shapes
 
     @override
     def forward(self, probabilities: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
