@@ -53,6 +53,14 @@ message UpsampleParameter {
   optional uint32 upsample_h = 6;
   optional uint32 upsample_w = 7;
 }
+message DeephiResizeParameter {
+  enum ResizeType { BILINEAR = 0; NEAREST = 1; }
+  optional uint32 new_height = 1;
+  optional uint32 new_width = 2;
+  optional float scale_h = 3;
+  optional float scale_w = 4;
+  optional ResizeType resize_type = 5 [default = BILINEAR];
+}
 message ReLU6Parameter {
   optional float negative_slope = 1 [default = 0];
 }
@@ -64,6 +72,7 @@ extend LayerParameter {
   optional InterpParameter interp_param = 163;
   optional ShuffleChannelParameter shuffle_channel_param = 164;
   optional BNParameter bn_param = 1137;
+  optional DeephiResizeParameter deephi_resize_param = 1139;
   optional ReLU6Parameter relu6_param = 100000;
 }
 """
@@ -290,6 +299,61 @@ class Interp(Layer):
             return code.call(template, x=x, size=tuple(self.top_shapes[0][2:]))
         size = "[(n - 1) // {shrink} * {zoom} + 1 for n in {x}.shape[2:]]"
         return code.call(template.replace("{size}", size), x=x, shrink=param.shrink_factor, zoom=param.zoom_factor)
+
+
+@register("DeephiResize", "deephi_resize_param")
+class DeephiResize(Layer):
+    """Resize each map as OpenCV does: to new_height and new_width, or by scale_h and scale_w, rounded down.
+
+    bottom[0]  (N, C, H, W)
+    top[0]     (N, C, H', W')
+    Fork: Xilinx' Caffe, src/caffe/layers/deephi_resize_layer.cpp, without its rounding for the DPU
+    """
+
+    @override
+    def setup(self) -> None:
+        self.settings = p = value(self.param, "deephi_resize_param")
+        self.nearest = p.resize_type == p.NEAREST
+        pairs = ("new_height", "new_width"), ("scale_h", "scale_w")
+        if not any(all(getattr(p, name) > 0 for name in pair) for pair in pairs):
+            raise self.error(
+                "expected new_height and new_width, or scale_h and scale_w, above 0", "deephi_resize_param"
+            )
+
+    @override
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        p, (shape,) = self.settings, bottom_shapes
+        size = p.new_height, p.new_width
+        if not p.new_height:
+            size = int(shape[-2] * p.scale_h), int(shape[-1] * p.scale_w)
+        if len(shape) != 4 or min(size) < 1:
+            raise self.error(
+                f"found a bottom of shape {shape} for a top of {size[0]} x {size[1]}, expected maps", "bottom"
+            )
+        return [(*shape[:2], *size)]
+
+    @override
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return F.interpolate(data, self.top_shapes[0][2:], mode="nearest" if self.nearest else "bilinear")
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        p = self.settings
+        size = graph.constant([p.new_height, p.new_width])
+        if not p.new_height:
+            floats = graph.cast(graph.shape_of(bottoms[0], 2, 4), "float32")
+            size = graph.cast(graph.node("Mul", floats, graph.constant([p.scale_h, p.scale_w])), "int64")
+        sizes = graph.node("Concat", graph.shape_of(bottoms[0], 0, 2), size, axis=0)
+        grid = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
+        if self.nearest:
+            grid = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+        return graph.node("Resize", bottoms[0], "", "", sizes, **grid)
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        how = {"x": bottoms[0], "mode": repr("nearest" if self.nearest else "bilinear")}
+        if self.settings.new_height:
+            return code.call("F.interpolate({x}, {size}, mode={mode})", size=tuple(self.top_shapes[0][2:]), **how)
+        template = "F.interpolate({x}, scale_factor={scales}, mode={mode}, recompute_scale_factor=True)"
+        return code.call(template, scales=(self.settings.scale_h, self.settings.scale_w), **how)
 
 
 register("Upsample", "upsample_param")(Upsample)

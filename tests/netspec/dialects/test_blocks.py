@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -354,3 +355,21 @@ def test_every_layer_says_what_it_takes_and_gives() -> None:
             assert "bottom[" in doc or cls.bottoms == (0, 0), kind
             assert "top[" in doc, kind
             assert "Fork: " in doc, kind
+
+
+@pytest.mark.parametrize(("how", "flag"), [("BILINEAR", cv2.INTER_LINEAR), ("NEAREST", cv2.INTER_NEAREST)])
+@pytest.mark.parametrize(
+    ("given", "size"), [("new_height: 11 new_width: 4", (11, 4)), ("scale_h: 2 scale_w: 2.5", (10, 15))]
+)
+def test_maps_are_resized_as_opencv_does(
+    build: Build, gradcheck: Gradcheck, given: str, size: tuple[int, int], how: str, flag: int
+) -> None:
+    data = torch.randn(2, 3, 5, 6)
+    layer = build("blocks", f"type: 'DeephiResize' deephi_resize_param {{ {given} resize_type: {how} }}", data.shape)
+    top = run(layer, data)
+    for n, c in np.ndindex(2, 3):
+        expected = cv2.resize(data[n, c].numpy(), size[::-1], interpolation=flag)
+        np.testing.assert_allclose(top[n, c], expected, rtol=1e-5, atol=1e-5)
+    gradcheck(layer, data)
+    with pytest.raises(SpecError, match="expected new_height and new_width, or scale_h and scale_w"):
+        build("blocks", "type: 'DeephiResize' deephi_resize_param { new_height: 3 }", data.shape)

@@ -79,6 +79,12 @@ CASES: dict[str, tuple[str, str, dict[str, Shape]]] = {
     ),
     "Interp to a size": ("blocks", "type: 'Interp' interp_param { height: 11 width: 4 }", {"x": MAP}),
     "Interp like another": ("blocks", "type: 'Interp'", {"x": MAP, "y": (2, 1, 9, 13)}),
+    "DeephiResize": ("blocks", "type: 'DeephiResize' deephi_resize_param { scale_h: 2 scale_w: 3 }", {"x": MAP}),
+    "DeephiResize to a size": (
+        "blocks",
+        "type: 'DeephiResize' deephi_resize_param { new_height: 11 new_width: 4 resize_type: NEAREST }",
+        {"x": MAP},
+    ),
     "Upsample": ("blocks", "type: 'Upsample' upsample_param { scale: 3 }", {"x": MAP}),
     "BN of PSPNet": ("blocks", "type: 'BN' bn_param { frozen: true }", {"x": MAP}),
     "BN of SegNet": ("blocks", "type: 'BN' bn_param { bn_mode: INFERENCE }", {"x": MAP}),
