@@ -229,6 +229,11 @@ class RoIData(_Sampling):
         self.entries: Sequence[Mapping[str, Any]] = ()
         self.waiting: list[int] = []
 
+    @property
+    def code(self) -> RoIData:
+        """What ``net.layers[0]`` of pycaffe is, as in the fork, where this layer is Python code."""
+        return self
+
     def set_roidb(self, entries: Sequence[Mapping[str, Any]]) -> None:
         """Read these images from now on; see the class. Raises SpecError where an entry lacks something."""
         for i, entry in enumerate(entries):

@@ -47,14 +47,15 @@ def moved(anchors: Array, deltas: Array, height: float, width: float) -> Array:
 
 def suppress(boxes: Array, threshold: float, most: int) -> list[int]:
     """Return the first ``most`` of boxes (n, 4), in this order, that overlap none kept before by more than that."""
-    areas = np.prod(boxes[:, 2:] - boxes[:, :2] + 1, axis=1)
-    left = np.arange(len(boxes))
+    left, rows = np.arange(len(boxes)), np.ascontiguousarray(boxes.T)  # rows of x1, y1, x2, y2: each in one piece
+    areas = (rows[2] - rows[0] + 1) * (rows[3] - rows[1] + 1)
     kept: list[int] = []
     while len(left) and len(kept) < most:
-        first, left = left[0], left[1:]
-        kept.append(int(first))
-        low = np.maximum(boxes[first, :2], boxes[left, :2])
-        high = np.minimum(boxes[first, 2:], boxes[left, 2:])
-        shared = np.prod(np.maximum(high - low + 1, 0), axis=1)
-        left = left[shared / (areas[first] + areas[left] - shared) <= np.float32(threshold)]
+        kept.append(int(left[0]))
+        x1, y1, x2, y2 = rows[:, 1:]
+        width = np.minimum(rows[2, 0], x2) - np.maximum(rows[0, 0], x1) + 1
+        height = np.minimum(rows[3, 0], y2) - np.maximum(rows[1, 0], y1) + 1
+        shared = np.maximum(width, 0) * np.maximum(height, 0)
+        apart = np.flatnonzero(shared / (areas[0] + areas[1:] - shared) <= np.float32(threshold)) + 1
+        left, rows, areas = left[apart], rows[:, apart], areas[apart]
     return kept
