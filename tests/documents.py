@@ -19,13 +19,13 @@ DOCUMENTS = [
     path.relative_to(ROOT).as_posix()
     for path in (ROOT / "README.md", *sorted(ROOT.glob("*/README.md")), *sorted(ROOT.glob("docs/**/*.md")))
 ]
-# What a command may begin with, and where its main() is, if it is Python's and ours.
+# What a command may begin with, and where its main() is, if the pages' test runs it.
 PROGRAMS = {
     "netspec": "netspec.cli",
     "lmdb-build": "lmdb_build.cli",
     "loopclosure": "loopclosure.cli",
-    "tools/bench": "benchmarks.cli",
     "torchrun": "torch.distributed.run",
+    "tools/bench": "",
     "tools/docs": "",
     "tools/quickstart": "",
     "tools/run_tests": "",
@@ -48,12 +48,13 @@ record() { printf '%s\\0' $(($# + 1)) "$PWD" "$@" >&3; }
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: where it begins, its language, its text, and the file that it is if the line before names one."""
+    """A fenced block: where it begins, its language, its text; by the line before: its file, that it is not run."""
 
     where: str
     language: str
     text: str
     file: str | None
+    not_run: bool
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,8 @@ def blocks(document: str) -> list[Block]:
     for fence in re.finditer(r"^```([^\n`]*)\n(.*?)^```$", text, re.M | re.S):
         where = f"{document}:{text.count(chr(10), 0, fence.start()) + 2}"
         file = re.search(r"`([\w.]+)`[^`]*:\s*$", text[: fence.start()])
-        found.append(Block(where, fence[1], fence[2], file and file[1]))
+        not_run = re.search(r"<!-- not run: .+ -->\n$", text[: fence.start()])
+        found.append(Block(where, fence[1], fence[2], file and file[1], bool(not_run)))
     return found
 
 
