@@ -53,6 +53,7 @@ def test_every_public_name_has_its_section() -> None:
     assert {name for module, name in NAMES if module == "netspec.datasets"} == set(netspec.datasets.__all__)
 
 
+@pytest.mark.slow
 def test_the_examples(folder: Path) -> None:
     finder, runner, tried = doctest.DocTestFinder(recurse=True), doctest.DocTestRunner(), 0
     for module, name in NAMES:

@@ -69,6 +69,7 @@ def test_the_second_tower_is_the_first_under_other_names(folder: Path) -> None:
         assert mine == twin
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_deploy_is_the_first_tower(folder: Path) -> None:
     train = layers_of(folder / "train_val.prototxt")
@@ -130,6 +131,7 @@ def test_the_normalized_nets_are_the_papers_and_the_length(name: str) -> None:
         assert paper[f"feat{side}"].inner_product_param == longer[f"ip_feat{side}"].inner_product_param
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("name", ["siamese_128", "siamese_resnet27_256"])
 def test_it_trains_whatever_the_seed(name: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,6 +198,7 @@ WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
 MORE_WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_768"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "descriptors", "layers"),
     [

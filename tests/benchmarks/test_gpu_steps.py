@@ -17,9 +17,10 @@ from fake_gpu import NAME, POSSIBLE, fake_gpu
 from paths import ROOT
 
 SCRIPT = ROOT / "benchmarks" / "gpu_steps"
-SMALL = {"GPU": "", "BATCH": "2", "ITERATIONS": "2", "TRAIN": "40", "VALIDATION": "8", "FRAMES": "250"}
+SMALL = {"GPU": "", "BATCH": "2", "ITERATIONS": "2", "TRAIN": "8", "VALIDATION": "4", "FRAMES": "60"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
 def test_netspec_and_the_twin_train_on_the_device_that_is_named() -> None:
     with training_case("lenet", 2) as case:
@@ -44,6 +45,7 @@ def test_a_step_that_there_is_not_is_wrong_usage(tmp_path: Path) -> None:
     assert finished.stderr.startswith("usage: benchmarks/gpu_steps STEP FOLDER")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_no_step_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SMALL, "GPU", "0")

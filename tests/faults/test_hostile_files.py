@@ -59,6 +59,7 @@ def test_an_npz_that_announces_too_much(read: Any, tmp_path: Path) -> None:
         read(tmp_path / "x.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read", [read_features, embedding.read_features])
 def test_an_npz_that_unpacks_to_too_much(read: Any, tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "x.npz", features=np.zeros((70, 1 << 20), np.float32))
@@ -253,6 +254,7 @@ def packed_rows(path: Path, chunk: bytes, rows: int = 40) -> None:
         file["packed"].id.write_direct_chunk((0, 0), chunk)
 
 
+@pytest.mark.slow
 def test_an_hdf5_chunk_that_unpacks_to_too_much(tmp_path: Path) -> None:
     packed_rows(tmp_path / "x.h5", zlib.compress(bytes(640)))
     all_rows(tmp_path / "x.h5")
@@ -261,6 +263,7 @@ def test_an_hdf5_chunk_that_unpacks_to_too_much(tmp_path: Path) -> None:
         all_rows(tmp_path / "x.h5")
 
 
+@pytest.mark.slow
 def test_an_hdf5_chunk_that_is_too_large(tmp_path: Path) -> None:
     packed_rows(tmp_path / "x.h5", zlib.compress(bytes(300 << 20)))
     with pytest.raises(SpecError, match=r"packed has a chunk of \d+ KiB, and its chunks hold 640 bytes"):
@@ -317,6 +320,7 @@ def database(tmp_path: Path) -> Path:
     return tmp_path / "db"
 
 
+@pytest.mark.slow
 def test_a_database_that_was_cut(database: Path, tmp_path: Path) -> None:
     data = (database / "data.mdb").read_bytes()
     (tmp_path / "cut").mkdir()

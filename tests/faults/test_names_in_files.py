@@ -156,6 +156,7 @@ def test_exports_parse_and_compute_the_same(text: str, capsys: pytest.CaptureFix
     netspec.load_net("folded.prototxt", weights="folded.caffemodel")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", nets())
 def test_drawings_parse(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("net.prototxt").write_text(text)
@@ -169,12 +170,14 @@ def test_drawings_parse(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     page(Path("out.html"))
 
 
+@pytest.mark.slow
 def test_a_drawing_for_printing_takes_any_name(capsys: pytest.CaptureFixture[str]) -> None:
     for text in list(nets())[::3]:
         Path("net.prototxt").write_text(text)
         assert main(["draw", "net.prototxt", "--out", "out.png"]) == 0, capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_curves_of_a_training_parse(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     start = "I1121 00:36:27.939015 12135 solver.cpp:239] "

@@ -43,6 +43,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace | None:
     return PARSERS[program]().parse_args(arguments)
 
 
+@pytest.mark.slow
 @each("where", SHELL)
 def test_every_command_is_one_that_its_parser_takes(where: str, tmp_path: Path) -> None:
     found = commands(BLOCKS[where].text, tmp_path)
@@ -71,6 +72,7 @@ def unknown_words(line: str) -> list[str]:
     return [word for word in words if word.startswith("--") and word.partition("=")[0] not in known]
 
 
+@pytest.mark.slow
 @each("document", DOCUMENTS)
 def test_commands_in_sentences_have_commands_and_options_that_exist(document: str) -> None:
     text = re.sub(r"^```.*?^```$", "", (ROOT / document).read_text(), flags=re.M | re.S)

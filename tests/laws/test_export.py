@@ -49,6 +49,7 @@ def test_every_layer_says_how_it_is_exported_or_why_not() -> None:
         assert len(own) == 2 or refused, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TYPES)
 @pytest.mark.parametrize("target", ["ONNX", "PyTorch"])
 def test_layer_computes_the_same_elsewhere_or_says_why_it_cannot(

@@ -67,6 +67,7 @@ def interleaved(parts: list) -> list:
     return [item for row in zip(*parts, strict=True) for item in row]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 7, 123456789])
 @pytest.mark.parametrize("ranks", [1, 2, 3, 4])
 @pytest.mark.parametrize("name", LAYERS)

@@ -133,6 +133,7 @@ test_gradient_in_caffes_order = of_each(SMOOTH, ["all"])(gradient_is_that_of_wha
 test_gradient_in_torchs_order = pytest.mark.slow(of_each(SMOOTH, ["none"])(gradient_is_that_of_what_it_computes))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
 @each("name", [name for name in TYPES if name != "Python"])  # whose code sees numpy arrays
 def test_computes_on_the_gpu_what_it_computes_on_the_cpu(

@@ -25,6 +25,7 @@ def pairs(walks: Path, *more: str) -> list[str]:
     return ["pairs", str(walks / "walk_1"), str(walks / "walk_2"), "--test", "0", *more]
 
 
+@pytest.mark.slow
 def test_from_a_walk_to_lists_and_a_picture(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "lists"
     command = pairs(
@@ -43,6 +44,7 @@ def test_from_a_walk_to_lists_and_a_picture(walks: Path, tmp_path: Path, capsys:
     assert (tmp_path / "sheet.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_what_it_says_of_its_lists_is_what_convert_needs(
     walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

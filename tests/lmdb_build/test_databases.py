@@ -91,6 +91,7 @@ def test_the_log_is_caffes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     ]
 
 
+@pytest.mark.slow
 def test_every_thousand_records_are_logged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "list.txt").write_text("0.png 1\n" * 2500)
     flags = ["-resize_width=2", "-resize_height=2", "-workers=1"]
@@ -103,6 +104,7 @@ def test_every_thousand_records_are_logged(tmp_path: Path, capsys: pytest.Captur
     assert len(records(tmp_path / "db")) == 2500
 
 
+@pytest.mark.slow
 def test_shuffling_is_repeatable_and_numbers_the_new_order(tmp_path: Path) -> None:
     keys = []
     for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):

@@ -119,6 +119,7 @@ def test_the_points_of_view_of_a_place_differ_as_strongly_as_asked() -> None:
     assert weak < 0.7 * usual < 0.7 * strong
 
 
+@pytest.mark.slow
 def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     lines = ["image,run,second"]

@@ -61,6 +61,7 @@ def test_it_ends_with_five_lines_and_starts_all_in_one_folder(project: Path) -> 
     assert {line.split()[0] for line in started} == {str(project / out)}
 
 
+@pytest.mark.slow
 def test_started_again_it_deletes_nothing(project: Path, tmp_path: Path) -> None:
     start(project, project)
     trained = project / "out" / "quickstart" / "mine.caffemodel"

@@ -185,6 +185,7 @@ def test_numbers_that_make_no_plan_are_refused(tmp_path: Path, plan: Plan, words
         build(pose_source(), plan, tmp_path)
 
 
+@pytest.mark.slow
 def test_drawing_finds_what_looking_at_all_pairs_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     source = pose_source()
     images = everything(source)

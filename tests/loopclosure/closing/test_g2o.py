@@ -71,6 +71,7 @@ def drive(poses: int, loops: int, false: int) -> tuple[np.ndarray, np.ndarray, l
     return truth, path_of(truth[0], steps), odometry, [*right, *wrong]
 
 
+@pytest.mark.slow
 def test_a_drive_with_a_fifth_of_its_loops_false() -> None:
     _, path, odometry, loops = drive(1500, 150, 30)
     clean, found = solve(path, odometry, loops[:150]), solve(path, odometry, loops)
@@ -127,6 +128,7 @@ def close(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> tupl
     return capsys.readouterr().out, lines
 
 
+@pytest.mark.slow
 def test_comments_gaps_and_fixed_vertices(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said, lines = close(tmp_path, GRAPH, capsys)
     vertices = {int(words[1]): np.array(words[2:], float) for words in lines if words[0] == "VERTEX_SE3:QUAT"}
@@ -163,6 +165,7 @@ def test_parts_that_no_edge_joins_stay_where_they_are(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.poses[:, 0], [0, 1, 6, 7], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_two_dimensions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     corners = ["0 0 0", "1 0.2 1.5", "1.1 1 3", "0 0.8 -1.6"]
     lines = [f"VERTEX_SE2 {i} {at}" for i, at in enumerate(corners)]

@@ -71,6 +71,7 @@ def a_map(first: Path, tmp_path: Path) -> Map:
 INDEXES = ["exact"] + ["faiss"] * (find_spec("faiss") is not None) + ["p.db"] * (find_spec("milvus_lite") is not None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", INDEXES)
 def test_build_add_and_query(
     index: str, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -97,6 +98,7 @@ def test_build_add_and_query(
     ]
 
 
+@pytest.mark.slow
 def test_long_descriptors_are_projected(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(maps, "LEARNED_FROM", 9)
     monkeypatch.setattr(maps, "COMPONENTS", 8)
@@ -128,6 +130,7 @@ Map(sys.argv[1]).add(open_recording(sys.argv[2]), Thumbnailer())
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_leaves_the_map_as_it_was(a_map: Map, drives: Path, tmp_path: Path) -> None:
     before = contents(tmp_path / "M")
     words = [sys.executable, "-c", DYING, str(tmp_path / "M"), str(drives / "b")]
@@ -141,6 +144,7 @@ def test_a_run_that_is_killed_leaves_the_map_as_it_was(a_map: Map, drives: Path,
     assert len(Map(tmp_path / "M")) == 2 * PLACES
 
 
+@pytest.mark.slow
 def test_one_adds_at_a_time_and_others_read(a_map: Map, drives: Path, tmp_path: Path) -> None:
     other = Map(tmp_path / "M")
     with only_one(tmp_path / "M" / ".lock", ""):

@@ -49,6 +49,7 @@ def test_features_take_the_place_of_describe(two_laps, two_laps_features):
     assert [r.accepted for r in results] == [None] * 10 + list(range(10))
 
 
+@pytest.mark.slow
 def test_features_with_verification_read_the_images(two_laps, two_laps_features):
     detector = LoopDetector(
         exclude_recent=10, threshold=-0.2, check=GeometricCheck(max_features=100, min_inliers=8, ratio=0.9)

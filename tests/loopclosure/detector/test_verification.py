@@ -47,6 +47,7 @@ def test_matches_join_what_is_the_same_point(check):
     assert np.mean(np.all(np.abs(steps - [20, 10]) < 1.0, axis=1)) > 0.9
 
 
+@pytest.mark.slow
 def test_matches_are_those_of_the_plain_ratio_test(check):
     a, b = check.describe(wall(0)), check.describe(seen_from_the_side(wall(0)))
     distances = np.linalg.norm(a.descriptors[:, None].astype(float) - b.descriptors[None], axis=2)
@@ -115,6 +116,7 @@ def test_eight_points_on_a_line_do_not_agree(check):
     assert check.inliers(line, line) == 0
 
 
+@pytest.mark.slow
 def test_as_many_must_agree_as_rule_out_chance():
     """Moisan and Stival's count: of eight matches all in an image of this size, of many a small share."""
     check = GeometricCheck()

@@ -59,6 +59,7 @@ def test_a_detector_finds_the_same_loops(name: str, tmp_path: Path, monkeypatch:
     np.testing.assert_allclose(detector.descriptors, rows, atol=ROUNDED[name])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("faiss") is None, reason="not installed: faiss")
 @pytest.mark.parametrize("metric", ["cosine", "euclidean"])
 def test_signs_leave_out_no_match(metric: str) -> None:

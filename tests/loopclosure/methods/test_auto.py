@@ -37,6 +37,7 @@ def everything(scores):
     return np.ones(scores.shape, bool)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_two_traverses_of_one_road_are_matched(seed):
     road = drive(150, seed)
@@ -50,6 +51,7 @@ def test_two_traverses_of_one_road_are_matched(seed):
     assert "best score" in found.counts()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_roads_that_share_no_place_have_no_loop(seed):
     scores = alike(drive(150, seed), drive(120, seed + 100))
@@ -67,6 +69,7 @@ def test_a_drive_against_keyframes():
     assert np.all(np.abs(4 * found.match - np.arange(200))[found.accepted] <= 8)
 
 
+@pytest.mark.slow
 def test_one_drive_that_comes_back_once():
     road = drive(400, 3)
     rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
@@ -85,6 +88,7 @@ def test_too_few_frames_tell_nothing():
     assert not answer(scores, everything(scores), two=True).accepted.any()
 
 
+@pytest.mark.slow
 def test_what_is_verified_is_a_loop_and_a_sequence_without_it_is_none():
     road = drive(150, 6)
     scores = alike(again(road, 1.0, 7), road)
@@ -148,6 +152,7 @@ def test_a_desk_of_which_all_images_show_something():
     assert np.count_nonzero(found.accepted) > 150
 
 
+@pytest.mark.slow
 def test_a_camera_that_moves_slowly_closes_no_loop():
     """Frames 31 apart are alike, and so are the next ones: a line, forwards only."""
     steps = np.random.default_rng(4).normal(size=(500, SIZE))
@@ -157,6 +162,7 @@ def test_a_camera_that_moves_slowly_closes_no_loop():
     assert not answer(alike(rows, rows), np.tri(400, k=-31, dtype=bool), False).accepted.any()
 
 
+@pytest.mark.slow
 def test_where_consecutive_frames_are_verified_a_loop_must_be_too():
     road = drive(400, 3)
     rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
@@ -190,6 +196,7 @@ def test_odometry_tells_different_places():
     assert not far_apart(np.full((5, 7), np.nan)).any()
 
 
+@pytest.mark.slow
 def test_with_odometry_single_images_are_told_from_chance():
     """The camera looks where it likes, so that no sequence comes back; a twin of each place is across the road."""
     rng = np.random.default_rng(2)

@@ -23,6 +23,7 @@ def test_it_scores_only_what_it_accepts(two_laps, two_laps_features):
     assert "precision 1.000, recall 0.900" in outcome.answer
 
 
+@pytest.mark.slow
 def test_without_a_threshold_its_candidates_are_verified(two_laps, two_laps_features):
     method = make_method(f"detector:{two_laps_features}:verify=yes,min_inliers=500", MethodContext(9))
     result = method.score(Images(load_tum(two_laps).query_images), silent)

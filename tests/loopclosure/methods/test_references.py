@@ -55,6 +55,7 @@ def test_vlad_sums_differences_to_the_nearest_word():
     assert not vlad(np.zeros((0, 2), np.float32), words).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", ["hog", "cohog:side=128", "vlad:words=8"])
 def test_they_find_the_second_lap(spec, two_laps, tmp_path):
     data = load_tum(two_laps)
@@ -79,6 +80,7 @@ def test_vlad_of_orb_words(tmp_path):
     np.testing.assert_allclose(scores.diagonal(), 1, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", ["hog", "cohog:side=128"])
 def test_two_traverses_are_compared_in_full(spec, two_laps):
     images = load_tum(two_laps).query_images

@@ -56,6 +56,7 @@ def first(scores, given):
     return [tuple(pair) for pair in np.argwhere(np.nan_to_num(scores, nan=-np.inf) > most).tolist()]
 
 
+@pytest.mark.slow
 def test_the_same_walls_come_first_and_the_rest_keeps_its_order(walls):
     rng = np.random.default_rng(0)
     given = rng.normal(size=(12, 12))
@@ -76,6 +77,7 @@ def test_the_same_walls_come_first_and_the_rest_keeps_its_order(walls):
     assert result.notes[1].startswith("6 of 66 pairs, the best 12 of each query, are verified")
 
 
+@pytest.mark.slow
 def test_only_the_best_k_of_each_query_are_examined(walls):
     scores = np.zeros((WALLS, WALLS))
     scores[range(WALLS), range(WALLS)] = np.array([-1, 1, 1, 1, 1, np.nan])
@@ -102,6 +104,7 @@ def test_just_more_inliers_than_chance_do_not_overrule_a_score(walls, inliers, b
     assert np.nanargmax(method.score(images, silent).scores) == best
 
 
+@pytest.mark.slow
 def test_another_method_of_the_run_finds_nothing_again(walls, monkeypatch):
     context = MethodContext()
     images = Images(walls[WALLS:], walls[:WALLS])
@@ -112,6 +115,7 @@ def test_another_method_of_the_run_finds_nothing_again(walls, monkeypatch):
     np.testing.assert_array_equal(scores, again)
 
 
+@pytest.mark.slow
 def test_on_top_of_seqslam_a_sequence_is_verified(walls):
     given = np.where(np.subtract.outer(np.arange(12), np.arange(12)) == WALLS, 1.0, -1.0)
     blank = walls[0].parent / "blank.png"
@@ -136,11 +140,13 @@ def test_trajectories_support_what_is_on_them():
     assert accepted(np.where(on_trajectories(seen, both), 1, np.nan)) == [(3, 2), (3, 4), (4, 3), (5, 2), (5, 4)]
 
 
+@pytest.mark.slow
 def test_excluded_frames_are_no_candidates(walls):
     method = Verified(Fixed(np.zeros((12, 12))), exclude_frames=WALLS)
     assert [i - j for i, j in accepted(method.score(Images(walls), silent).scores) if i - j <= WALLS] == []
 
 
+@pytest.mark.slow
 def test_a_known_camera(walls):
     camera = "focal_px=260,center_x_px=160,center_y_px=120"
     method = make_method(f"verified:{camera},k=12,min_inliers=25+thumbnails", MethodContext())

@@ -18,6 +18,7 @@ from faults.recordings import read_bag
 from places_bags import START_S, Bag
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ros", "encoding"), [("a.bag", 1, "rgb8"), ("b", 2, "bgr8"), ("c.bag", 1, "png"), ("d", 2, "png")]
 )
@@ -38,6 +39,7 @@ def test_a_bag_becomes_a_sequence(name: str, ros: int, encoding: str, tmp_path: 
     assert (sequence.camera.fy, sequence.camera.distortion[:2]) == (28.25, (0.1, -0.2))
 
 
+@pytest.mark.slow
 def test_a_damaged_bag_is_one_line(tmp_path: Path) -> None:
     """In the index, in a header, in a message, in the text beside it."""
     whole = Bag(tmp_path / "whole.bag", 1, "mono8", count=3).file.read_bytes()
@@ -72,6 +74,7 @@ def test_what_uses_a_bag_keeps_its_own_errors(tmp_path: Path) -> None:
         raise ZeroDivisionError
 
 
+@pytest.mark.slow
 def test_a_topic_must_be_chosen_where_there_are_several(tmp_path: Path) -> None:
     bag = Bag(tmp_path / "two.bag", 1, second_camera=True).file
     with pytest.raises(

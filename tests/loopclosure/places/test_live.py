@@ -81,6 +81,7 @@ def test_what_cannot_be_opened(source: str, sentence: str, camera) -> None:
         next(live_frames(source))
 
 
+@pytest.mark.slow
 def test_detect_watches_a_video(tmp_path, capsys) -> None:
     """A drive past 12 places at one per second, and past them again."""
     video = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 1, (160, 120))

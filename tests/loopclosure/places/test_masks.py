@@ -26,6 +26,7 @@ def write(path, matrix):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mat", ".npy", ".txt", ".csv", ".bmp", ".png"])
 def test_every_form(tmp_path, suffix):
     hard, soft = read_truth_matrix(write(tmp_path / f"mask{suffix}", MASK))
@@ -33,6 +34,7 @@ def test_every_form(tmp_path, suffix):
     np.testing.assert_array_equal(soft, hard)
 
 
+@pytest.mark.slow
 def test_sparse_and_bool_masks(tmp_path):
     scipy.io.savemat(tmp_path / "sparse.mat", {"truth": scipy.sparse.csc_matrix(MASK.astype(float))})
     np.testing.assert_array_equal(read_truth_matrix(tmp_path / "sparse.mat")[0], MASK == 1)
@@ -40,6 +42,7 @@ def test_sparse_and_bool_masks(tmp_path):
     np.testing.assert_array_equal(read_truth_matrix(tmp_path / "bool.npy")[0], MASK == 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
@@ -61,6 +64,7 @@ def test_broken_masks(tmp_path, name, content, sentence):
         read_truth_matrix(tmp_path / name)
 
 
+@pytest.mark.slow
 def test_mat_without_the_variable_lists_what_it_has(tmp_path):
     scipy.io.savemat(tmp_path / "x.mat", {"alpha": np.eye(2), "beta": np.eye(3)})
     with pytest.raises(InputError, match=r'no variable "truth".*alpha 2x2, beta 3x3'):
@@ -69,6 +73,7 @@ def test_mat_without_the_variable_lists_what_it_has(tmp_path):
         read_truth_matrix(tmp_path / "absent.mat")
 
 
+@pytest.mark.slow
 def test_coordinates(tmp_path):
     expected = [[1.5, 2.0], [3.0, -4.0]]
     scipy.io.savemat(tmp_path / "a.mat", {"GPS": np.array(expected)})

@@ -81,6 +81,7 @@ def test_the_rule_is_symmetric() -> None:
     assert truth.diagonal().all()
 
 
+@pytest.mark.slow
 def test_fr1_rpy_has_the_clear_negatives_its_readme_counts_and_xyz_none() -> None:
     folder = shared("data", "tum_fr1")
     for name, clear in (("rpy", 20_101), ("xyz", 0)):

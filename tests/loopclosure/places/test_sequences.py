@@ -181,6 +181,7 @@ class Harmful:
         return (Path.touch, (Path("harmed"),))
 
 
+@pytest.mark.slow
 def test_damaged_lists_of_matches(tmp_path: Path) -> None:
     """Each byte in turn: numpy itself would raise a SystemError, or end the process, for some of them."""
     rows = np.empty((2, 2), dtype=object)

@@ -36,6 +36,7 @@ def legend_of(axis: Axes) -> Legend:
     return legend
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3, 10, 20])
 def test_legends_of_curves_hide_nothing(count):
     figure = curves(evaluation_of([LONG_NAME, *(f"method {i}" for i in range(1, count))]))
@@ -56,12 +57,14 @@ def test_legends_of_curves_hide_nothing(count):
         assert box.width / figure.dpi > 3.5
 
 
+@pytest.mark.slow
 def test_every_curve_of_twenty_looks_different():
     axis = curves(evaluation_of([str(i) for i in range(20)])).axes[0]
     lines = legend_of(axis).get_lines()
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 20
 
 
+@pytest.mark.slow
 def test_a_dollar_sign_in_a_name_is_no_formula():
     evaluation = evaluation_of([r"$\nonsense{$", "_hidden"])
     for draw in (curves, matrices, matches):

@@ -479,6 +479,7 @@ def begin_with(lines: list[str], beginnings: list[str]) -> bool:
     return len(lines) == len(beginnings) and all(map(str.startswith, lines, beginnings))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("case", [*CASES.values(), *FOUND_IN_DATA.values()], ids=[*CASES, *FOUND_IN_DATA])
 def test_check_reports_at_once_what_train_refuses(run: Run, case: Case) -> None:
@@ -494,6 +495,7 @@ def test_check_reports_at_once_what_train_refuses(run: Run, case: Case) -> None:
     assert not any(message.startswith("Iteration ") for message in trained.messages)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_check_needs_no_data_for_the_faults_of_prototxts(run: Run, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:

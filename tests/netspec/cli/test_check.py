@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 NET = "sgd_step/train_val.prototxt"
 SOLVER = "sgd_step/solver.prototxt"
 PAIR_SHAPE = ("--shape", "pair_data=4,2,28,28")
@@ -34,6 +36,7 @@ def test_check_prints_a_table(run: Run) -> None:
     assert rows["total"].split() == ["total", "5,756", "0.20", "1,340,416"]
 
 
+@pytest.mark.slow
 def test_a_blob_that_many_layers_read(run: Run, tmp_path: Path) -> None:
     """The widest line makes all lines wide: it lists no more blobs than people read."""
     net = tmp_path / "net.prototxt"

@@ -109,6 +109,7 @@ def test_train_goes_on_from_a_snapshot(run: Run, edited: Edit) -> None:
     assert Path("sgd_step/ref_iter_62.solverstate").is_file()
 
 
+@pytest.mark.slow
 def test_train_gives_level_and_stages_to_the_training_net_only(run: Run, edited: Edit) -> None:
     stage = (
         'layer { name: "extra" type: "Power" bottom: "data" top: "extra" include { stage: "a" min_level: 2 } }\nlayer {'
@@ -362,6 +363,7 @@ def test_weights_of_which_no_layer_fits_are_refused(run: Run) -> None:
         assert fault.endswith("is it the file of another net?")
 
 
+@pytest.mark.slow
 def test_weights_that_lack_a_layer_get_one_warning_and_with_strict_a_fault(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 1")
     part = NetParameter.FromString(Path(INIT).read_bytes())

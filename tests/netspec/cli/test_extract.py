@@ -50,6 +50,7 @@ def test_the_same_bytes_are_written_twice_where_no_time_is_wanted(run: Run, monk
     assert np.isnan(np.load("a.npz")["seconds_per_record"])
 
 
+@pytest.mark.slow
 def test_extract_reads_another_database_and_as_many_batches_as_asked(run: Run) -> None:
     words = [
         "--model",
@@ -326,6 +327,7 @@ def test_weights_that_tell_of_no_transform_get_no_warning(run: Run, images: Path
         assert conv1_of(run, "deploy.prototxt", weights)[1].err == ""
 
 
+@pytest.mark.slow
 def test_the_net_that_the_project_brings_gets_no_warning(run: Run, images: Path) -> None:
     words = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
     _, result = conv1_of(run, str(words / "deploy.prototxt"), str(words / "siamese_words_256.caffemodel"))

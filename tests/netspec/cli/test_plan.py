@@ -12,6 +12,7 @@ from paths import ROOT
 DEPLOY = ROOT / "prototxt" / "small" / "siamese_resnet27_256" / "deploy.prototxt"
 
 
+@pytest.mark.slow
 def test_the_plan_names_what_runs_together(run: Callable[..., Any]) -> None:
     lines = run("check", DEPLOY, "--plan").out.splitlines()
     (first,) = (line for line in lines if line.startswith("  ") and line.split()[1] == "conv1a")
@@ -31,12 +32,14 @@ def test_an_unknown_pass_is_refused(run: Callable[..., Any]) -> None:
     assert "found 'folds', expected none, or some of fold,fuse,skip,pack" in result.err
 
 
+@pytest.mark.slow
 def test_a_training_net_has_no_passes(run: Callable[..., Any]) -> None:
     out = run("check", DEPLOY, "--plan", "--phase", "TRAIN").out
     assert "no passes" in out
     assert re.search("bfloat16 on this CPU: (yes|no|unknown)\n", out)
 
 
+@pytest.mark.slow
 def test_says_how_a_net_is_trained(run: Callable[..., Any]) -> None:
     folder = DEPLOY.parents[1]
     shape = ("--shape", "pair_data=2,6,64,64")

@@ -44,6 +44,7 @@ def test_caffes_own_database_is_read_without_leaving_a_lock_beside_it() -> None:
     assert os.listdir(GOLDEN / "features" / "feat_lmdb") == ["data.mdb"]
 
 
+@pytest.mark.slow
 def test_readers_work_in_threads() -> None:
     path = str(GOLDEN / "pairs" / "train_lmdb")
     expected = [open_reader(path).record(i) for i in range(640)]
@@ -290,6 +291,7 @@ def test_leveldb_goes_there_and_back(tmp_path: Path) -> None:
     assert open_reader(str(tmp_path / "db"), "leveldb").record(3) == b"\x03" * 3  # LevelDB itself would refuse a second
 
 
+@pytest.mark.slow
 def test_reading_a_leveldb_neither_locks_nor_changes_it(tmp_path: Path) -> None:
     plyvel = pytest.importorskip("plyvel")
     write(tmp_path / "db", {b"%04d" % i: bytes(i) for i in range(3000)}, "leveldb")

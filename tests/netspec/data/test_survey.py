@@ -155,6 +155,7 @@ def test_the_command_tells_and_its_status_says_whether_there_are_faults(run: Run
     assert run("data", "stat", "nowhere").fault.startswith('nowhere: database "nowhere" does not exist')
 
 
+@pytest.mark.slow
 def test_the_command_draws_pairs_side_by_side_and_faults_first(run: Run, tmp_path: Path) -> None:
     assert run("data", "show", "pairs/train_lmdb", "--out", "x.png", "--count", 6).status == 0
     assert cv2.imread("x.png") is not None

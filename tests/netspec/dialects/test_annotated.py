@@ -158,6 +158,7 @@ SAMPLERS = "batch_sampler { max_sample: 1 max_trials: 1 } " + " ".join(
 )
 
 
+@pytest.mark.slow
 def test_boxes_stay_on_what_they_show_however_an_image_is_varied(tmp_path: Path) -> None:
     image = np.full((90, 120, 3), (104, 117, 123), np.uint8)
     image[30:60, 20:80] = 255

@@ -289,6 +289,7 @@ def test_a_name_that_caffe_has_too_switches_on_nothing(files_afresh: None) -> No
     assert use_dialects_of(text.replace("num_output", "scale_bias: true num_output"), "x.prototxt") == ["nvidia"]
 
 
+@pytest.mark.slow
 def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None:
     text = 'layer { type: "Permute" permute_param { order: 0 } } layer { type: "Axpy" } layer { type: "Normalize" }'
     assert use_dialects_of(text, "x.prototxt") == ["ssd", "blocks"]

@@ -117,6 +117,7 @@ def pooled(data: torch.Tensor, method: str, sides: tuple[int, ...], floor: bool)
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("floor", [False, True])
 @pytest.mark.parametrize(("given", "sides"), SIDES)
 @pytest.mark.parametrize("method", ["MAX", "AVE", "AVE_EXC_PAD", "AVE_TF"])

@@ -391,6 +391,7 @@ NET = """
 """
 
 
+@pytest.mark.slow
 def test_a_small_detector_learns_where_two_squares_are() -> None:
     use_dialect("ssd")
     net, source = parse_net_text(NET, "f")

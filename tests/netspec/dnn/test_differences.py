@@ -23,6 +23,7 @@ def made(layers: str) -> dnn.Net:
     return dnn.readNetFromCaffe((INPUT + layers).encode())
 
 
+@pytest.mark.slow
 def test_one_line_replaces_the_module(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "dnn", dnn)
     module: Any = cv2.dnn

@@ -70,6 +70,7 @@ def random_diagram(seed: int) -> Diagram:
     return Diagram("random", tuple(boxes), tuple(reads), tuple(tops))
 
 
+@pytest.mark.slow
 @each("seed", range(60))
 def test_nothing_overlaps_whatever_the_wiring(seed: int) -> None:
     assert list(faults(picture_of(random_diagram(seed)))) == []
@@ -93,6 +94,7 @@ def test_an_overlap_would_be_found() -> None:
     assert any("overlap" in fault for fault in faults(picture))
 
 
+@pytest.mark.slow
 def test_blocks_that_repeat_are_drawn_once_and_unfold() -> None:
     diagram = read(residual(100))
     assert len(diagram.boxes) == 302
@@ -172,6 +174,7 @@ def test_settings_in_a_few_words(param: str, words: str) -> None:
     assert settings_text(net.layer[0]) == words
 
 
+@pytest.mark.slow
 def test_files_of_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     net = tmp_path / "net.prototxt"
     net.write_text('name: "a <b> & \\"c\\""\n' + residual(3).replace('"a0"', '"</script>"'))

@@ -63,6 +63,7 @@ def entries(folder: Path) -> list[Path]:
     return sorted((folder / "cache" / "netspec").iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_the_numbers_are_those_of_torch(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
     net, expected = load(engine), load("torch")
@@ -80,6 +81,7 @@ def test_the_numbers_are_those_of_torch(engine: str, data: np.ndarray, caplog: p
     assert list(net.blobs) == ["feat"]
 
 
+@pytest.mark.slow
 def test_blobs_that_are_asked_for_are_kept(engine: str, files: Path, data: np.ndarray) -> None:
     net, expected = load(engine), load("torch")
     net.keep = expected.keep = ["conv"]
@@ -94,6 +96,7 @@ def test_blobs_that_are_asked_for_are_kept(engine: str, files: Path, data: np.nd
     assert len(entries(files)) == 2
 
 
+@pytest.mark.slow
 def test_the_model_is_kept_by_content(engine: str, files: Path, data: np.ndarray) -> None:
     first = load(engine)(data=data)["feat"]
     (entry,) = entries(files)
@@ -114,6 +117,7 @@ def test_the_model_is_kept_by_content(engine: str, files: Path, data: np.ndarray
     assert entries(files) == before
 
 
+@pytest.mark.slow
 def test_changed_parameters_take_effect_and_are_not_kept(engine: str, files: Path, data: np.ndarray) -> None:
     net, expected = load(engine), load("torch")
     net(data=data)
@@ -132,6 +136,7 @@ def test_changed_parameters_take_effect_and_are_not_kept(engine: str, files: Pat
     assert len(entries(files)) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_parameters_that_may_change_unseen_are_read_at_every_pass(
     engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
@@ -153,6 +158,7 @@ def test_parameters_that_may_change_unseen_are_read_at_every_pass(
     assert not net(data=data)["feat"].requires_grad
 
 
+@pytest.mark.slow
 def test_random_weights_are_not_kept(engine: str, files: Path, data: np.ndarray) -> None:
     found = netspec.load_net("net.prototxt", seed=3, engine=engine)(data=data)["feat"]
     expected = netspec.load_net("net.prototxt", seed=3)(data=data)["feat"].detach()
@@ -196,6 +202,7 @@ def test_what_it_cannot_do_is_torchs(
     assert line.endswith("; torch runs the net")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_a_library_that_fails_is_replaced(
     engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
@@ -212,6 +219,7 @@ def test_a_library_that_fails_is_replaced(
     assert caplog.messages == [f"engine {engine}: out of order; torch runs the net"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_a_cache_that_cannot_be_written_is_told(
     engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
@@ -222,6 +230,7 @@ def test_a_cache_that_cannot_be_written_is_told(
     assert caplog.messages == ["file/cache: cannot be written: Not a directory; the exported model is not kept"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_bf16_says_how_far_it_is_from_fp32(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
     expected = load(engine)(data=data)["feat"]
@@ -263,6 +272,7 @@ def test_as_many_threads_as_torch_has(monkeypatch: pytest.MonkeyPatch) -> None:
 # Records, commands, images
 
 
+@pytest.mark.slow
 def test_a_net_that_reads_records_scores_and_extracts_the_same(
     engine: str, work_in: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -282,6 +292,7 @@ def test_a_net_that_reads_records_scores_and_extracts_the_same(
         assert list(found["keys"]) == list(plain["keys"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_time_is_of_the_whole_forward_pass(engine: str, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["time", "--model", "net.prototxt", "--phase", "TEST", "--iterations", "2", "--engine", engine]
@@ -377,6 +388,7 @@ def test_signals_are_handled_after_nets_of_openvino_are_gone(precision: str) -> 
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_a_size_that_the_net_does_not_take_is_refused_by_all(engine: str) -> None:
     odd = np.zeros((2, 3, 19, 12), np.float32)

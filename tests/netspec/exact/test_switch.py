@@ -62,6 +62,7 @@ def test_no_image_is_no_fault(net_of) -> None:
     assert net_of(CONVOLUTION, exact="all").layers[2].run(torch.zeros(0, 2, 2, 2))[0].shape == (0, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exact", ["small", "all"])
 @pytest.mark.filterwarnings("ignore")  # torch.jit.trace is deprecated, but in use
 def test_a_recorded_net_computes_and_does_not_remember(net_of, exact: str) -> None:

@@ -16,6 +16,7 @@ pytest.importorskip("onnx", reason=ONNX_EXTRA)
 OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 
 
+@pytest.mark.slow
 @each("case", CASES, lambda path: path.name)
 def test_golden_layer_computes_the_same_in_onnxruntime_and_opencv_and_at_other_sizes(case: Path) -> None:
     net, inputs = golden_net(case)

@@ -84,6 +84,7 @@ def test_filters_agree_with_plain_loops_at_random_settings(build, kind: str, axe
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
 @pytest.mark.parametrize(
     "settings",
@@ -299,6 +300,7 @@ def test_a_top_without_a_pixel_and_unlike_bottoms_are_refused(build) -> None:
         build(text.format("Convolution", "kernel_size: 1"), (1, 1, 4, 4), (1, 1, 4, 4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "window"),
     [

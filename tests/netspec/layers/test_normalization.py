@@ -176,6 +176,7 @@ SHAPE = (2, 3, 4, 5)
 SCALE_FILL = 'filler { type: "gaussian" }'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "num_axes", "shape", "broadcast"), OPERANDS)
 def test_learned_scale_and_bias_lie_over_their_axes(build, gradcheck, axis, num_axes, shape, broadcast) -> None:
     data = torch.randn(SHAPE)
@@ -192,6 +193,7 @@ def test_learned_scale_and_bias_lie_over_their_axes(build, gradcheck, axis, num_
     gradcheck(layer, data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "num_axes", "shape", "broadcast"), OPERANDS)
 def test_a_second_bottom_is_the_operand(build, gradcheck, axis, num_axes, shape, broadcast) -> None:
     data, operand = torch.randn(SHAPE), torch.randn(shape)

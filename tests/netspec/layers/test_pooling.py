@@ -64,6 +64,7 @@ def pooling_text(method: str, kernel, stride, pad, floor: bool) -> str:
     return f'type: "Pooling" pooling_param {{ pool: {method} {fields} {"round_mode: FLOOR" if floor else ""} }}'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["MAX", "AVE"])
 def test_pooling_agrees_with_plain_loops_at_random_settings(build, method: str) -> None:
     random = np.random.default_rng(7)
@@ -259,6 +260,7 @@ def test_wrong_pooling_is_refused(build, settings: str, shape: tuple, tops: int,
     assert words in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["MAX", "AVE"])
 def test_spp_puts_the_levels_side_by_side(build, gradcheck, method: str) -> None:
     layer = build(f'type: "SPP" spp_param {{ pyramid_height: 3 pool: {method} }}', (2, 3, 9, 12))

@@ -130,6 +130,7 @@ def test_exposed_state_goes_in_and_out_without_gradient(build, kind: str, with_s
     assert [s.grad for s in given] == [None] * states(kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["RNN", "LSTM"])
 def test_gradients_go_back_through_time(build, gradcheck, kind: str) -> None:
     layer = build(text(kind), (3, N, INPUTS), (3, N), (N, 2))

@@ -3,6 +3,7 @@
 import copy
 from itertools import product
 
+import pytest
 import torch
 from google.protobuf import text_format
 
@@ -72,6 +73,7 @@ def build(name: str, text: str, shapes: list[tuple[int, ...]], exact: str) -> La
     return cls(param, shapes, Context(TRAIN, BuildOptions(exact=exact, accumulate_in_place=True)))
 
 
+@pytest.mark.slow
 @each("name, text, shapes, exact, sideways", [(*case, *how) for case in ALL for how in product(CHOICES, (False, True))])
 @one_thread()  # as Learning says: the two would share a product among threads in different ways, and so round otherwise
 def test_kernels_are_what_autograd_computes(

@@ -111,6 +111,7 @@ def test_the_old_places_of_a_transform_mean_nothing_to_a_current_data_layer(net_
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", layer_types())
 def test_a_layer_reads_the_fields_it_is_registered_for(kind: str) -> None:
     """Where ``reads`` says less than the class, users are warned of what works; where more, not of what does not."""

@@ -73,6 +73,7 @@ def test_a_shape_that_the_file_does_not_tell_is_asked_for(trained: Callable[...,
     assert deploy.layer[-1].type == "SoftmaxWithLoss"
 
 
+@pytest.mark.slow
 def test_the_commands_show_and_write_it(trained: Callable[..., Any], run: Callable[..., Any]):
     trained("mirror: true")
     assert "say --shape data=1,3,H,W" in run("check", "w.caffemodel").fault

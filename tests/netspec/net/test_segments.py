@@ -83,6 +83,7 @@ def assert_same(found: Sequence[torch.Tensor], expected: Sequence[torch.Tensor])
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-3 * float(theirs.nan_to_num().abs().max()))
 
 
+@pytest.mark.slow
 def test_losses_statistics_and_gradients_stay(backend: str, net_of: Callable[..., Net]) -> None:
     """With shared filters, a pooling beyond the rim, and values far from 0."""
     compiled, plain = net_of(NET, compiled=True, **TRAINED), net_of(NET, **TRAINED)
@@ -90,6 +91,7 @@ def test_losses_statistics_and_gradients_stay(backend: str, net_of: Callable[...
     assert segments(compiled) == ["x_in_0_split-far_bn!", "conv_p-abs!"]
 
 
+@pytest.mark.slow
 def test_poolings_treat_nan_and_the_rim_as_caffe_does(backend: str, net_of: Callable[..., Net]) -> None:
     data = random(1, 3, 7, 7)
     data[0, 0, 0, 0], data[0, 0, 2:4, 2:4], data[0, 1, 6, 6] = torch.nan, torch.nan, -torch.inf
@@ -104,6 +106,7 @@ def test_poolings_treat_nan_and_the_rim_as_caffe_does(backend: str, net_of: Call
         torch.testing.assert_close(mine, theirs, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_torchs_logs_are_as_they_were(net_of: Callable[..., Net]) -> None:
     names = ("torch._dynamo", "torch._inductor", "torch")
     before = [logging.getLogger(name).level for name in names]
@@ -111,6 +114,7 @@ def test_torchs_logs_are_as_they_were(net_of: Callable[..., Net]) -> None:
     assert [logging.getLogger(name).level for name in names] == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("traced_only")
 def test_passes_that_are_not_repeated_run_layer_by_layer(net_of: Callable[..., Net]) -> None:
     net = net_of(NET, compiled=True, **TRAINED)
@@ -132,6 +136,7 @@ def test_passes_that_are_not_repeated_run_layer_by_layer(net_of: Callable[..., N
         net_of(NET, phase=TEST, exact="none", compiled=True, passes=())(x=random(4, 3, 11, 11))
 
 
+@pytest.mark.slow
 def test_each_segment_is_compiled_once(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
     keep = lambda graph, _: (made.append(graph), graph.forward)[1]  # noqa: E731
@@ -160,6 +165,7 @@ def trained(case: str, **options: Any) -> Solver:
     return load_solver(f"{case}/solver.prototxt", weights=f"{case}/init.caffemodel", **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_a_training_with_tests_and_iter_size_stays(
     backend: str, precision: str, work_in: Callable[..., Path], edited_solver: Callable[[Path], None]
@@ -187,6 +193,7 @@ def edited_solver() -> Callable[[Path], None]:
     return edit
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("traced_only")
 def test_a_resumed_training_goes_on_to_the_bit(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")

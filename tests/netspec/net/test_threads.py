@@ -29,6 +29,7 @@ def in_threads(run: Callable[[int], None]) -> None:
         list(pool.map(run, range(COUNT)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradients", [False, True])
 def test_threads_that_share_a_net_get_their_own_numbers(net_of: Callable[..., Net], gradients: bool) -> None:
     net = net_of(TEXT)

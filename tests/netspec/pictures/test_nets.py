@@ -171,6 +171,7 @@ def test_thumbnails_by_name_and_by_key(tmp_path: Path) -> None:
 NET = ("sgd_step/train_val.prototxt", "--weights", "sgd_step/init.caffemodel")
 
 
+@pytest.mark.slow
 def test_the_commands(run: Run) -> None:
     cv2.imwrite("a.png", image(0, (30, 40, 3)))
     cv2.imwrite("b.png", image(1, (30, 40, 3)))
@@ -195,6 +196,7 @@ def test_the_commands(run: Run) -> None:
         Path("x.png").unlink()
 
 
+@pytest.mark.slow
 def test_the_embedding_of_a_siamese_net(run: Run) -> None:
     assert run("extract", *NET, "--blob", "feat", "--out", "f.npz").status == 0
     result = run("look", "embedding", "f.npz", "--images", "pairs/test_lmdb", "--out", "x.svg")

@@ -31,6 +31,7 @@ def test_old_weights_are_upgraded(tmp_path: Path) -> None:
     assert parse_net_binary(path, upgrade=False)[0] == old
 
 
+@pytest.mark.slow
 def test_there_is_no_limit_of_64_megabytes(tmp_path: Path) -> None:
     path = tmp_path / "large.caffemodel"
     floats = bytes(68 << 20)

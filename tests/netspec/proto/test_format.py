@@ -135,6 +135,7 @@ def texts(draw: st.DrawFn, depth: int = 0) -> str:
     return text
 
 
+@pytest.mark.slow
 @given(texts())
 @example(" # one\nf:1 # two\n ;# three\n")
 def test_any_text_keeps_its_tokens_and_comments_and_is_formatted_once(text: str) -> None:
@@ -163,6 +164,7 @@ def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
         assert parse(formed, str(path))[0] == before
 
 
+@pytest.mark.slow
 @each("path", OWN, last_parts)
 def test_the_projects_own_files_have_the_form(path: Path) -> None:
     assert format_text(text_of(path), str(path)) == text_of(path)

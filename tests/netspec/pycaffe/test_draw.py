@@ -78,6 +78,7 @@ def test_multipliers_of_the_learning_rate(net) -> None:
         draw.get_layer_lr_mult(net.layer[3])
 
 
+@pytest.mark.slow
 def test_graphviz_text_needs_no_graphviz(net, tmp_path: Path) -> None:
     draw.draw_net_to_file(net, str(tmp_path / "net.dot"), "BT")
     (read,) = pydot.graph_from_dot_file(str(tmp_path / "net.dot"))

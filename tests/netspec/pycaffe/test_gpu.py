@@ -27,6 +27,7 @@ def _gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
+@pytest.mark.slow
 @each("folder", LAYERS)
 def test_blobs_hold_what_caffes_held(folder: Path) -> None:
     case = LayerCase(folder)
@@ -35,6 +36,7 @@ def test_blobs_hold_what_caffes_held(folder: Path) -> None:
         np.testing.assert_allclose(value, expected, rtol=0, atol=1e-5 * max(np.abs(expected).max(initial=0), 1e-30))
 
 
+@pytest.mark.slow
 def test_a_training_as_scripts_have_it(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     solver = caffe.get_solver("sgd_step/solver.prototxt")

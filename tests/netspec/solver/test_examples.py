@@ -51,6 +51,7 @@ def test_follows_caffe(run: str, folder: Path, same_blas: bool, monkeypatch: pyt
     assert [{name: value for name, (value,) in scores.items()} for scores in solver.scores] == meta["tests_after"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", RUNS)
 def test_begins_as_caffe_does_on_every_cpu(run: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The weights after the first iteration, to 1e-4 of what was subtracted from them."""

@@ -26,6 +26,7 @@ def lines(tmp_path: Path) -> Iterator[Callable[[], list[str]]]:
     log.logger.setLevel(level)
 
 
+@pytest.mark.slow
 def test_the_speed_comes_from_the_clock_and_is_0_at_first(work_in: Callable[..., Path], lines: Callable[[], list[str]]):
     work_in("train/sgd_step")
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel")

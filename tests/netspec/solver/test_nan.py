@@ -67,6 +67,7 @@ def test_the_first_bad_parameter_is_named(write: Callable[..., None]) -> None:
         solver.snapshot()
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_where_that_is_wanted(
     write: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -42,6 +42,7 @@ def test_a_rounded_training_follows_caffe_from_afar(
     assert np.abs(exact - golden).max() < np.abs(found - golden).max()
 
 
+@pytest.mark.slow
 def test_tf32_is_for_gpus(work_in: Callable[..., Path]) -> None:
     """On a CPU it is float32, with sums in torch's order."""
     work_in("train/sgd_step")

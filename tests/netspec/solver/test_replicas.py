@@ -22,6 +22,7 @@ def test_ranks_share_the_records_between_them() -> None:
         assert [r.wraps(iteration) for r in ranks] == [alone.wraps(iteration)] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("devices", [2, 4])
 def test_devices_with_a_share_of_the_batch_train_as_one_with_all_of_it(
     devices: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rounding: float
