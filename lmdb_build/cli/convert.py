@@ -45,7 +45,7 @@ def add_to(commands: Commands) -> None:
 
     p = commands.add("mean", _mean, "compute the mean image of a database (compute_image_mean)")
     _add_backend(p)
-    p.add_argument("INPUT_DB")
+    p.add_argument("INPUT_DB", help="the database to read")
     p.add_argument("OUTPUT_FILE", nargs="?", help="where to write the mean, as .binaryproto")
 
     p = commands.add("mnist", _mnist, "write the files of MNIST into a database (convert_mnist_data)")
@@ -58,7 +58,7 @@ def add_to(commands: Commands) -> None:
     p = commands.add("cifar", _cifar, "write the files of CIFAR-10 into two databases (convert_cifar_data)")
     p.add_argument("INPUT_FOLDER", help="the folder of data_batch_1.bin to data_batch_5.bin and test_batch.bin")
     p.add_argument("OUTPUT_FOLDER", help="where cifar10_train_DB_TYPE and cifar10_test_DB_TYPE are written")
-    p.add_argument("DB_TYPE", choices=BACKENDS)
+    p.add_argument("DB_TYPE", choices=BACKENDS, help="the form of the databases")
 
 
 def _add_backend(p: argparse.ArgumentParser) -> None:

@@ -17,11 +17,11 @@ def add_to(commands: Commands) -> None:
     p = commands.add("similarity", _similarity, "compare all descriptors of a file, by blocks")
     p.add_argument("features", help="the .npz file of the queries")
     p.add_argument("--references", metavar="F.npz", help="the references (default: the queries, as one sequence)")
-    p.add_argument("--metric", choices=METRICS, default=METRICS[0])
+    p.add_argument("--metric", choices=METRICS, default=METRICS[0], help=f"of the descriptors (default: {METRICS[0]})")
     p.add_argument("--top-k", type=int, metavar="K", help="write the best K of each query as CSV, not all as .npy")
     p.add_argument("--exclude-frames", type=int, default=0, metavar="N", help="of --top-k in one sequence")
     p.add_argument("--exclude-seconds", type=float, default=0.0, metavar="S", help="the same, by stamps")
-    p.add_argument("--out", required=True, metavar="FILE")
+    p.add_argument("--out", required=True, metavar="FILE", help="the file to write")
 
 
 def _similarity(a: argparse.Namespace) -> None:

@@ -24,9 +24,9 @@ def add_to(commands: Commands) -> None:
     p.add_argument("blobs", help="blob names, separated by commas")
     p.add_argument("databases", help="the databases to write, one per blob, separated by commas")
     p.add_argument("batches", type=positive, help="mini-batches to run")
-    p.add_argument("db_type", choices=("lmdb", "leveldb"))
-    p.add_argument("mode", nargs="?", choices=("CPU", "GPU"), default="CPU")
-    p.add_argument("device", nargs="?", default="0", metavar="DEVICE_ID=0")
+    p.add_argument("db_type", choices=("lmdb", "leveldb"), help="the form of the databases")
+    p.add_argument("mode", nargs="?", choices=("CPU", "GPU"), default="CPU", help="where the net runs (default: CPU)")
+    p.add_argument("device", nargs="?", default="0", metavar="DEVICE_ID=0", help="the GPU's number")
 
     p = commands.add("device_query", _device_query, "show the GPUs (caffe device_query)")
     p.add_argument("--gpu", default="all", help="one number, several separated by commas, or all (the default)")
@@ -38,8 +38,8 @@ def add_to(commands: Commands) -> None:
     ):
         text_net = name == "upgrade_net_proto_text"
         p = commands.add(name, function, f"write {what} in the current format", net=READ if text_net else 0)
-        p.add_argument("input", metavar="IN")
-        p.add_argument("output", metavar="OUT")
+        p.add_argument("input", metavar="IN", help="the file to read")
+        p.add_argument("output", metavar="OUT", help="the file to write")
         if text_net:
             add_shapes(p, "of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input")
 

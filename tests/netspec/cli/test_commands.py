@@ -270,6 +270,7 @@ def test_a_prefix_that_cannot_be_written_to(run: Run, edited: Edit) -> None:
     assert fault.startswith(
         'edited.prototxt:9:1: cannot write to snapshot prefix "nowhere/ref": No such file or directory'
     )
+    assert fault.endswith(f"; relative paths begin at {Path.cwd()}")
 
 
 def test_weights_that_are_missing_or_no_weights(run: Run) -> None:

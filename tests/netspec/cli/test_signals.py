@@ -1,11 +1,14 @@
-"""What a training does when a signal comes."""
+"""What a training does when a signal comes, and what it shows on a terminal."""
 
 import os
+import re
 import signal
+import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -167,3 +170,22 @@ def test_a_second_interrupt_ends_a_training_at_once(endless) -> None:
     assert process.poll() is None
     process.send_signal(signal.SIGINT)
     assert process.wait(10) == 130
+
+
+def test_on_a_terminal_a_line_says_how_far_it_is(work_in: Callable[..., Path]) -> None:
+    work_in("train/sgd_step")
+    pty, fcntl, termios = map(pytest.importorskip, ("pty", "fcntl", "termios"))  # Windows has none of them
+    terminal, given = pty.openpty()
+    fcntl.ioctl(given, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))  # without columns no line is shown
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "TQDM_MININTERVAL": "0"}
+    command = [sys.executable, "-m", "netspec", "train", SOLVER, "-q"]
+    with subprocess.Popen(command, stderr=given, env=environment) as training:
+        os.close(given)
+        shown = b""
+        with suppress(OSError):  # how Linux says that nobody writes any more
+            while part := os.read(terminal, 1000):
+                shown += part
+    os.close(terminal)
+    assert training.returncode == 0, shown
+    assert re.search(rb"\r10 of 60 \|", shown), shown
+    assert b"Iteration" not in shown, "Caffe's log has no such line, and -q hides the log"
