@@ -1,7 +1,7 @@
-"""Products with learned weights for training at fixed shapes: what netspec/exact/products.py computes, call by call.
+"""Products with learned weights at fixed shapes: what netspec/exact/products.py computes, call by call.
 
-The arguments of BLAS' calls are made once: they are views of memory that stays where it is. Everything here expects
-that BLAS uses one thread.
+The arguments of BLAS' calls are made once: they are views of memory that stays where it is. So what a function here
+returns is good until its next call. Everything here expects that BLAS uses one thread.
 
 Caffe: src/caffe/layers/inner_product_layer.cpp, base_conv_layer.cpp
 """
@@ -10,13 +10,15 @@ Caffe: src/caffe/layers/inner_product_layer.cpp, base_conv_layer.cpp
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from netspec.exact.blas import gemm_routine, gemv_routine
-from netspec.exact.products import Filter, columns_of_shape
+from netspec.exact.products import Axes, Filter
 
 SMALL = 2**14  # numbers that are copied sooner than shown
 
@@ -24,23 +26,24 @@ SMALL = 2**14  # numbers that are copied sooner than shown
 class Matrix:
     """Shows tensors as matrices with so many columns, to BLAS, which takes them as transposed.
 
-    A tensor that comes again, the same object, has its view from the last time. One whose numbers do not lie one after
-    the other is copied, and so is a small one that is another each time: to make a view takes longer.
+    Memory that comes again has its view from the last time. A tensor whose numbers do not lie one after the other is
+    copied, and so is a small one that lies elsewhere each time: to make a view takes longer.
     """
 
-    __slots__ = ("_columns", "_copy", "_last", "_shown", "_tensor")
+    __slots__ = ("_columns", "_copy", "_place", "_shown", "_tensor")
 
     def __init__(self, columns: int) -> None:
         self._columns = columns
-        self._last: torch.Tensor | None = None
+        self._place: int | None = None  # the view keeps the memory: nothing else comes to lie there
         self._tensor: torch.Tensor | None = None
 
     def __call__(self, tensor: torch.Tensor) -> np.ndarray:
         """Return the view, (columns, rows)."""
-        if tensor is self._last:
+        place = tensor.data_ptr() if tensor.is_contiguous() else None
+        if place is not None and place == self._place:
             return self._shown
-        if tensor.is_contiguous() and (self._last is None or tensor.numel() > SMALL):
-            self._last = tensor
+        if place is not None and (self._place is None or tensor.numel() > SMALL):
+            self._place = place
             self._shown = tensor.view(-1, self._columns).numpy().T
             return self._shown
         if self._tensor is None:
@@ -59,6 +62,14 @@ class Weights(NamedTuple):
     bias_sums: torch.Tensor | None
 
 
+def copied(values: Sequence[torch.Tensor]) -> Weights:
+    """Return copies of the weights and, where there is a second tensor, the biases of a layer that does not learn."""
+    weight, *biases = values
+    return Weights(
+        weight.clone(memory_format=torch.contiguous_format), biases[0].clone() if biases else None, None, None
+    )
+
+
 class BoundVectors:
     """:class:`netspec.exact.products.VectorProducts` of vectors of one shape, and of one matrix.
 
@@ -72,7 +83,7 @@ class BoundVectors:
         top_shape: tuple[int, ...],
         transposed: bool,
         learned: Weights,
-        wanted: bool,
+        wanted: bool = False,
     ) -> None:
         weight, self._bias, weight_sums, bias_sums = learned
         inputs, outputs = weight.shape if transposed else (weight.shape[1], weight.shape[0])
@@ -123,35 +134,35 @@ class BoundColumns:
         sliding: Filter,
         group: int,
         learned: Weights,
-        wanted: bool,
-        steady: bool,
+        wanted: bool = False,
+        steady: bool = True,
     ) -> None:
         weight, bias, weight_sums, bias_sums = learned
         count, channels, *size = shape
-        self._size, self._sliding = tuple(size), sliding
+        self._size, self._sliding, self._group = tuple(size), sliding, group
         fits = sliding.fits(self._size)
         self._steady = steady
         self._top = torch.empty((count, len(weight), *fits), dtype=weight.dtype)
         self._bias = None if bias is None else bias.view(-1, 1, 1)
         self._at_once = min(count, sliding.images_at_once(channels, self._size))
         positions = math.prod(fits)
-        self._tops = [image.numpy() for image in self._top.flatten(2)]
-        self._columns = [
-            columns_of_shape((min(self._at_once, count - start), channels, *size), weight.dtype, sliding, fits)
-            for start in range(0, count, self._at_once)
-        ]
-        area = math.prod(sliding.kernel)
-        outputs, rows = len(weight) // group, channels // group * area
-        self._groups = [(slice(g * outputs, (g + 1) * outputs), slice(g * rows, (g + 1) * rows)) for g in range(group)]
-        self._filters = weight.flatten(1).numpy()
-        self._weight_sums = None if weight_sums is None else weight_sums.flatten(1).numpy()
+        self._tops = [_by_group(image.numpy(), group) for image in self._top.flatten(2)]
+        whole, rest = divmod(count, self._at_once)
+        of = partial(_columns, dtype=weight.dtype, sliding=sliding, fits=fits, group=group)
+        self._columns = [of((self._at_once, channels, *size))] * whole
+        if rest:
+            self._columns.append(of((rest, channels, *size)))
+        self._filters = _by_group(weight.flatten(1).numpy(), group)
+        self._weight_sums = None if weight_sums is None else _by_group(weight_sums.flatten(1).numpy(), group)
         self._bias_sums = None if bias_sums is None else bias_sums.numpy()
         self._diffs = Matrix(positions)
-        self._ones = np.ones(positions, self._filters.dtype)
+        self._ones = np.ones(positions, self._filters[0].dtype)
         self._spread = None
         if wanted:
-            self._spread = torch.empty((self._at_once, channels * area, positions), dtype=weight.dtype)
-        self._gemm, self._gemv = gemm_routine(self._filters), gemv_routine(self._filters)
+            self._spread = torch.empty(
+                (self._at_once, channels * math.prod(sliding.kernel), positions), dtype=weight.dtype
+            )
+        self._gemm, self._gemv = gemm_routine(self._filters[0]), gemv_routine(self._filters[0])
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         """Return the responses."""
@@ -160,8 +171,8 @@ class BoundColumns:
             start = k * self._at_once
             self._laid_out = lay_out(maps[start : start + self._at_once] if len(self._columns) > 1 else maps)
             for columns, top in zip(self._laid_out, self._tops[start:], strict=False):
-                for outputs, inputs in self._groups:
-                    self._gemm(1.0, columns[inputs].T, self._filters[outputs].T, 0.0, top[outputs].T, 0, 0, 1)
+                for inputs, filters, outputs in zip(columns, self._filters, top, strict=True):
+                    self._gemm(1.0, inputs, filters, 0.0, outputs, 0, 0, 1)
         if self._bias is not None:
             self._top.add_(self._bias)
         return self._top
@@ -177,16 +188,58 @@ class BoundColumns:
         whole = self._steady and len(self._columns) == 1
         for k, lay_out in enumerate(self._columns):
             start = k * self._at_once
-            some = diffs[start : start + self._at_once]
+            some = [_by_group(each, self._group) for each in diffs[start : start + self._at_once]]
             if self._weight_sums is not None:
                 laid_out = self._laid_out if whole else lay_out(self._maps[start : start + self._at_once])
                 for columns, each in zip(laid_out, some, strict=True):
-                    for rows, inputs in self._groups:
-                        self._gemm(1.0, columns[inputs].T, each[rows].T, 1.0, self._weight_sums[rows].T, 1, 0, 1)
+                    for inputs, outputs_diff, sums in zip(columns, each, self._weight_sums, strict=True):
+                        self._gemm(1.0, inputs, outputs_diff, 1.0, sums, 1, 0, 1)
             if self._spread is not None:
                 spread = self._spread[: len(some)]
                 for columns, each in zip(spread.numpy(), some, strict=True):
-                    for rows, inputs in self._groups:
-                        self._gemm(1.0, each[rows].T, self._filters[rows].T, 0.0, columns[inputs].T, 0, 1, 1)
+                    for inputs, outputs_diff, filters in zip(
+                        _by_group(columns, self._group), each, self._filters, strict=True
+                    ):
+                        self._gemm(1.0, outputs_diff, filters, 0.0, inputs, 0, 1, 1)
                 found.append(self._sliding.spread(spread, self._size))
         return None if not found else found[0] if len(found) == 1 else torch.cat(found)
+
+
+def _by_group(matrix: np.ndarray, group: int) -> list[np.ndarray]:
+    """Return the rows of each group, one group after the other, as BLAS takes them: transposed."""
+    return [matrix.T] if group == 1 else [rows.T for rows in np.split(matrix, group)]
+
+
+def _columns(
+    shape: Axes, dtype: torch.dtype, sliding: Filter, fits: Sequence[int], group: int
+) -> Callable[[torch.Tensor], list[list[np.ndarray]]]:
+    """Return what :meth:`Filter.columns` gives for all maps (N, C, H, W) of one shape, by image and by group."""
+    (count, channels, *size), (kernel, stride, dilation) = shape, (sliding.kernel, sliding.stride, sliding.dilation)
+    flat = (count, channels * math.prod(kernel), math.prod(fits))
+    each_pixel_once = math.prod(kernel) * flat[2] == math.prod(size)
+    if not any(sliding.pad) and each_pixel_once and (math.prod(kernel) == 1 or flat[2] == 1):
+        return lambda maps: [_by_group(image, group) for image in maps.contiguous().numpy().reshape(flat)]
+    frame = None
+    if any(sliding.pad):
+        frame = torch.zeros(
+            (count, channels, *(n + 2 * p for n, p in zip(size, sliding.pad, strict=True))), dtype=dtype
+        )
+        inner = frame[:, :, sliding.pad[0] : sliding.pad[0] + size[0], sliding.pad[1] : sliding.pad[1] + size[1]]
+        size = list(frame.shape[2:])
+    area = size[0] * size[1]
+    strides = (channels * area, area, dilation[0] * size[1], dilation[1], stride[0] * size[1], stride[1])
+    columns = torch.empty((count, channels, *kernel, *fits), dtype=dtype)
+    layout, found = columns.shape, [_by_group(image, group) for image in columns.view(flat).numpy()]
+    place, pixels = None, columns if frame is None else frame.as_strided(layout, strides)
+
+    def lay_out(maps: torch.Tensor) -> list[list[np.ndarray]]:
+        nonlocal place, pixels
+        if frame is not None:
+            inner.copy_(maps)
+        elif maps.data_ptr() != place or not maps.is_contiguous():  # the view keeps the memory of the last maps
+            whole = maps.contiguous()
+            place, pixels = whole.data_ptr(), whole.as_strided(layout, strides)
+        columns.copy_(pixels)
+        return found
+
+    return lay_out

@@ -5,20 +5,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact.accumulate import ParameterSums
-from netspec.exact.blas import add_sums, gemm, gemm_routine, one_thread
+from netspec.exact.blas import add_sums, gemm, one_thread
 
 Axes = tuple[int, ...]
 FEW = 64  # vectors; a product of fewer takes less time than to round the weights to another precision
@@ -139,63 +138,6 @@ class ColumnProducts(ParameterSums):
                 _gemm_by_group(filters, diff, columns[: len(diff)], ctx.group, a_t=True)
                 some.copy_(ctx.sliding.spread(columns[: len(diff)], maps.shape[2:]))
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None
-
-
-def prepared_columns(
-    shape: Axes, sliding: Filter, weight: torch.Tensor, bias: torch.Tensor | None = None
-) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return what :class:`ColumnProducts` computes for maps (N, C, H, W) of one shape, without gradients.
-
-    It works in memory of its own, on copies of the weights, which ask for no gradient, and expects that BLAS uses one
-    thread.
-    """
-    count, fits, outputs = shape[0], sliding.fits(shape[2:]), len(weight)
-    filters = weight.flatten(1).clone().numpy().T
-    bias = None if bias is None else bias.clone().view(-1, 1)
-    lay_out = columns_of_shape(shape, weight.dtype, sliding, fits)
-    top_shape, rows = (count, outputs, *fits), (count, outputs, fits[0] * fits[1])
-    multiply, dtype = gemm_routine(filters), weight.dtype
-
-    def run(maps: torch.Tensor) -> torch.Tensor:
-        tops = torch.empty(rows, dtype=dtype)
-        for image, top in zip(lay_out(maps), tops.numpy(), strict=True):
-            multiply(1.0, image.T, filters, 0.0, top.T, 0, 0, 1)
-        if bias is not None:
-            tops.add_(bias)
-        return tops.view(top_shape)
-
-    return run
-
-
-def columns_of_shape(
-    shape: Axes, dtype: torch.dtype, sliding: Filter, fits: Sequence[int]
-) -> Callable[[torch.Tensor], np.ndarray]:
-    """Return what :meth:`Filter.columns` gives for all maps of one shape: (N, C kernel, positions), in fixed memory."""
-    (count, channels, *size), (kernel, stride, dilation) = shape, (sliding.kernel, sliding.stride, sliding.dilation)
-    flat = (count, channels * math.prod(kernel), math.prod(fits))
-    each_pixel_once = math.prod(kernel) * flat[2] == math.prod(size)
-    if not any(sliding.pad) and each_pixel_once and (math.prod(kernel) == 1 or flat[2] == 1):
-        return lambda maps: maps.contiguous().numpy().reshape(flat)
-    frame = None
-    if any(sliding.pad):
-        frame = torch.zeros(
-            (count, channels, *(n + 2 * p for n, p in zip(size, sliding.pad, strict=True))), dtype=dtype
-        )
-        inner = frame[:, :, sliding.pad[0] : sliding.pad[0] + size[0], sliding.pad[1] : sliding.pad[1] + size[1]]
-        size = list(frame.shape[2:])
-    area = size[0] * size[1]
-    strides = (channels * area, area, dilation[0] * size[1], dilation[1], stride[0] * size[1], stride[1])
-    columns = torch.empty((count, channels, *kernel, *fits), dtype=dtype)
-    layout, found = columns.shape, columns.view(flat).numpy()
-
-    def lay_out(maps: torch.Tensor) -> np.ndarray:
-        if frame is not None:
-            inner.copy_(maps)
-            maps = frame
-        columns.copy_(maps.contiguous().as_strided(layout, strides))
-        return found
-
-    return lay_out
 
 
 class SpreadProducts(ParameterSums):
@@ -488,26 +430,6 @@ class SummedProducts(ParameterSums):
         if ctx.needs_input_grad[0]:
             vectors_diff = (tops_diff @ (weight.t() if ctx.transposed else weight).to(kind)).to(ctx.kind)
         return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
-
-
-def prepared_vectors(
-    rows: int, transposed: bool, weight: torch.Tensor, bias: torch.Tensor | None = None
-) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return what :class:`VectorProducts` computes for vectors (rows, K), without gradients.
-
-    It works on copies of the weights, which ask for no gradient, and expects that BLAS uses one thread.
-    """
-    matrix = weight.clone(memory_format=torch.contiguous_format).numpy().T
-    bias = None if bias is None else bias.clone()
-    outputs = weight.shape[1 if transposed else 0]
-    multiply, trans = gemm_routine(matrix), int(not transposed)
-
-    def kernel(vectors: torch.Tensor) -> torch.Tensor:
-        tops = vectors.new_empty(rows, outputs)
-        multiply(1.0, matrix, vectors.contiguous().numpy().T, 0.0, tops.numpy().T, trans, 0, 1)
-        return tops if bias is None else tops.add_(bias)
-
-    return kernel
 
 
 class ChosenRows(ParameterSums):

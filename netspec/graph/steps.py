@@ -24,7 +24,7 @@ class Step:
     """One kernel of a run: layer ``node`` with its ``chain`` folded in, then layer ``finish`` in place on its top.
 
     ``bottoms`` and ``tops`` are values; ``reuse``: nobody else needs the memory of the first bottom; ``ends``: values
-    that are not needed after it.
+    that are not needed after it; ``lasts``: after the run somebody may look at the memory of its tops.
     """
 
     node: int
@@ -34,6 +34,7 @@ class Step:
     finish: int | None = None
     reuse: bool = False
     ends: tuple[int, ...] = ()
+    lasts: bool = True
 
 
 @dataclass(frozen=True)
@@ -95,13 +96,16 @@ def _readers(plan: Plan, origin: Sequence[int], passes_on: Sequence[bool]) -> di
 def _with_ends(steps: Sequence[Step], fresh: Sequence[bool], lasting: Collection[int], reusing: bool) -> list[Step]:
     """Return the steps with what ends with them, and what may be overwritten: memory that no view shows."""
     last = {v: s for s, step in enumerate(steps) for v in (*step.bottoms, *step.tops)}
-    owned: set[int] = set()
+    owned, shown = set[int](), set(lasting)
+    for step in reversed(steps):
+        if not (fresh[step.node] or shown.isdisjoint(step.tops)):
+            shown.update(step.bottoms)
     made = []
     for s, step in enumerate(steps):
         ends = tuple(dict.fromkeys(v for v in (*step.bottoms, *step.tops) if last[v] == s and v not in lasting))
         first = step.bottoms[0] if step.bottoms else -1
         reuse = reusing and first in ends and first in owned and step.bottoms.count(first) == 1
-        made.append(replace(step, reuse=reuse, ends=ends))
+        made.append(replace(step, reuse=reuse, ends=ends, lasts=not shown.isdisjoint(step.tops)))
         if fresh[step.node]:
             owned.update(step.tops)
         else:

@@ -10,13 +10,13 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.bound import BoundVectors, Weights
-from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts, prepared_vectors
+from netspec.exact.bound import BoundVectors, Weights, copied
+from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts
 from netspec.layers import fused
 from netspec.layers.base import Layer, Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.folding import Absorbed, blob_like, copy_of
-from netspec.layers.preparing import Kernel, Preparation, finished
+from netspec.layers.preparing import Kernel, Preparation, finished, lent
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.training import Kernels, Learning, Room, weight_and_bias
@@ -82,15 +82,14 @@ class InnerProduct(Layer):
         transposed, top_shape = self.param.inner_product_param.transpose, self.top_shapes[0]
         rows = math.prod(top_shape[:-1])
         one_by_one = (rows, self.inputs)
-        if self.is_exact(weight, self.small):
-            multiply = finished(prepared_vectors(rows, transposed, *self.values()), how.finish)
+        if self.is_exact(weight, self.small) and math.prod(self.bottom_shapes[0]):
+            return lent(BoundVectors(self.bottom_shapes[0], top_shape, transposed, copied(self.values())).forward, how)
+        weight = weight.t() if transposed else weight
+        # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
+        if rows > 1 and how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:
+            multiply = fused.product(weight, bias, how)
         else:
-            weight = weight.t() if transposed else weight
-            # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
-            if rows > 1 and how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:
-                multiply = fused.product(weight, bias, how)
-            else:
-                multiply = finished(lambda vectors: F.linear(vectors, weight, bias), how.finish)
+            multiply = finished(lambda vectors: F.linear(vectors, weight, bias), how.finish)
         if self.axis == 1:
             return lambda data: multiply(data.reshape(one_by_one))
         return lambda data: multiply(data.reshape(one_by_one)).view(top_shape)

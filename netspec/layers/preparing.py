@@ -32,11 +32,12 @@ class Preparation:
 
     ``finish`` is to be done in place to its top; its first bottom may be overwritten where ``reuse``. What it makes of
     its blobs for all shapes it gets by ``memo(name, make)``, which makes it once; weights may be laid out for a kernel
-    where ``pack``.
+    where ``pack``. Its top may be memory that its next pass overwrites, unless it ``lasts``.
     """
 
     finish: Finish | None = None
     reuse: bool = False
+    lasts: bool = True
     memo: Callable[[str, Callable[[], Any]], Any] = lambda _, make: make()
     pack: bool = True
 
@@ -100,3 +101,9 @@ def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
         return change(top[0] if isinstance(top, tuple) else top)
 
     return both
+
+
+def lent(kernel: Kernel, how: Preparation) -> Kernel:
+    """Return the whole kernel of a layer of one top, which ``kernel`` computes into memory that its next pass uses."""
+    kernel = finished(kernel, how.finish)
+    return (lambda *bottoms: kernel(*bottoms).clone()) if how.lasts else kernel

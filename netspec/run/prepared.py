@@ -206,7 +206,7 @@ class Prepared:
             chain = step.chain
             layer = absorbing(layer, memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
         finish = None if step.finish is None else finishing(layers[step.finish])
-        how = Preparation(finish, step.reuse, memo, PACK in self.passes)
+        how = Preparation(finish, step.reuse, step.lasts, memo, PACK in self.passes)
         own = None if as_is else own_kernel(layer, how)
         kernel = finished(layer.forward, finish) if own is None else own
         if not offered(layer, "any_layout") or self._exact == ALL:

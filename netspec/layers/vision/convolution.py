@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.bound import BoundColumns, Weights
+from netspec.exact.bound import BoundColumns, Weights, copied
 from netspec.exact.products import (
     ColumnProducts,
     Filter,
@@ -19,14 +19,13 @@ from netspec.exact.products import (
     SummedConvolutions,
     convolution,
     laid_out_like,
-    prepared_columns,
 )
 from netspec.exact.switch import is_recorded
 from netspec.layers import fused
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.folding import Absorbed, blob_like, copy_of
-from netspec.layers.preparing import Kernel, Preparation, finished
+from netspec.layers.preparing import Kernel, Preparation, finished, lent
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.training import Kernels, Learning, weight_and_bias
@@ -156,12 +155,11 @@ class Convolution(SlidingFilter):
     def prepare(self, how: Preparation) -> Kernel | None:
         usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(self.bottom_shapes[0]))
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
-        exact = self.is_exact(weight, self.small)
-        if not usual or len(self.bottom_shapes) > 1 or (exact and self.group > 1):
+        if not usual or len(self.bottom_shapes) > 1 or math.prod(self.top_shapes[0]) == 0:
             return None
         shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
-        if exact:
-            return finished(prepared_columns(shape, sliding, *self.values()), how.finish)
+        if self.is_exact(weight, self.small):
+            return lent(BoundColumns(shape, sliding, self.group, copied(self.values())).forward, how)
         if shape[0] * self._work > SMALL_PRODUCT and how.pack and fused.suits(weight):
             return fused.convolution(shape, weight, bias, sliding, self.group, how)
         geometry = (self.stride, self.pad, self.dilation, self.group)

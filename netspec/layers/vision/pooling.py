@@ -25,6 +25,7 @@ from netspec.layers.vision.windows import (
     Pair,
     Windows,
     average_pool,
+    largest,
     max_pool,
     sampled_pool,
     weighted_pool,
@@ -32,6 +33,7 @@ from netspec.layers.vision.windows import (
 from netspec.proto.schema import TRAIN
 
 MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
+SLICED = 2**14  # numbers in a bottom: of more the slices pay (netspec/layers/vision/windows.py, largest)
 HIGHEST_PYRAMID = 16  # levels: 4^16 / 3 windows
 
 
@@ -208,11 +210,15 @@ class Pooling(_PoolingBase):
         if self.method == AVE:
             return finished(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.finish)
 
+        large = math.prod(self.bottom_shapes[0]) > SLICED and not any(windows.pad)
+
         def kernel(maps: torch.Tensor) -> torch.Tensor:
-            values = torch.max_pool2d(maps, *geometry, 1, ceil)
-            return (
-                values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]
-            )  # as there: torch lets NaN win
+            if large and maps.is_contiguous() and not self.is_exact(maps):
+                values = largest(maps, windows)
+            else:
+                values = torch.max_pool2d(maps, *geometry, 1, ceil)
+            # As there: torch lets NaN win.
+            return values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]
 
         return finished(kernel, how.finish)
 

@@ -114,6 +114,26 @@ def _native_max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor
     return values, rows * maps.shape[-1] + indices % framed.shape[-1] - pad[1]
 
 
+def largest(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
+    """Return the maximum of each window, unpadded and known to torch, of maps (N, C, H, W) in this order.
+
+    NaN wins, and of zeros either sign. Rows first, then columns: torch's kernel takes such maps pixel by pixel, which
+    is up to ten times as slow.
+    """
+    for axis, (_, kernel, stride, _), count in zip((2, 3), windows._axes(), windows.count, strict=True):
+        first, *more = (
+            maps[(*(slice(None),) * axis, slice(j, j + (count - 1) * stride + 1, stride))] for j in range(kernel)
+        )
+        if more and more[0].shape == first.shape:
+            maps = torch.maximum(first, more.pop(0))
+        else:
+            maps = first.clone()
+        for part in more:
+            best = maps.narrow(axis, 0, part.shape[axis])  # the last window may reach past the map
+            torch.maximum(best, part, out=best)
+    return maps
+
+
 def average_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Return the mean of each window; padding counts as zeros.
 

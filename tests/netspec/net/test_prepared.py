@@ -26,6 +26,7 @@ from netspec.run import prepared as programs
 FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 8 dim: 40 dim: 40 } } }'
 CONV = f'type: "Convolution" convolution_param {{ num_output: 16 kernel_size: 3 pad: 1 {FILLERS} }}'
+PRODUCT = f'type: "InnerProduct" inner_product_param {{ num_output: 6 {FILLERS} }}'
 NORM = """
 layer { name: "bn" type: "BatchNorm" bottom: "conv" top: "bn" }
 layer { name: "scale" type: "Scale" bottom: "bn" top: "scale" scale_param { bias_term: true } }
@@ -308,6 +309,34 @@ layer { name: "join" type: "Concat" bottom: "seen" bottom: "flat" top: "join" }
     assert_same(first, expected)
     quickly(net, data=-x)
     assert_same(first, expected)
+
+
+@pytest.mark.parametrize("keep", [(), "conv", "all"])
+@pytest.mark.parametrize("exact", ["small", "all"])
+def test_products_lend_memory_only_where_nobody_looks_afterwards(
+    exact: str, keep: str | tuple[str, ...], net_of: Callable[..., Net]
+) -> None:
+    text = (
+        INPUT.replace("dim: 40 dim: 40", "dim: 5 dim: 4")
+        + f"""
+layer {{ name: "conv" bottom: "data" top: "conv" {CONV.replace("pad: 1", "group: 2")} }}
+layer {{ name: "flat" type: "Flatten" bottom: "conv" top: "flat" }}
+layer {{ name: "parts" type: "Slice" bottom: "flat" top: "left" top: "right" slice_param {{ axis: 1 }} }}
+layer {{ name: "ip" bottom: "left" top: "ip" {PRODUCT} }}
+layer {{ name: "relu" type: "ReLU" bottom: "ip" top: "ip" }}
+layer {{ name: "shape" type: "Reshape" bottom: "ip" top: "shape" reshape_param {{ shape {{ dim: 0 dim: 2 dim: 3 }} }} }}
+layer {{ name: "inner" bottom: "ip" top: "inner" {PRODUCT} }}
+layer {{ name: "end" bottom: "inner" top: "end" {PRODUCT} }}
+"""
+    )
+    net = net_of(text, exact=exact)
+    net.keep = keep
+    given = [images(n, 8, 5, 4) * k for k, n in enumerate((3, 3, 1, 0, 3))]
+    expected = [(slowly(net, data=x), dict(net.blobs)) for x in given]
+    found = [(quickly(net, data=x), net.blobs) for x in given]
+    for (outputs, kept), (wanted, all_wanted) in zip(found, expected, strict=True):
+        for name, blob in {**wanted, **all_wanted}.items():
+            assert torch.equal({**kept, **outputs}[name], blob), name
 
 
 def test_what_follows_on_a_count_of_items_is_run_by_its_values(net_of: Callable[..., Net]) -> None:
