@@ -97,6 +97,8 @@ class Passes:
         self._prepares = self._can_prepare()
         self._given, self._results = self._ends()
         self._final_values = frozenset(v for v, *_ in (*self._given, *self._results))
+        self._hand_on = not all(fresh for *_, fresh in self._results)
+        self._no_loss = torch.zeros((), device=net.device)
 
     # Building
 
@@ -209,7 +211,7 @@ class Passes:
             return self._forward_prepared()
         with one_thread() if any(self._has_kernels) else nullcontext():
             loss = walk(self._steps("forward", range(start, end + 1)), {}, self.net.options.exact)
-        return torch.zeros((), device=self.net.device) if loss is None else loss
+        return self._no_loss if loss is None else loss
 
     def _steps(self, which: str, numbers: Iterable[int]) -> Iterator[Step]:
         """Yield the forward or backward passes of layers through memory, and what hooks do before and after them."""
@@ -255,7 +257,7 @@ class Passes:
         found = self.net.prepared.run(given, self._final_values)
         assert found is not None, "a pass of pycaffe records no gradients"
         loss, values = found
-        taken = _storages(list(given.values()))
+        taken = _storages(list(given.values())) if self._hand_on else set[int]()
         for v, blob, shares, fresh in self._results:
             tensor = values[v]
             if shares:
@@ -265,7 +267,7 @@ class Passes:
             blob.put_data(tensor if fresh else _apart(tensor, taken))
             if not fresh:
                 taken |= _storages([tensor])
-        return torch.zeros((), device=self.net.device) if loss is None else loss
+        return self._no_loss if loss is None else loss
 
     @torch.no_grad()
     def backward(self, start: int, end: int) -> None:

@@ -97,7 +97,7 @@ class Prepared:
         if torch.is_grad_enabled() or is_recorded():
             return None
         values: Values = dict(given)
-        loss = walk(self._sources, values, self._exact)
+        loss = walk(self._sources, values, self._exact) if self._sources else None
         program = self.program(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
         with one_thread() if program.one_thread else nullcontext():
             term = walk(program.line, values, self._exact)

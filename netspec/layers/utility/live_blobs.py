@@ -64,7 +64,9 @@ class Memory:
         """Return the first numbers, on the device; who reads the tensor must not write to it."""
         count = math.prod(shape)
         holder = self.holder(count)
-        return holder if holder.shape == shape else holder.view(-1)[:count].view(shape)
+        if holder.shape == shape:
+            return holder
+        return (holder if holder.numel() == count else holder.view(-1)[:count]).view(shape)
 
     def holder(self, count: int) -> torch.Tensor:
         """Return the tensor that holds the first ``count`` numbers; while it is the same one, so are they."""
