@@ -33,7 +33,7 @@ from netspec.layers.vision.windows import (
 from netspec.proto.schema import TRAIN
 
 MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
-SLICED = 2**14  # numbers in a bottom: of more the slices pay (netspec/layers/vision/windows.py, largest)
+SLICED = 2**12  # numbers in a bottom: of more the slices pay (netspec/layers/vision/windows.py, largest)
 HIGHEST_PYRAMID = 16  # levels: 4^16 / 3 windows
 
 
