@@ -7,7 +7,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from loopclosure.detector.detector import LoopDetector, LoopResult
+    from loopclosure.detector.decision import LoopResult
+    from loopclosure.detector.detector import LoopDetector
 
 __all__ = ["LoopDetector", "LoopResult"]
 

@@ -14,7 +14,8 @@ from loopclosure.cli.run import show_progress, warn
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
-from loopclosure.detector.detector import Describe, DetectorSettings, LoopDetector, LoopResult
+from loopclosure.detector.decision import DetectorSettings, LoopResult
+from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import write_g2o, write_loops_csv
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.auto import PRECISION

@@ -9,7 +9,8 @@ from pathlib import Path
 from loopclosure.cli.data_set import recording_of
 from loopclosure.cli.run import show_progress
 from loopclosure.detector import run
-from loopclosure.detector.detector import Describe, LoopResult
+from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.detector import Describe
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.map import Map, checked_name
 from loopclosure.detector.visitor import Visitor

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from loopclosure.descriptors.similarity import check_metric
+from loopclosure.detector.decision import DetectorSettings, LoopResult, Runs, result_of
 from loopclosure.detector.frames import Frames, Points, points_of
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
@@ -30,79 +30,9 @@ from netspec.files.arrays import check_array, from_json, read_npz
 from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
-Runs = list[tuple[int, int]]  # of a frame: its candidates, and how many consecutive frames led to each
 LEAST_STEPS = 20  # from one frame to the next, before they give a threshold
 FORMAT = 1  # of the file that save writes
 SAVED = "a file that LoopDetector.save wrote"
-
-
-@dataclass(frozen=True)
-class LoopResult:
-    """What adding one frame found. It is true if the frame closes a loop.
-
-    query_id    the frame's number, from 0
-    candidates  (id, score) of the best earlier frames, best first, higher = more similar
-    accepted    the earlier frame that this one closes a loop with, or None
-    verdict     why: "accepted", "no candidate", "too early" (to choose a threshold), "below threshold",
-                "not consistent", "not verified"
-    score       of the accepted frame, or of the best candidate; -inf without one
-    inliers     inliers of the accepted candidate, or the most of any candidate tried; None if none was tried
-    stamp       seconds, as given
-    """
-
-    query_id: int
-    candidates: list[tuple[int, float]]
-    accepted: int | None
-    verdict: str
-    score: float
-    inliers: int | None = None
-    stamp: float | None = None
-
-    def __bool__(self) -> bool:
-        return self.accepted is not None
-
-
-@dataclass(frozen=True)
-class DetectorSettings:
-    """How loops are decided.
-
-    metric              "euclidean" (score = minus the distance) or "cosine"
-    views               how many views of an image a descriptor consists of, one after the other; the score of two
-                        frames is that of their two most similar views
-    exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i
-    exclude_seconds     frames less than this many seconds old are not candidates either
-    top_k               how many candidates are examined
-    threshold           a candidate needs score >= threshold. None: with a geometric check, that decides alone; without
-                        one a candidate must be as similar as consecutive frames so far are (their median)
-    consistency         how many previous frames must have had a candidate that leads to this one, so that places
-                        follow each other in time
-    consistency_window  a candidate leads to one of the next frame that is at most this many frames away
-    """
-
-    metric: str = "euclidean"
-    views: int = 1
-    exclude_recent: int = 50
-    exclude_seconds: float = 0.0
-    top_k: int = 5
-    threshold: float | None = None
-    consistency: int = 0
-    consistency_window: int = 5
-
-    def __post_init__(self) -> None:
-        check_metric(self.metric)
-        for name, least in (
-            ("views", 1),
-            ("exclude_recent", 0),
-            ("exclude_seconds", 0),
-            ("top_k", 1),
-            ("consistency", 0),
-        ):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} is {getattr(self, name)}; expected {least} or more")
-        if self.threshold is not None and np.isnan(self.threshold):
-            raise InputError("threshold is nan; expected a number")
-        if self.consistency_window < 0:
-            raise InputError(f"consistency_window is {self.consistency_window}; expected 0 or more")
 
 
 class LoopDetector:
@@ -276,7 +206,7 @@ class LoopDetector:
             detector._sessions = _starts(about.get("sessions", [0]), len(detector))
             detector._steps = detector._all_steps()
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
-            detector.loops = [_loop(found, len(detector)) for found in about["loops"]]
+            detector.loops = [result_of(found, len(detector)) for found in about["loops"]]
         except SpecError as fault:
             raise fault if fault.where else InputError(fault.message, path) from None
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
@@ -441,15 +371,3 @@ def _starts(found: Any, count: int) -> list[int]:
     if starts[:1] != [0] or sorted(starts) != starts or starts[-1] > count:
         raise ValueError(f"sessions that begin at {starts} of {count} frames")
     return starts
-
-
-def _loop(found: Any, count: int) -> LoopResult:
-    """Return a saved loop of a detector of ``count`` frames. Raises ValueError, LookupError or TypeError."""
-    candidates = [(int(number), float(score)) for number, score in found["candidates"]]
-    loop = LoopResult(**{**found, "candidates": candidates})
-    ends = (loop.query_id, loop.accepted)
-    if not all(isinstance(end, int) and 0 <= end < count for end in ends) or not isinstance(loop.score, float):
-        raise ValueError(f"a loop of frames {ends} among {count}")
-    if not isinstance(loop.inliers, int | None) or not isinstance(loop.stamp, float | int | None):
-        raise ValueError(f"a loop with {loop.inliers!r:.20} inliers at {loop.stamp!r:.20} s")
-    return loop

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loopclosure.detector.detector import LoopResult
+from loopclosure.detector.decision import LoopResult
 from loopclosure.errors import InputError
 from netspec.files.whole_file import whole_file
 

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from loopclosure.descriptors.whitening import Whitening, learn_whitening
-from loopclosure.detector.detector import Describe, LoopDetector, LoopResult
+from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.frames import Points, points_of
 from loopclosure.detector.run import NAME, Recording, run_detector, views_of

@@ -16,7 +16,8 @@ import numpy as np
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.whitening import Whitening
-from loopclosure.detector.detector import Describe, LoopDetector, LoopResult
+from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import RelativePose, relative_pose
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loopclosure.detector.detector import LoopDetector, LoopResult, Runs
+from loopclosure.detector.decision import LoopResult, Runs
+from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 

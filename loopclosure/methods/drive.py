@@ -6,7 +6,8 @@ import numpy as np
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.similarity import similarity_matrix
-from loopclosure.detector.detector import LoopDetector, LoopResult
+from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import Recording, run_detector
 from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
 from loopclosure.methods.auto import PRECISION, Answer, answer

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.descriptors.feature_file import read_features
-from loopclosure.detector.detector import DetectorSettings, LoopDetector
+from loopclosure.detector.decision import DetectorSettings
+from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import Recording, run_detector, verdicts_said
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from loopclosure.closing.close import Closed
-from loopclosure.detector.detector import LoopResult
+from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.run import Recording
 from loopclosure.errors import InputError
 from loopclosure.progress import Progress, silent

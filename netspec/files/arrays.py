@@ -16,9 +16,11 @@ import sys
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import IO, Any, TypeVar, cast
+from typing import IO, Any, BinaryIO, TypeVar, cast
 
 import numpy as np
 
@@ -34,44 +36,42 @@ _ALWAYS = 1 << 28  # bytes that any file may ask for
 _MOST_PACKED = 100  # times a file's size: real data is packed 2 to 20 times, a file made to fill the memory 1000 times
 
 
+@contextmanager
+def _opened(path: Path, expected: str) -> Iterator[BinaryIO]:
+    """Yield a file. Raises InputError, which says what was expected, for what cannot be read within the block."""
+    try:
+        with path.open("rb") as stream:
+            yield stream
+    except _FAULTS as error:
+        raise _fault(error, path, expected) from None
+
+
 def read_npz(path: str | Path, expected: str) -> dict[str, np.ndarray]:
     """Return the arrays of an .npz file, by name.
 
     Raises InputError, which says what was expected, for any other file.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            if stream.seekable():
-                return unpack(stream, path.stat().st_size)
-            data = stream.read()  # a pipe
-            return unpack(io.BytesIO(data), len(data))
-    except _FAULTS as error:
-        raise _fault(error, path, expected) from None
+    with _opened(Path(path), expected) as stream:
+        if stream.seekable():
+            return unpack(stream, os.fstat(stream.fileno()).st_size)
+        data = stream.read()  # a pipe
+        return unpack(io.BytesIO(data), len(data))
 
 
 def read_npy(path: str | Path, expected: str) -> np.ndarray:
     """Return the array of an .npy file. Raises InputError, which says what was expected, for any other file."""
-    path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            return _read(stream, os.fstat(stream.fileno()).st_size)
-    except _FAULTS as error:
-        raise _fault(error, path, expected) from None
+    with _opened(Path(path), expected) as stream:
+        return _read(stream, os.fstat(stream.fileno()).st_size)
 
 
 def map_npy(path: str | Path, expected: str) -> np.ndarray:
     """Return the array of an .npy file as :func:`read_npy`, but each part read from disk only when it is used."""
-    path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            shape, by_columns, dtype = _header(stream, os.fstat(stream.fileno()).st_size)
-            if not math.prod(shape):
-                return np.zeros(shape, dtype)
-            order = "F" if by_columns else "C"
-            return np.asarray(np.memmap(stream, dtype, "r", stream.tell(), shape, order))
-    except _FAULTS as error:
-        raise _fault(error, path, expected) from None
+    with _opened(Path(path), expected) as stream:
+        shape, by_columns, dtype = _header(stream, os.fstat(stream.fileno()).st_size)
+        if not math.prod(shape):
+            return np.zeros(shape, dtype)
+        order = "F" if by_columns else "C"
+        return np.asarray(np.memmap(stream, dtype, "r", stream.tell(), shape, order))
 
 
 def read_lists(path: str | Path) -> list[Any] | None:
@@ -80,21 +80,16 @@ def read_lists(path: str | Path) -> list[Any] | None:
     Such a file is a pickle, which could run anything: here it may hold integers, lists, tuples and arrays of them, and
     nothing else. Raises InputError for other files.
     """
-    path = Path(path)
-    expected = "an array of numbers, or of lists of integers"
-    try:
-        with path.open("rb") as stream:
-            version = np.lib.format.read_magic(stream)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(stream)
-            if not dtype.hasobject:
-                return None
-            found = _Lists(stream).load()
-            if not isinstance(found, _Array) or found.values.shape != shape:
-                raise ValueError("another array than its header says")
-            return _plain(found)
-    except _FAULTS as error:
-        raise _fault(error, path, expected) from None
+    with _opened(Path(path), "an array of numbers, or of lists of integers") as stream:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+        if not dtype.hasobject:
+            return None
+        found = _Lists(stream).load()
+        if not isinstance(found, _Array) or found.values.shape != shape:
+            raise ValueError("another array than its header says")
+        return _plain(found)
 
 
 class _Lists(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIssue]
