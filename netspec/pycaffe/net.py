@@ -18,7 +18,6 @@ from netspec.errors import did_you_mean
 from netspec.graph.filter import with_state
 from netspec.layers.utility import pycaffe_shim
 from netspec.layers.utility.live_blobs import Blob, BlobVec
-from netspec.layers.utility.python import Python
 from netspec.net import net as core
 from netspec.net.build import build_net
 from netspec.net.weights import load_weights, write_binary, write_hdf5
@@ -35,7 +34,7 @@ Arrays = dict[str, np.ndarray]
 
 
 class Layer(pycaffe_shim.Layer):
-    """A layer that netspec has: its type and its learnable blobs. (Those written in Python are themselves.)"""
+    """A layer that netspec has: its type and its learnable blobs. (Those written in Python are their ``code``.)"""
 
     def __init__(self, type_name: str, blobs: BlobVec) -> None:
         self.type = type_name
@@ -91,7 +90,7 @@ class Net:
         self._blobs = list(passes.blobs)
         self._blobs_dict: Named[Blob] = Named("blob", zip(passes.names, passes.blobs, strict=True))
         self.layers: list[Any] = [
-            layer.code if isinstance(layer, Python) else Layer(layer.type, blobs)
+            getattr(layer, "code", None) or Layer(layer.type, blobs)
             for layer, blobs in zip(net.layers, passes.params, strict=True)
         ]
         self._layer_dict: Named[Any] = Named("layer", zip(names, self.layers, strict=True))

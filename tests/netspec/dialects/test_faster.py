@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import netspec
+import netspec.pycaffe as caffe
 from netspec.dialects import _faster
 from netspec.dialects._faster import settings
 from netspec.dialects._proposals import all_anchors, base_anchors
@@ -154,6 +155,17 @@ def test_code_that_may_run_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         netspec.load_net("net.prototxt")
     with pytest.raises(SpecError, match="this is mine"):
         netspec.load_net("net.prototxt", allow_python=True)
+
+
+def test_a_program_gives_the_images_as_it_did(tmp_path: Path) -> None:
+    text = PYTHON.format("roi_data_layer.layer", "RoIDataLayer", "'num_classes': 4")
+    (tmp_path / "net.prototxt").write_text(f'layer {{ name: "d" top: "data" top: "im_info" top: "gt_boxes" {text} }}')
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((60, 80, 3)))
+    net = caffe.Net(str(tmp_path / "net.prototxt"), caffe.TRAIN)
+    net.layers[0].set_roidb([{"image": tmp_path / "0.png", "boxes": [[1, 2, 30, 40]], "gt_classes": [2]}])
+    net.forward()
+    assert net.blobs["data"].data.shape == (1, 3, 600, 800)
+    assert net.blobs["gt_boxes"].data.tolist() == [[10, 20, 300, 400, 2]]
 
 
 @pytest.mark.slow
