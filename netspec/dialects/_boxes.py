@@ -44,12 +44,17 @@ def check_predictions(layer: Layer, bottom_shapes: Sequence[Shape], kinds: int, 
     return priors
 
 
+# Nets that were not trained predict boxes without bounds: areas are infinite, overlaps not a number, as in C++.
+
+
+@np.errstate(over="ignore", invalid="ignore")
 def sizes(boxes: Array) -> Array:
     """Return the areas of boxes (..., 4): (...); 0 where a box is turned inside out."""
     width, height = boxes[..., 2] - boxes[..., 0], boxes[..., 3] - boxes[..., 1]
     return np.where((width < 0) | (height < 0), np.float32(0), width * height)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def shared(first: Array, second: Array) -> Array:
     """Return the areas that each pair of boxes (..., 4), broadcast against each other, has in common."""
     low = np.maximum(first[..., :2], second[..., :2])
@@ -58,7 +63,7 @@ def shared(first: Array, second: Array) -> Array:
     return np.where((width > 0) & (height > 0), width * height, np.float32(0))
 
 
-@np.errstate(invalid="ignore")  # boxes without bounds, as nets that were not trained give them: not a number
+@np.errstate(invalid="ignore")
 def overlaps(first: Array, second: Array) -> Array:
     """Return intersection over union of each pair of boxes (..., 4), broadcast against each other."""
     common = shared(first, second)
@@ -86,6 +91,7 @@ def encode(boxes: Array, priors: Array, variances: Array | None, code: int) -> A
     return codes if variances is None else codes / variances
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def decode(codes: Array, priors: Array, variances: Array | None, code: int) -> Array:
     """Return the boxes (n, 4) of which :func:`encode` makes ``codes``."""
     (low, high), (extent, center) = _corners(priors), _centers(priors)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from netspec.dialects import use_dialect
-from netspec.dialects._boxes import suppress
+from netspec.dialects._boxes import CENTER_SIZE, decode, suppress
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
@@ -433,7 +433,10 @@ def test_what_the_solver_of_ssd_has_more_is_named(tmp_path: Path, caplog: pytest
 
 
 @pytest.mark.filterwarnings("error")
-def test_boxes_without_bounds_suppress_none() -> None:
+@pytest.mark.parametrize("bound", [math.inf, 3e38, 3e19])
+def test_boxes_without_bounds_suppress_none(bound: float) -> None:
     """What a net that was not trained predicts: exp of anything."""
-    without, plain = [-math.inf, -math.inf, math.inf, math.inf], [0.1, 0.1, 0.4, 0.4]
+    without, plain = [-bound, -bound, bound, bound], [0.1, 0.1, 0.4, 0.4]
     assert suppress(np.array([without, plain, without, plain], np.float32), 0.45) == [0, 1, 2]
+    codes = np.array([[bound, -bound, bound, bound]], np.float32)
+    assert not np.isfinite(decode(codes, np.array([plain], np.float32), None, CENTER_SIZE)).all()
