@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -30,10 +31,10 @@ SCRIPTS = Path(sys.executable).parent
 
 
 def modules(package: str) -> list[str]:
-    """Return a package's modules, but for its __main__, which would run."""
+    """Return a package's modules, but for its __main__, which would run, and dialects, of which two share names."""
     found = importlib.import_module(package)
     walked = pkgutil.walk_packages(found.__path__[:1], f"{package}.")
-    return [module.name for module in walked if not module.name.endswith("__main__")]
+    return [module.name for module in walked if not re.search(r"__main__$|\.dialects\.", module.name)]
 
 
 def run(*words: str) -> str:
@@ -71,6 +72,11 @@ def main(golden: Path) -> None:
     run("netspec", "bug-report", "sgd_step/solver.prototxt", "--out", "report.md")
     run("lmdb-build", "walk", "walk", "--frames", "12", "--size", "48x36")
     run("loopclosure", "evaluate", "--help")
+    import netspec.dialects
+
+    for dialect in pkgutil.iter_modules(netspec.dialects.__path__):
+        if not dialect.name.startswith("_"):
+            run("netspec", "layers", "--plugin", dialect.name)
     without = f", without {', '.join(sorted(map(str, missing)))}" if missing else ""
     print(f"Python {platform.python_version()}: {count} modules, and the commands of a training{without}")
 
