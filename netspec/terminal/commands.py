@@ -248,14 +248,14 @@ class _Version(argparse.Action):
 
 
 class _Switch(argparse.Action):
-    """A Boolean flag: ``--flag`` and ``--noflag``."""
+    """A Boolean flag: ``--flag`` and ``--noflag``; ``--no-flag`` and ``--flag``."""
 
     def __init__(
         self, option_strings: Sequence[str], dest: str, default: bool = False, help: str | None = None
     ) -> None:
         (self.on,) = option_strings
         self.name = self.on[2:]
-        self.off = f"--no{self.name}"
+        self.off = f"--{self.name[3:]}" if self.name.startswith("no-") else f"--no{self.name}"
         super().__init__([self.on, self.off], dest, nargs=0, default=default, help=help)
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
