@@ -62,19 +62,16 @@ class Weights(NamedTuple):
     bias_sums: torch.Tensor | None
 
 
-def copied(values: Sequence[torch.Tensor]) -> Weights:
-    """Return copies of the weights and, where there is a second tensor, the biases of a layer that does not learn."""
-    weight, *biases = values
-    return Weights(
-        weight.clone(memory_format=torch.contiguous_format), biases[0].clone() if biases else None, None, None
-    )
+def at_rest(weight: torch.Tensor, bias: torch.Tensor | None = None) -> Weights:
+    """Return the weights and biases of a layer that does not learn."""
+    return Weights(weight, bias, None, None)
 
 
 class BoundVectors:
     """:class:`netspec.exact.products.VectorProducts` of vectors of one shape, and of one matrix.
 
     ``shape`` is the bottom's, any that has rows of K numbers; the top is ``top_shape``. ``wanted`` says whether the
-    bottom's gradient is computed.
+    bottom's gradient is computed. ``nbytes`` of memory are kept between forward passes.
     """
 
     def __init__(
@@ -90,6 +87,7 @@ class BoundVectors:
         rows = math.prod(shape) // inputs
         self._matrix, self._transposed = weight.numpy().T, transposed
         self._top = torch.empty(top_shape, dtype=weight.dtype)
+        self.nbytes = self._top.nbytes
         self._rows = self._top.view(rows, outputs)
         self._shown = self._rows.numpy().T
         self._vectors, self._diffs = Matrix(inputs), Matrix(outputs)
@@ -125,7 +123,7 @@ class BoundColumns:
     """:class:`netspec.exact.products.ColumnProducts` of maps (N, C, H, W) of one shape.
 
     The columns of a batch that fits into :data:`netspec.exact.products.COLUMNS` are kept for the backward pass, if maps
-    are ``steady``: if they do not change before it.
+    are ``steady``: if they do not change before it. About ``nbytes`` of memory are kept between forward passes.
     """
 
     def __init__(
@@ -146,6 +144,8 @@ class BoundColumns:
         self._bias = None if bias is None else bias.view(-1, 1, 1)
         self._at_once = min(count, sliding.images_at_once(channels, self._size))
         positions = math.prod(fits)
+        columns = self._at_once * channels * math.prod(sliding.kernel) * positions
+        self.nbytes = self._top.nbytes + columns * weight.itemsize
         self._tops = [_by_group(image.numpy(), group) for image in self._top.flatten(2)]
         whole, rest = divmod(count, self._at_once)
         of = partial(_columns, dtype=weight.dtype, sliding=sliding, fits=fits, group=group)

@@ -10,13 +10,13 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.bound import BoundVectors, Weights, copied
+from netspec.exact.bound import BoundVectors, Weights, at_rest
 from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts
 from netspec.layers import fused
 from netspec.layers.base import Layer, Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.folding import Absorbed, blob_like, copy_of
-from netspec.layers.preparing import Kernel, Preparation, finished, lent
+from netspec.layers.preparing import Kernel, Preparation, copies, finished, lent
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.training import Kernels, Learning, Room, weight_and_bias
@@ -83,7 +83,8 @@ class InnerProduct(Layer):
         rows = math.prod(top_shape[:-1])
         one_by_one = (rows, self.inputs)
         if self.is_exact(weight, self.small) and math.prod(self.bottom_shapes[0]):
-            return lent(BoundVectors(self.bottom_shapes[0], top_shape, transposed, copied(self.values())).forward, how)
+            learned = at_rest(*copies(self.values(), how))
+            return lent(BoundVectors(self.bottom_shapes[0], top_shape, transposed, learned), how)
         weight = weight.t() if transposed else weight
         # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
         if rows > 1 and how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:

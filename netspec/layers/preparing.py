@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -32,7 +33,8 @@ class Preparation:
 
     ``finish`` is to be done in place to its top; its first bottom may be overwritten where ``reuse``. What it makes of
     its blobs for all shapes it gets by ``memo(name, make)``, which makes it once; weights may be laid out for a kernel
-    where ``pack``. Its top may be memory that its next pass overwrites, unless it ``lasts``.
+    where ``pack``. Its top may be memory that its next pass overwrites, unless it ``lasts``. ``keeps`` is told
+    the bytes of what it keeps for its present shapes.
     """
 
     finish: Finish | None = None
@@ -40,6 +42,7 @@ class Preparation:
     lasts: bool = True
     memo: Callable[[str, Callable[[], Any]], Any] = lambda _, make: make()
     pack: bool = True
+    keeps: Callable[[int], None] = lambda _: None
 
 
 class Prepares(Protocol):
@@ -103,7 +106,24 @@ def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
     return both
 
 
-def lent(kernel: Kernel, how: Preparation) -> Kernel:
-    """Return the whole kernel of a layer of one top, which ``kernel`` computes into memory that its next pass uses."""
-    kernel = finished(kernel, how.finish)
+class Bound(Protocol):
+    """A product with copies of a layer's blobs, in memory of its own: see netspec/exact/bound.py."""
+
+    nbytes: int
+
+    def forward(self, bottom: torch.Tensor, /) -> torch.Tensor:
+        """Return the top, good until the next call."""
+        ...
+
+
+def copies(blobs: Sequence[torch.Tensor], how: Preparation) -> list[torch.Tensor]:
+    """Return copies of a layer's blobs, the same ones for all shapes."""
+    copy = partial(torch.clone, memory_format=torch.contiguous_format)
+    return [how.memo(f"copy {i}", partial(copy, blob)) for i, blob in enumerate(blobs)]
+
+
+def lent(bound: Bound, how: Preparation) -> Kernel:
+    """Return the whole kernel of a layer of one top, whose memory its next pass uses again."""
+    how.keeps(bound.nbytes)
+    kernel = finished(bound.forward, how.finish)
     return (lambda *bottoms: kernel(*bottoms).clone()) if how.lasts else kernel

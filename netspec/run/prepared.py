@@ -51,7 +51,8 @@ class Program:
     frozen: list[tuple[dict[str, Any], str, torch.Tensor, Stamp]]
     waiting: list[tuple[torch.Tensor, Stamp]]
     memos: set[Any]  # the keys of what it keeps in memory beside the blobs
-    need: int  # bytes of the values that are alive at one time, at most
+    kept: int  # bytes that kernels keep for these shapes
+    need: int  # bytes of the values that are alive at one time, at most, and of what kernels keep
 
     def is_current(self) -> bool:
         """Return whether no blob was written to or replaced since, and every blob that was changing still is."""
@@ -133,7 +134,8 @@ class Prepared:
         """Return the bytes that programs keep beside the learned blobs."""
         values = [value for _, value in self.memos.values()]
         tensors = [blob for value in values for blob in (value.blobs if isinstance(value, Absorbed) else (value,))]
-        return sum({id(tensor): tensor.nbytes for tensor in tensors}.values())
+        own = sum(program.kept for program in self.made.values())
+        return own + sum({id(tensor): tensor.nbytes for tensor in tensors}.values())
 
     def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
         plan = self._plan
@@ -159,9 +161,9 @@ class Prepared:
             kept=kept | {v for node, losses in zip(plan.nodes, self._losses, strict=True) if losses for v in node.tops},
             passes=self.passes,
         )
-        line, kinds, memos = [], [], set[Any]()
+        line, kinds, memos, own = [], [], set[Any](), list[int]()
         for step in order.steps:
-            kernel, kind = self._kernel(step, layers, found[step.node] is None, as_is[step.node], memos)
+            kernel, kind = self._kernel(step, layers, found[step.node] is None, as_is[step.node], memos, own.append)
             kinds.append("exact" if exact[step.node] else kind)
             line.append(Step(step.node, kernel, step.bottoms, step.tops, self._losses[step.node], step.ends))
         owners: list[dict[str, Any]] = [layer.blobs._parameters for layer in self._layers]
@@ -174,15 +176,22 @@ class Prepared:
             [(owner, name, blob, stamp(blob)) for owner, name, blob in blobs if id(blob) not in changing],
             [(blob, stamp(blob)) for _, _, blob in blobs if id(blob) in changing],
             memos,
-            _most_alive(order.steps, shapes),
+            sum(own),
+            sum(own) + _most_alive(order.steps, shapes),
         )
 
     def _kernel(
-        self, step: planned.Step, layers: Sequence[Layer], unknown: bool, as_is: bool, memos: set[Any]
+        self,
+        step: planned.Step,
+        layers: Sequence[Layer],
+        unknown: bool,
+        as_is: bool,
+        memos: set[Any],
+        keeps: Callable[[int], None],
     ) -> tuple[Kernel, str]:
         """Return what runs a step, and in which way: "by value", "as is", "packed" or "prepared".
 
-        The keys of the memos that it uses are added to ``memos``.
+        The keys of the memos that it uses are added to ``memos``; ``keeps`` is told the bytes of the rest.
         """
         layer = layers[step.node]
         promised = layers[step.chain.last if step.chain else step.node]
@@ -206,7 +215,7 @@ class Prepared:
             chain = step.chain
             layer = absorbing(layer, memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
         finish = None if step.finish is None else finishing(layers[step.finish])
-        how = Preparation(finish, step.reuse, step.lasts, memo, PACK in self.passes)
+        how = Preparation(finish, step.reuse, step.lasts, memo, PACK in self.passes, keeps)
         own = None if as_is else own_kernel(layer, how)
         kernel = finished(layer.forward, finish) if own is None else own
         if not offered(layer, "any_layout") or self._exact == ALL:

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.bound import BoundColumns, Weights, copied
+from netspec.exact.bound import BoundColumns, Weights, at_rest
 from netspec.exact.products import (
     ColumnProducts,
     Filter,
@@ -25,7 +25,7 @@ from netspec.layers import fused
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.folding import Absorbed, blob_like, copy_of
-from netspec.layers.preparing import Kernel, Preparation, finished, lent
+from netspec.layers.preparing import Kernel, Preparation, copies, finished, lent
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.training import Kernels, Learning, weight_and_bias
@@ -159,7 +159,7 @@ class Convolution(SlidingFilter):
             return None
         shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
         if self.is_exact(weight, self.small):
-            return lent(BoundColumns(shape, sliding, self.group, copied(self.values())).forward, how)
+            return lent(BoundColumns(shape, sliding, self.group, at_rest(*copies(self.values(), how))), how)
         if shape[0] * self._work > SMALL_PRODUCT and how.pack and fused.suits(weight):
             return fused.convolution(shape, weight, bias, sliding, self.group, how)
         geometry = (self.stride, self.pad, self.dilation, self.group)

@@ -258,6 +258,18 @@ def test_what_programs_keep_is_bounded_by_what_runs_need(
     assert_same(quickly(net, data=images(1, 8, 8, 9)), slowly(net, data=images(1, 8, 8, 9)))
 
 
+def test_exact_programs_share_copies_of_blobs_and_count_what_they_keep(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK, exact="all"))
+    assert net.prepared is not None
+    for size in range(8, 40):
+        quickly(net, data=images(1, 8, size, size))
+    made = net.prepared.made.values()
+    assert net.prepared.memos.keys() == next(iter(made)).memos
+    assert min(program.kept for program in made) > 0
+    learned = sum(item.parameter.nbytes for item in net.learnable)
+    assert net.prepared.kept_bytes() <= programs.RUNS * (learned + max(program.need for program in made))
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_runs_of_many_sizes_take_little_more_memory_than_one(tmp_path: Path) -> None:
