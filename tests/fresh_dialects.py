@@ -24,6 +24,7 @@ def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(dialect, "_known", dict(dialect._known))
     keep_registry(monkeypatch)
     yield
+    files.waiting.clear()  # switched on, never run
     for name in dialect.active():
         dialect.deactivate(name)
     own = [file.module for file in files.known_files().values()]

@@ -17,7 +17,7 @@ from netspec.data.database import Reader
 from netspec.data.datum import datum_to_array, times
 from netspec.data.random_words import derived
 from netspec.data.sources import Arrays, Cursor, Source
-from netspec.dialects._augment import COLUMNS, FIT_SMALL_SIZE, Augmenter, wrong_settings
+from netspec.dialects._augment import COLUMNS, FIT_SMALL_SIZE, Augmenter, fixed_size, wrong_settings
 from netspec.errors import SpecError, Where
 from netspec.layers.base import Shape
 from netspec.layers.data.files import Data, ReadingLayer
@@ -214,15 +214,9 @@ class AnnotatedData(Data):
     def known_shape(self) -> Shape | None:
         """Return the shape where the prototxt says size and channels."""
         p = self.param.transform_param
-        resizes, crop = value(p, "resize_param"), (value(p, "crop_h"), value(p, "crop_w"))
+        size = fixed_size(p)
         channels = 3 if p.force_color else 1 if p.force_gray else len(p.mean_value)
-        if p.crop_size or all(crop):
-            size = (p.crop_size,) * 2 if p.crop_size else crop
-        elif resizes and resizes[0].resize_mode != FIT_SMALL_SIZE:
-            size = (resizes[0].height, resizes[0].width)
-        else:
-            return None
-        return (self.batch_size, channels, *size) if channels > 1 or p.force_gray else None
+        return (self.batch_size, channels, *size) if size and (channels > 1 or p.force_gray) else None
 
     @override
     def shapes_without_data(self) -> list[Shape]:

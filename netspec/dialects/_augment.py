@@ -76,6 +76,16 @@ def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Wh
             yield fault(f"found aspect ratios {ratios}, expected 0 < min <= max", *place)
 
 
+def fixed_size(transform: Any) -> tuple[int, int] | None:
+    """Return height and width of all images, where a transform_param alone says them."""
+    resizes, crop = value(transform, "resize_param"), (value(transform, "crop_h"), value(transform, "crop_w"))
+    if transform.crop_size or all(crop):
+        return (transform.crop_size,) * 2 if transform.crop_size else crop
+    if resizes and resizes[0].resize_mode != FIT_SMALL_SIZE:
+        return resizes[0].height, resizes[0].width
+    return None
+
+
 class Augmenter:
     """Applies a ``transform_param`` with SSD's fields, after the batch samplers. ``at(*path)`` is a field's place.
 
@@ -118,7 +128,7 @@ class Augmenter:
         windows = [self._jittered(draw)] if self._jitter else list(self._windows(boxes[:, CORNERS], draw))
         if windows:
             image, boxes = self._cut(image, boxes, draw.choice(windows))
-        return self._transformed(image, boxes, draw)
+        return self.transformed(image, boxes, draw)
 
     def size(self, image: Shape) -> tuple[int, int]:
         """Return height and width that an image of a shape (H, W, ...) gets, before and without the samplers."""
@@ -201,7 +211,8 @@ class Augmenter:
 
     # Size, window, mirror, mean, scale
 
-    def _transformed(self, image: Array, boxes: Array, draw: Random) -> tuple[Array, Array]:
+    def transformed(self, image: Array, boxes: Array, draw: Random) -> tuple[Array, Array]:
+        """Do only the second half: size, window, mirror, mean and scale."""
         mirror = self._mirror and draw.randrange(2) == 1
         old = image.shape[:2]
         if self.resize is not None:

@@ -45,6 +45,7 @@ class ReadingLayer(Layer):
     tops = (2, 2)
     reads_data = True
     ahead: int = 0
+    in_order = False  # whether batches can be made only one after the other
     group: ClassVar[str]  # the field with the layer's own settings
 
     def __getstate__(self) -> dict[str, Any]:
@@ -103,7 +104,8 @@ class ReadingLayer(Layer):
         make = partial(_make, self.source, self.num_tops, self.context.device.type == "cuda")
         self.ahead = self._batches_ahead()
         ahead: int = self.param.data_param.prefetch
-        self._feed = Feed(make, ahead, workers=max(1, min(ahead, os.cpu_count() or 1)))
+        workers = 1 if self.in_order else max(1, min(ahead, os.cpu_count() or 1))
+        self._feed = Feed(make, ahead, workers)
 
     def _batches_ahead(self) -> int:
         """Return the bytes of the batches read ahead, float32."""
