@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import torch
 import torch.nn.functional as F
 
+from netspec.exact.bound import BoundColumns, BoundVectors
 from netspec.layers.base import Layer
 from netspec.layers.offers import call
 
@@ -106,23 +107,13 @@ def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
     return both
 
 
-class Bound(Protocol):
-    """A product with copies of a layer's blobs, in memory of its own: see netspec/exact/bound.py."""
-
-    nbytes: int
-
-    def forward(self, bottom: torch.Tensor, /) -> torch.Tensor:
-        """Return the top, good until the next call."""
-        ...
-
-
 def copies(blobs: Sequence[torch.Tensor], how: Preparation) -> list[torch.Tensor]:
     """Return copies of a layer's blobs, the same ones for all shapes."""
     copy = partial(torch.clone, memory_format=torch.contiguous_format)
     return [how.memo(f"copy {i}", partial(copy, blob)) for i, blob in enumerate(blobs)]
 
 
-def lent(bound: Bound, how: Preparation) -> Kernel:
+def lent(bound: BoundVectors | BoundColumns, how: Preparation) -> Kernel:
     """Return the whole kernel of a layer of one top, whose memory its next pass uses again."""
     how.keeps(bound.nbytes)
     kernel = finished(bound.forward, how.finish)
