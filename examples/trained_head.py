@@ -48,7 +48,7 @@ for views in lists:
 maps = np.concatenate([np.load(views.with_suffix(".npy")).reshape(-1, 112, 9, 12) for views in lists])
 for layer, of in (("positions", "block10"), ("white_means", "means"), ("white_parts", "parts")):
     x = maps[:6000] if of == "block10" else head.forward_all([of], block10=maps.astype(np.float32))[of]
-    x = np.float32(np.moveaxis(x, 1, -1) if of == "block10" else x.reshape(len(x), 1, -1))
+    x = np.asarray(np.moveaxis(x, 1, -1) if of == "block10" else x.reshape(len(x), 1, -1), np.float32)
     apart = (x[::2] - x[1::2]).reshape(-1, x.shape[-1])
     within = apart.T @ apart / len(apart) / 2
     values, directions = np.linalg.eigh(within + SHRINK * np.trace(within) / len(within) * np.eye(len(within)))
