@@ -43,7 +43,7 @@ head = caffe.Net(str(folder / "head.prototxt"), caffe.TEST)
 for views in lists:
     if not views.with_suffix(".npy").exists():
         files = [views.parent / name for row in views.open() if row[0] != "#" for name in row.split()[:2]]
-        images = np.stack([cv2.imread(str(file)).transpose(2, 0, 1) for file in files]).astype(np.float32)
+        images = np.stack([np.asarray(cv2.imread(str(file)), np.float32) for file in files]).transpose(0, 3, 1, 2)
         np.save(views.with_suffix(".npy"), whole.forward_all(["block10"], data=images)["block10"].astype(np.float16))
 maps = np.concatenate([np.load(views.with_suffix(".npy")).reshape(-1, 112, 9, 12) for views in lists])
 for layer, of in (("positions", "block10"), ("white_means", "means"), ("white_parts", "parts")):
