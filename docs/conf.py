@@ -44,7 +44,7 @@ myst_enable_extensions = ["colon_fence"]
 suppress_warnings = ["myst.header", "misc.highlighting_failure"]  # READMEs begin where they like; logs are no language
 
 # The README of each folder is a page too, and so are these files.
-ROOMS = {f"{name}/README.md": f"rooms/{name}.md" for name in ("netspec", "loopclosure", "prototxt", "benchmarks")} | {
+ROOMS = {f"{name}/README.md": f"rooms/{name}.md" for name in ("loopclosure", "prototxt", "benchmarks")} | {
     f"{name.upper()}.md": f"rooms/{name}.md" for name in ("changelog", "contributing", "architecture", "security")
 }
 LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]*)(#[^)]*)?\)")

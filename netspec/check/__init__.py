@@ -1,1 +1,1 @@
-"""Checks and measurements of a net or a solver: shapes, costs, errors, likely mistakes."""
+"""Checks, comparisons and measurements of nets and solvers: shapes, costs, errors, likely mistakes, differences."""

@@ -74,8 +74,8 @@ def _tell(arguments: argparse.Namespace, found: Survey) -> int:
 
 def _show(arguments: argparse.Namespace, records: Records, found: Survey) -> None:
     from netspec.data.records import spread
-    from netspec.pictures.sheet import sheet
-    from netspec.pictures.style import ending_of, write_figure
+    from netspec.draw.sheet import sheet
+    from netspec.draw.style import ending_of, write_figure
 
     ending_of(arguments.out, ("png", "svg"))
     if arguments.start is None:

@@ -31,7 +31,7 @@ def _tolerance(text: str) -> float:
 
 
 def _diff(arguments: argparse.Namespace) -> int:
-    from netspec.compare.files import compare_files
+    from netspec.check.compare import compare_files
 
     status = DONE
     for each in compare_files(arguments.first, arguments.second, arguments.tolerance):

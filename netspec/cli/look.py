@@ -67,8 +67,8 @@ def _add_net(parser: argparse.ArgumentParser) -> None:
 
 def _filters(arguments: argparse.Namespace) -> None:
     from netspec.data.stored_weights import stored_layers
-    from netspec.pictures.nets import filters_figure
-    from netspec.pictures.style import ending_of, write_figure
+    from netspec.draw.learned import filters_figure
+    from netspec.draw.style import ending_of, write_figure
 
     ending_of(arguments.out, PICTURES)
     layers = [layer for layer in stored_layers(arguments.weights) if layer.has_filters]
@@ -88,8 +88,8 @@ def _filters(arguments: argparse.Namespace) -> None:
 
 
 def _maps(arguments: argparse.Namespace) -> None:
-    from netspec.pictures.nets import maps_figure
-    from netspec.pictures.style import ending_of, write_figure
+    from netspec.draw.learned import maps_figure
+    from netspec.draw.style import ending_of, write_figure
 
     ending_of(arguments.out, PICTURES)
     net = _net(arguments)
@@ -100,9 +100,9 @@ def _maps(arguments: argparse.Namespace) -> None:
 
 
 def _saliency(arguments: argparse.Namespace) -> None:
+    from netspec.draw.learned import saliency_figure
+    from netspec.draw.style import ending_of, write_figure
     from netspec.features.saliency import of_distance, of_unit
-    from netspec.pictures.nets import saliency_figure
-    from netspec.pictures.style import ending_of, write_figure
     from netspec.terminal.log import number
 
     if arguments.to:
@@ -122,10 +122,10 @@ def _saliency(arguments: argparse.Namespace) -> None:
 
 
 def _embedding(arguments: argparse.Namespace) -> None:
+    from netspec.draw.learned import embedding_figure
+    from netspec.draw.style import ending_of, write_figure
     from netspec.features.embedding import in_plane, read_features
     from netspec.features.thumbnails import thumbnails
-    from netspec.pictures.nets import embedding_figure
-    from netspec.pictures.style import ending_of, write_figure
 
     ending_of(arguments.out, PICTURES)
     features = read_features(arguments.features, arguments.array)

@@ -22,9 +22,9 @@ def add_to(commands: Commands) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> None:
-    from netspec.pictures.page import training_page
-    from netspec.pictures.style import ending_of, write_bytes, write_figure
-    from netspec.pictures.training import Look, training_figure
+    from netspec.draw.style import ending_of, write_bytes, write_figure
+    from netspec.draw.training import Look, training_figure
+    from netspec.draw.training_page import training_page
     from netspec.runs.run import read_log
     from netspec.runs.summary import summary
 

@@ -299,7 +299,7 @@ def test_what_no_dialect_has_is_left_to_the_reader(files_afresh: None) -> None:
     assert use_dialects_of('layer { type: "NoSuchType" no_such_param { } }', "x.prototxt") == []
 
 
-def test_the_readme_names_every_dialect() -> None:
-    table = re.findall(r"^\| `(\w+)` \|", (ROOT / "netspec" / "README.md").read_text(), re.MULTILINE)
+def test_the_page_names_every_dialect() -> None:
+    table = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "netspec.md").read_text(), re.MULTILINE)
     own = {path.stem for path in (ROOT / "netspec" / "dialects").glob("[!_]*.py")}
     assert own <= set(table)

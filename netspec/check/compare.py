@@ -1,4 +1,4 @@
-"""Two files: of which kind they are, and what differs."""
+"""What differs between two nets, two solvers or two files of weights: by meaning, not by text. No torch."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from netspec.compare.difference import Difference, Differences
-from netspec.compare.messages import differences
-from netspec.compare.nets import compare_in_state, compare_nets
+from netspec.check.compare_nets import compare_in_state, compare_nets
+from netspec.check.difference import Difference, Differences, differences
 from netspec.errors import SpecError, Where
 from netspec.proto.binary import is_hdf5, is_net_binary
 from netspec.proto.source_map import Place
@@ -28,7 +27,7 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
     if old[0] != new[0]:
         raise SpecError(f"is {new[0]}, and {first} is {old[0]}; expected two files of one kind", Where(str(second)))
     if old[0] == WEIGHTS:
-        from netspec.compare.weights import compare_weights  # NumPy is not loaded for two prototxts
+        from netspec.check.compare_weights import compare_weights  # NumPy is not loaded for two prototxts
 
         return compare_weights(first, second, tolerance)
     return compare_nets(old[1:], new[1:]) if old[0] == NET else _compare_solvers(old[1:], new[1:])

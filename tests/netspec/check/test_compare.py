@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from each import each, last_parts
+from netspec.check.compare import compare_files
 from netspec.cli import main
-from netspec.compare.files import compare_files
 from netspec.data.blobs import from_array
 from netspec.errors import SpecError
 from netspec.proto.format import format_text

@@ -1,14 +1,14 @@
-"""Two messages of one kind, field by field: an absent field counts as its default."""
+"""What differs between two messages of one kind, field by field: an absent field counts as its default."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 
-from netspec.compare.difference import Difference, Differences
-from netspec.errors import Where
+from netspec.errors import Where, printable
 from netspec.proto.schema import Field, fields_of
 from netspec.proto.source_map import Place
 
@@ -31,6 +31,29 @@ WINDOWS = {
 }
 OLD_NAMES = {"concat_dim": "axis", "slice_dim": "axis"}
 ABSENT = "absent"
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What is otherwise in the second file than in the first, as a line of text.
+
+    ``where`` is the place, ``other`` the place in the first file where there is one in both.
+    """
+
+    where: Where
+    message: str
+    other: Where | None = None
+
+    def __str__(self) -> str:
+        place = f" ({_short(self.other)})" if self.other else ""
+        return printable(f"{self.where}: {self.message}{place}")
+
+
+def _short(where: Where) -> str:
+    return f"{where.file}:{where.line}:{where.column}" if where.line else where.file
+
+
+Differences = Iterator[Difference]
 
 
 def differences(first: Any, second: Any, here: Place, there: Place, ignored: Collection[str] = ()) -> Differences:

@@ -12,12 +12,12 @@ from matplotlib.offsetbox import AnnotationBbox
 
 import netspec
 from netspec.data.stored_weights import stored_layers
+from netspec.draw.learned import embedding_figure, filters_figure, maps_figure, saliency_figure
 from netspec.features.embedding import in_plane, read_features
 from netspec.features.images import ImageNet
 from netspec.features.saliency import of_distance, of_unit
 from netspec.features.thumbnails import thumbnails
 from netspec.graph.options import BuildOptions
-from netspec.pictures.nets import embedding_figure, filters_figure, maps_figure, saliency_figure
 from paths import GOLDEN
 
 WEIGHTS = GOLDEN / "snapshot" / "ref_iter_40.caffemodel"

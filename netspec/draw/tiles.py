@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from netspec.data.datum import times
-from netspec.pictures.style import stretched
+from netspec.draw.style import stretched
 
 FRAME = 0.06  # of a tile's side, between tiles
 

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
 from netspec.data.datum import times
+from netspec.draw.style import COLORS, PALE, STYLE
+from netspec.draw.tiles import split
 from netspec.files.opencv import cv2
-from netspec.pictures.style import COLORS, PALE, STYLE
-from netspec.pictures.tiles import split
 from netspec.terminal.log import number
 
 WIDTH = 9.0  # inches

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import pytest
 
-from netspec.pictures.training import Look, training_figure
+from netspec.draw.training import Look, training_figure
 from netspec.runs.curve import Curve
 from netspec.runs.run import Run, read_log
 from paths import GOLDEN

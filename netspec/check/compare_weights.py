@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from netspec.compare.difference import Difference, Differences
+from netspec.check.difference import Difference, Differences
 from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError, Where
 

@@ -10,8 +10,8 @@ from jinja2 import Environment
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from netspec.pictures.style import COLORS, svg
-from netspec.pictures.training import MOST_POINTS
+from netspec.draw.style import COLORS, svg
+from netspec.draw.training import MOST_POINTS
 from netspec.runs.curve import Curve, thinned
 from netspec.runs.run import Run
 from netspec.runs.summary import summary
@@ -23,7 +23,7 @@ _FEW = 6  # test outputs that the cursor reads
 def training_page(runs: Sequence[Run], figure: Figure, title: str) -> str:
     """Return the page; ``figure`` is the picture of the runs. It needs nothing from elsewhere."""
     environment = Environment(autoescape=True, trim_blocks=False)
-    template = environment.from_string(Path(__file__).with_name("page.html.jinja").read_text(encoding="utf-8"))
+    template = environment.from_string(Path(__file__).with_name("training_page.html.jinja").read_text(encoding="utf-8"))
     told = [summary(run) for run in runs]
     columns = list(dict.fromkeys(name for line in told for name in line))
     shown = [

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from netspec.pictures.style import COLORS, FAULT, GRID, STYLE
+from netspec.draw.style import COLORS, FAULT, GRID, STYLE
 from netspec.runs.curve import Curve, shown_range, smoothed, thinned
 from netspec.runs.run import Run
 from netspec.terminal import log

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from netspec.compare.difference import Difference, Differences
-from netspec.compare.messages import child, differences, labeled
+from netspec.check.difference import Difference, Differences, child, differences, labeled
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.plan import Node, Plan, make_plan
 from netspec.proto.schema import PHASE_NAMES, TEST, TRAIN, NetParameter, ParamSpec
