@@ -2,7 +2,7 @@
 
 python trained_head.py FOLDER LIST...: FOLDER has the files of efficientnet_lite0.py, a LIST pairs of views of one place
 (lmdb-build views --view-size 192x144). Directions in which the views of a pair differ become short (within-class
-whitening; Mikolajczyk and Matas, ICCV 2007). prototxt/README.md says what the net reaches.
+whitening; Mikolajczyk and Matas, ICCV 2007). docs/trained.md says what the net reaches.
 """
 
 import sys
