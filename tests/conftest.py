@@ -1,32 +1,64 @@
-"""What all tests share: one thread a process, so that runs in parallel stay quick, and a fake GPU."""
+"""What all tests share: a process that each leaves as it found it, and one thread, so that parallel runs stay quick.
 
+torch is imported where tests run only: the process that hands them out to others needs none.
+"""
+
+import logging
+import os
 import signal
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from fresh_dialects import fresh_dialects
 
+OTHERS = {"PYTEST_CURRENT_TEST", "TORCHINDUCTOR_CACHE_DIR"}  # set by pytest, and by torch once it compiles
+LOGGERS = [logging.getLogger(name) for name in ("", "netspec", "loopclosure", "lmdb_build")]
+SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)]  # Windows has no SIGHUP
 
-@pytest.fixture(autouse=True, scope="session")
-def _interrupts_are_heard() -> None:
-    """Where the tests run in the background, a shell may have SIGINT ignored, and children inherit that."""
-    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+
+def pytest_collection_finish() -> None:
+    """Set up the process of the tests, where there are any: in a parallel run not that which hands them out."""
+    import torch
+
+    import fake_gpu  # noqa: F401  autograd counts the devices at its first backward pass
+    from netspec.pycaffe import logs
+
+    torch.set_num_threads(1)
+    logs.stop()  # importing pycaffe shows Caffe's log from then on; here pytest keeps it
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background; children would inherit that
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.fixture(autouse=True)
-def _no_dialect_is_left_on(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    yield from fresh_dialects(monkeypatch)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _one_thread() -> None:
+def settings() -> dict[str, Any]:
+    """Return what is one for the whole process: what a test leaves behind there, another one stumbles over."""
     import torch
 
-    torch.set_num_threads(1)
+    return {
+        **{name: value for name, value in os.environ.items() if name not in OTHERS},
+        "folder": os.getcwd(),
+        "handlers of signals": [signal.getsignal(number) for number in SIGNALS],
+        "loggers": [(log.name, log.level, log.propagate, log.disabled, list(log.handlers)) for log in LOGGERS],
+        "torch's settings": (
+            torch.get_num_threads(),
+            torch.get_default_dtype(),
+            torch.is_grad_enabled(),
+            torch.are_deterministic_algorithms_enabled(),
+            torch.get_float32_matmul_precision(),
+        ),
+    }
 
 
-@pytest.fixture(autouse=True, scope="session")
-def _fake_gpu() -> None:
-    import fake_gpu  # noqa: F401  autograd counts the devices at its first backward pass
+@pytest.fixture(autouse=True)
+def _the_process_is_left_as_it_was() -> Iterator[None]:
+    before = settings()
+    yield
+    after = settings()
+    left = {name: after.get(name) for name in before.keys() | after.keys() if after.get(name) != before.get(name)}
+    assert not left, f"this test leaves behind: {left}"
+
+
+@pytest.fixture(autouse=True)
+def _no_dialect_is_left_on(_the_process_is_left_as_it_was: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    yield from fresh_dialects(monkeypatch)

@@ -1,18 +1,11 @@
-"""The Markdown files: their blocks, the commands in them as a shell reads them, and how commands and snippets run."""
+"""The Markdown files: their blocks, the commands in them as a shell reads them, and how both run."""
 
-import multiprocessing
-import os
 import re
 import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-import pytest
-
+import forked
 from paths import ROOT
 
 DOCUMENTS = [
@@ -33,11 +26,6 @@ PROGRAMS = {
     "python3": "",
     "pip": "",
 }
-# Imported once; each command and snippet then starts from there. It has a process of its own, as in a shell.
-PRELOADED = [
-    *("torch", "cv2", "scipy.optimize", "scipy.stats", "matplotlib.pyplot", "sklearn.cluster", "netspec"),
-    *filter(None, PROGRAMS.values()),
-]
 SHELL = """
 set -eu
 source() { :; }
@@ -98,42 +86,10 @@ def commands(text: str, folder: Path) -> list[Command]:
 
 def run(command: Command, log: Path) -> int | None:
     """Run a command of ours; return its exit status, None if it does not end. What it says goes to ``log``."""
-    return _status(_main, command.words, command.folder, log)
+    main = PROGRAMS[command.words[0]]
+    return forked.wait(forked.start(forked.main, main, command.words, folder=command.folder, out=log))
 
 
 def run_snippet(text: str, folder: Path, log: Path) -> int | None:
     """Run Python source in a folder; return as :func:`run`."""
-    return _status(_snippet, text, folder, log)
-
-
-def _status(function: Callable[[Any], None], what: object, folder: Path, log: Path) -> int | None:
-    """Call a function in a process of its own, in which torch and our modules have been imported already."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(PRELOADED)
-    process = context.Process(target=_call, args=(function, what, folder, log, multiprocessing.get_start_method()))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("OMP_NUM_THREADS", "1")
-        process.start()
-    process.join(300)
-    if process.exitcode is None:
-        process.kill()
-    return process.exitcode
-
-
-def _call(function: Callable[[Any], None], what: object, folder: Path, log: Path, usual: str) -> None:
-    multiprocessing.set_start_method(usual, force=True)  # of processes of its own, as where it is typed
-    os.chdir(folder)
-    os.environ["XDG_CACHE_HOME"] = str(folder / ".cache")
-    out, nothing = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), os.open(os.devnull, os.O_RDONLY)
-    for new, standard in ((nothing, 0), (out, 1), (out, 2)):
-        os.dup2(new, standard)
-    function(what)
-
-
-def _main(words: tuple[str, ...]) -> None:
-    sys.argv = list(words)
-    sys.exit(import_module(PROGRAMS[words[0]]).main(list(words[1:])))
-
-
-def _snippet(text: str) -> None:
-    exec(compile(text, "snippet", "exec"), {"__name__": "__main__"})
+    return forked.wait(forked.start(forked.snippet, text, folder=folder, out=log))

@@ -1,15 +1,13 @@
 """Each script of examples/ runs as it stands, in 60 lines or fewer, and says what it is to show."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+import forked
 from loopclosure.evaluate import judge
 from loopclosure.methods.base import MethodContext, make_method
 from loopclosure.places.datasets import load_traverses
@@ -37,18 +35,15 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     folder = tmp_path_factory.mktemp(request.param.stem)
     if request.param.stem == "trained_head":
         given = [write_pairs(folder)]
-        trunk = request.param.with_name("efficientnet_lite0.py")
-        subprocess.run([sys.executable, str(trunk), str(folder)], check=True, capture_output=True)
-    done = subprocess.run(
-        [sys.executable, str(request.param), str(folder), *map(str, given)],
-        env={**os.environ, "GLOG_minloglevel": "2", "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    return request.param.stem, done.stdout, folder
+        run(request.param.with_name("efficientnet_lite0.py"), folder)
+    return request.param.stem, run(request.param, folder, *given), folder
+
+
+def run(script: Path, folder: Path, *words: object) -> str:
+    """Run a script that must say nothing on standard error; return what it prints."""
+    done = forked.run(forked.script, script, [str(folder), *map(str, words)], folder=folder, GLOG_minloglevel="2")
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
 
 
 def write_pairs(folder: Path) -> Path:

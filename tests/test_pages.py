@@ -4,6 +4,8 @@ A block below ``<!-- not run: REASON -->`` is not run, nor are programs without 
 measure for minutes or start these tests, and have tests of their own. tests/laws/test_documents.py parses all of them.
 """
 
+import fcntl
+import os
 import re
 import shlex
 import shutil
@@ -32,7 +34,16 @@ PAGES = [page for page in DOCUMENTS if any(block.language in ("", "python") for 
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return playground.make(tmp_path_factory.mktemp("pages") / "made")
+    """The folder, which all processes of a parallel run share: the first one makes it."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "made"
+    with folder.with_suffix(".lock").open("a+") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.with_suffix(".done").exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            playground.make(folder)
+            folder.with_suffix(".done").touch()
+    return folder
 
 
 def less(words: tuple[str, ...]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from fake_gpu import NAME, POSSIBLE, fake_gpu
 from paths import ROOT
 
 SCRIPT = ROOT / "benchmarks" / "gpu_steps"
-SMALL = {"GPU": "", "BATCH": "2", "ITERATIONS": "2", "TRAIN": "8", "VALIDATION": "4", "FRAMES": "60"}
+SMALL = {"GPU": "", "BATCH": "2", "ITERATIONS": "1", "TRAIN": "4", "VALIDATION": "4", "FRAMES": "60"}
 
 
 @pytest.mark.slow
@@ -66,10 +66,10 @@ def test_the_training_goes_on_and_gets_its_row(tmp_path: Path) -> None:
         finished = step(name, tmp_path)
         assert finished.returncode == 0, finished.stderr
     results = tmp_path / "results"
-    assert (results / "train.txt").read_text() == "all 2 iterations are done\n"
+    assert (results / "train.txt").read_text() == "all 1 iterations are done\n"
     assert "as if it had never stopped" in (results / "train.log").read_text()
     scores = json.loads((results / "train.scores.json").read_text())
-    assert [snapshot["iteration"] for snapshot in scores["snapshots"]] == [1, 2]
+    assert [snapshot["iteration"] for snapshot in scores["snapshots"]] == [1]
     table = (results / "table.txt").read_text()
     assert "siamese_resnet27_256 " in table
     assert "siamese_resnet27_256_small" in table

@@ -22,7 +22,7 @@ CORPUS = {
     "mobilenet": "shicai+MobileNet-Caffe/mobilenet_v2_deploy.prototxt",
     "squeezenet": "forresti+SqueezeNet/SqueezeNet_v1.1/deploy.prototxt",
 }
-# 128 differs from 8 only in its last layer; the full sizes are those of the small ones
+# 128 differs from 8 only in its last layer, as 512 from 256; the full sizes are those of the small ones
 TRAINED = [
     "lenet",
     "cifar10_quick",
@@ -51,7 +51,7 @@ def outputs(prototxt: Path, caffemodel: Path, inputs: Path) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*ZOO, *SMALL, PAPER[0], PAPER[2]])
+@pytest.mark.parametrize("name", [*ZOO, SMALL[0], SMALL[2], PAPER[2]])
 def test_a_twin_has_the_same_numbers(name: str) -> None:
     with forward_case(name, 2, onnx=False) as case:
         expected = outputs(case.prototxt, case.caffemodel, case.inputs)

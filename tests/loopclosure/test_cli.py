@@ -147,6 +147,7 @@ def test_detect_saves_and_resumes(two_laps, two_laps_features, tmp_path, capsys)
         assert [int(row["query_id"]) for row in csv.DictReader(stream)] == list(range(20, 40))
 
 
+@pytest.mark.slow
 def test_detect_chooses_by_itself(tmp_path, capsys):
     """A drive that comes back: pictures that change slowly, the second time darker."""
     rng = np.random.default_rng(0)
@@ -250,6 +251,7 @@ def test_options_that_do_not_go_together_are_one_line_and_status_2(
     assert sentence in printed
 
 
+@pytest.mark.slow
 def test_names_that_are_not_utf8_are_escaped(two_laps, tmp_path):
     source, out = tmp_path / "caf\udce9", tmp_path / "out\udce9"
     shutil.copytree(two_laps, source)
@@ -289,6 +291,7 @@ def test_numbers_that_mean_nothing_are_wrong_usage(words, said, capsys):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_control_c_is_one_line_and_status_130(tmp_path):
     """Interrupted while it reads: a pipe that nobody writes into."""
     os.mkfifo(tmp_path / "features.npz")

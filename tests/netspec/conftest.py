@@ -2,18 +2,20 @@
 
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from netspec.cli import main
 from netspec.errors import Report, raise_fault
 from netspec.exact.blas import CAFFES, kernels
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
+from netspec.layers import Layer
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, PhaseValue
@@ -57,6 +59,22 @@ def net_of() -> Callable[..., Net]:
         return build_net(with_state(net, phase), source.telling(report), BuildOptions(**{"seed": 0, **options}))
 
     return build
+
+
+@pytest.fixture
+def gradcheck() -> Callable[..., None]:
+    """``gradcheck(layer, *bottoms, fixed=())``: in double, the gradients of bottoms and blobs are the function's.
+
+    ``fixed`` are bottoms that get none. The Jacobians are compared along random directions, as PyTorch's own tests do.
+    """
+
+    def check(layer: Layer, *bottoms: torch.Tensor, fixed: Sequence[int] = ()) -> None:
+        layer.double()
+        inputs = [bottom.double().requires_grad_(i not in fixed) for i, bottom in enumerate(bottoms)]
+        learned = [blob for j, blob in enumerate(layer.blobs) if layer.default_param_lr and j not in layer.not_learned]
+        torch.autograd.gradcheck(lambda *args: layer.run(*args[: len(inputs)])[0], (*inputs, *learned), fast_mode=True)
+
+    return check
 
 
 @pytest.fixture

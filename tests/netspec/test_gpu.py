@@ -48,6 +48,7 @@ def test_a_fake_gpu_refuses_what_a_gpu_refuses() -> None:
     assert (x + torch.tensor(2.0)).cpu().numpy().sum() == 18
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", TRAININGS)
 def test_training_testing_snapshots_and_resuming(
     case: str, device: str, work_in: Callable[..., Path], record_property: Callable[[str, object], None]

@@ -80,6 +80,7 @@ def fabmap_folder(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("camera", "frames", "loops"),
     [
@@ -106,6 +107,7 @@ def test_fabmap_cameras(fabmap_folder, tmp_path, camera, frames, loops):
         assert "left and a right image" in data.notes[0]
 
 
+@pytest.mark.slow
 def test_fabmap_stride_and_limit_count_places(fabmap_folder):
     data = load_fabmap(
         fabmap_folder, camera="left", selection=Selection(stride=4, limit=2), exclusion=Exclusion(frames=0)
@@ -123,6 +125,7 @@ def test_fabmap_mask_of_places_for_images_of_both_cameras(fabmap_folder):
     assert data.query_images[5].stem == "0012"
 
 
+@pytest.mark.slow
 def test_fabmap_faults(fabmap_folder, tmp_path):
     with pytest.raises(InputError, match="unknown camera"):
         load_fabmap(fabmap_folder, camera="front")
@@ -232,6 +235,7 @@ def test_corridor_loop():
     assert data.name == "corridor_loop/samples"
 
 
+@pytest.mark.slow
 def test_tum_fr1():
     data = load_tum(shared("data/tum_fr1/rgbd_dataset_freiburg1_rpy"))
     assert len(data.query_images) == 721

@@ -14,7 +14,7 @@ from netspec.errors import SpecError
 from netspec.proto.format import format_text
 from netspec.proto.schema import BlobProto, NetParameter
 from netspec.proto.text import parse_net, write_text
-from paths import ROOT, SHARED
+from paths import nets_as_found
 
 NET = """name: "n"
 layer { name: "in" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 dim: 8 dim: 8 } } }
@@ -196,11 +196,8 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["diff", "A", "gone"]) == 2
 
 
-FILES = [*(ROOT / "prototxt").rglob("*.prototxt"), *(SHARED / "corpus").rglob("*.prototxt")]
-
-
 @pytest.mark.slow
-@each("path", sorted(path for path in FILES if "solver" not in path.name), last_parts)
+@each("path", nets_as_found(), last_parts)
 def test_nets_as_they_are_found_equal_what_is_written_of_them(path: Path) -> None:
     upgraded = write_text(parse_net(path)[0])
     Path("written").write_text(upgraded)

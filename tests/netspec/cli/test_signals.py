@@ -9,10 +9,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import forked
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -20,37 +23,58 @@ pytestmark = pytest.mark.slow
 SOLVER = "sgd_step/solver.prototxt"
 
 
+class Training:
+    """``netspec train``, forked; with ``python``, another command line in a Python that starts as usual."""
+
+    def __init__(self, words: Sequence[str], name: str = "netspec", python: Sequence[str] = ()) -> None:
+        self.log = Path("training.log").absolute()
+        if python:
+            environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+            with self.log.open("w") as stream:
+                self.process = subprocess.Popen([sys.executable, *python, *words], stderr=stream, env=environment)
+        else:
+            self.process = forked.start(forked.program, [name, "train", *words], out=self.log)
+
+    def status(self, limit_s: float = 60) -> int | None:
+        """Return the exit status, once it has ended."""
+        if isinstance(self.process, BaseProcess):
+            return forked.wait(self.process, limit_s)
+        return self.process.wait(limit_s)
+
+    def is_over(self) -> bool:
+        if isinstance(self.process, BaseProcess):
+            return not self.process.is_alive()
+        return self.process.poll() is not None
+
+    def send(self, number: int) -> None:
+        assert self.process.pid
+        os.kill(self.process.pid, number)
+
+    def wait_for(self, text: str) -> None:
+        """Wait for a line of its log."""
+        end = time.monotonic() + 60
+        while not self.log.exists() or text not in self.log.read_text():
+            assert time.monotonic() < end, self.log.read_text()[-2000:]
+            assert not self.is_over(), self.log.read_text()[-2000:]
+            time.sleep(0.02)
+
+
 @pytest.fixture
-def endless(work_in: Callable[..., Path]) -> Iterator[Callable[..., tuple[subprocess.Popen, Callable[[str], None]]]]:
-    """``endless(*words)``: a training of its own that does not end by itself, and how to wait for a line of its log."""
+def endless(work_in: Callable[..., Path]) -> Iterator[Callable[..., Training]]:
+    """``endless(*words)``: a training of its own that does not end by itself."""
     work_in("train/sgd_step")
     text = Path(SOLVER).read_text().replace("max_iter: 60", "max_iter: 1000000")
     Path(SOLVER).write_text(text.replace("snapshot_after_train: false", ""))
-    started: list[subprocess.Popen] = []
+    started: list[Training] = []
 
-    def start(
-        *words: str, program: Sequence[str] = ("-m", "netspec", "train")
-    ) -> tuple[subprocess.Popen, Callable[[str], None]]:
-        log = Path("training.log")
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-        with log.open("w") as stream:
-            command = [sys.executable, *program, SOLVER, *words]
-            process = subprocess.Popen(command, stderr=stream, env=environment)
-        started.append(process)
-
-        def wait_for(text: str) -> None:
-            end = time.monotonic() + 60
-            while text not in log.read_text():
-                assert time.monotonic() < end, log.read_text()[-2000:]
-                assert process.poll() is None, log.read_text()[-2000:]
-                time.sleep(0.05)
-
-        return process, wait_for
+    def start(*words: str, **program: Any) -> Training:
+        started.append(Training([SOLVER, *words], **program))
+        return started[-1]
 
     yield start
-    for process in started:
-        process.kill()
-        process.wait()
+    for training in started:
+        training.process.kill()
+        training.status()
 
 
 def snapshots() -> set[str]:
@@ -62,74 +86,67 @@ def last_messages(count: int) -> list[str]:
 
 
 def test_an_interrupt_stops_a_training_and_takes_a_snapshot(endless) -> None:
-    process, wait_for = endless()
-    wait_for("Iteration 10 ")
-    process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 130
+    training = endless()
+    training.wait_for("Iteration 10 ")
+    training.send(signal.SIGINT)
+    assert training.status() == 130
     assert last_messages(2) == ["Optimization stopped early.", "Optimization Done."]
     (state,) = snapshots()
     assert state.removesuffix(".solverstate") in last_messages(3)[0]
 
 
 def test_a_hangup_takes_a_snapshot_and_training_goes_on(endless) -> None:
-    process, wait_for = endless()
-    wait_for("Iteration 10 ")
-    process.send_signal(signal.SIGHUP)
-    wait_for("Snapshotting solver state")
+    training = endless()
+    training.wait_for("Iteration 10 ")
+    training.send(signal.SIGHUP)
+    training.wait_for("Snapshotting solver state")
     before = Path("training.log").read_text().count(", loss = ")
-    wait_for(f"Iteration {10 * (before + 2)} ")
-    assert process.poll() is None
+    training.wait_for(f"Iteration {10 * (before + 2)} ")
+    assert not training.is_over()
     assert len(snapshots()) == 1
 
 
 def test_what_signals_do_can_be_changed(endless) -> None:
-    process, wait_for = endless("--sigint_effect=none", "-sighup_effect", "stop")
-    wait_for("Iteration 10 ")
-    process.send_signal(signal.SIGINT)
-    wait_for("Iteration 100 ")
+    training = endless("--sigint_effect=none", "-sighup_effect", "stop")
+    training.wait_for("Iteration 10 ")
+    training.send(signal.SIGINT)
+    training.wait_for("Iteration 100 ")
     assert not snapshots()
-    process.send_signal(signal.SIGHUP)
-    assert process.wait(60) == 129
+    training.send(signal.SIGHUP)
+    assert training.status() == 129
     assert len(snapshots()) == 1
 
 
-NAMES = {
-    "netspec": ((), 143),
-    "no effect of Ctrl-C": (("--sigint_effect=none",), 143),
-    "tools/train.py": ((), 0),
-    "torchrun": ((), 0),
+STARTS: dict[str, tuple[dict[str, Any], int]] = {
+    "netspec": ({"python": ("-m", "netspec", "train")}, 143),
+    "tools/train.py": ({"python": (str(ROOT / "tools" / "train.py"),)}, 0),
+    "torchrun": ({"python": ("-m", "torch.distributed.run", "--standalone", "-m", "netspec", "train")}, 0),
 }
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_sigterm_stops_a_training_with_a_snapshot(name: str, endless, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", STARTS)
+def test_sigterm_stops_a_training_with_a_snapshot(name: str, endless) -> None:
     """A scheduler takes 0 for the end of the work; under Caffe's names it is what Caffe's users expect."""
-    words, status = NAMES[name]
-    ready = {
-        "tools/train.py": (str(ROOT / "tools" / "train.py"),),
-        "torchrun": ("-m", "torch.distributed.run", "--standalone", "-m", "netspec", "train"),
-    }
-    process, wait_for = endless(*words, program=ready.get(name, ("-m", "netspec", "train")))
-    wait_for("Iteration 10 ")
-    number = process.pid
+    program, status = STARTS[name]
+    training = endless(*["--sigint_effect=none"] * (name == "netspec"), **program)
+    training.wait_for("Iteration 10 ")
     if name == "torchrun":
-        line = next(line for line in Path("training.log").read_text().splitlines() if "Iteration 10 " in line)
-        number = int(line.split()[2])  # glog has the process there
-    os.kill(number, signal.SIGTERM)
-    assert process.wait(60) == status
-    text = Path("training.log").read_text()
+        line = next(line for line in training.log.read_text().splitlines() if "Iteration 10 " in line)
+        os.kill(int(line.split()[2]), signal.SIGTERM)  # glog has the process there
+    else:
+        training.send(signal.SIGTERM)
+    assert training.status() == status
+    text = training.log.read_text()
     assert "Traceback" not in text
     assert text.index("Optimization stopped early.") < text.index("Optimization Done.")
     assert len(snapshots()) == 1
 
 
-@pytest.mark.parametrize("name", ["caffe", "netspec"])
-def test_the_status_goes_by_the_name_of_the_program(name: str, endless) -> None:
-    Path(name).write_text("import sys\nfrom netspec.terminal.main import program\nsys.exit(program('netspec.cli'))\n")
-    process, wait_for = endless(program=(name, "train"))
-    wait_for("Iteration 10 ")
-    process.send_signal(signal.SIGINT)
-    assert process.wait(60) == (0 if name == "caffe" else 130)
+def test_the_status_goes_by_the_name_of_the_program(endless) -> None:
+    training = endless(name="caffe")
+    training.wait_for("Iteration 10 ")
+    training.send(signal.SIGINT)
+    assert training.status() == 0
 
 
 def test_a_training_whose_standard_error_is_closed(work_in: Callable[..., Path]) -> None:
@@ -163,13 +180,13 @@ def test_a_second_interrupt_ends_a_training_at_once(endless) -> None:
     Path("endless.py").write_text(ENDLESS)
     net = 'layer { name: "e" type: "Python" top: "e" python_param { module: "endless" layer: "Endless" } }'
     Path(SOLVER).write_text(f"net_param {{ {net} }} base_lr: 1 lr_policy: 'fixed' max_iter: 1 snapshot_prefix: 'x'")
-    process, wait_for = endless("--allow-python-layers")
-    wait_for("begun")
-    process.send_signal(signal.SIGINT)
+    training = endless("--allow-python-layers")
+    training.wait_for("begun")
+    training.send(signal.SIGINT)
     time.sleep(0.5)
-    assert process.poll() is None
-    process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 130
+    assert not training.is_over()
+    training.send(signal.SIGINT)
+    assert training.status(10) == 130
 
 
 def test_on_a_terminal_a_line_says_how_far_it_is(work_in: Callable[..., Path]) -> None:

@@ -77,6 +77,7 @@ def test_two_layers_may_read_one_database() -> None:
     assert first.record(0) == second.record(0)
 
 
+@pytest.mark.slow
 def test_readers_come_and_go_in_threads() -> None:  # liblmdb must not open what is still being closed
     faults: list[Exception] = []
 

@@ -94,6 +94,7 @@ def test_records_without_a_transformation_are_those_of_the_database() -> None:
     assert sum(1 for _ in records) == 640
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", WORKERS)
 def test_each_epoch_has_its_own_draws(workers: int) -> None:
     records = Records(TRAIN, TRANSFORM)

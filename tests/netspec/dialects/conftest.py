@@ -32,18 +32,11 @@ def build() -> Callable[..., Layer]:
 
 
 @pytest.fixture
-def gradcheck() -> Callable[..., None]:
-    """``gradcheck(layer, *bottoms, fixed=...)``: in double, gradients of bottoms and blobs are the function's.
-
-    And a GPU computes the same. ``fixed`` are bottoms that get no gradient; layers whose blobs are statistics learn
-    those not in ``not_learned``.
-    """
+def gradcheck(gradcheck: Callable[..., None]) -> Callable[..., None]:
+    """The same, and a GPU computes what the CPU does."""
 
     def check(layer: Layer, *bottoms: torch.Tensor, fixed: tuple[int, ...] = ()) -> None:
-        layer.double()
-        inputs = [bottom.double().requires_grad_(i not in fixed) for i, bottom in enumerate(bottoms)]
-        learned = [blob for j, blob in enumerate(layer.blobs) if j not in layer.not_learned]
-        torch.autograd.gradcheck(lambda *args: layer.run(*args[: len(inputs)])[0], (*inputs, *learned))
+        gradcheck(layer, *bottoms, fixed=fixed)
         if POSSIBLE:
             _compare_on_the_gpu(layer.float(), [bottom.detach().float() for bottom in bottoms])
 

@@ -77,6 +77,7 @@ def test_relu6_in_place_has_the_gradient_of_what_lies_in_memory() -> None:
 CONVOLVED = "kernel_size: 3 pad: 1 stride: 2 weight_filler { type: 'xavier' } bias_filler { type: 'uniform' }"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     [

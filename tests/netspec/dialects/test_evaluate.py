@@ -157,6 +157,7 @@ eval_type: "detection" ap_version: "11point" test_initialization: true show_per_
 """
 
 
+@pytest.mark.slow
 def test_a_small_ssd_learns_to_find_squares(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,6 +16,7 @@ CORRELATION = "type: 'Correlation' correlation_param {{ {} }}"
 RESAMPLE = "type: 'Resample' resample_param {{ height: {} width: {} {} }}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "pad", "kernel", "most", "stride", "step"),
     [
@@ -74,6 +75,7 @@ def test_maps_are_resampled(build: Build, kind: str, height: int, width: int, an
         np.testing.assert_allclose(top[:, :, i, j], total / (weights or 1), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_image_follows_a_flow(build: Build, gradcheck: Gradcheck) -> None:
     image, flow = torch.randn(2, 3, 5, 6), 3 * torch.randn(2, 2, 5, 6)
     layer = build("flownet", "type: 'FlowWarp' flow_warp_param { fill_value: NOT_A_NUMBER }", image.shape, flow.shape)

@@ -25,11 +25,9 @@ from netspec.graph.options import BuildOptions
 from netspec.layers import layer_types
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_net_text
-from paths import ROOT, SHARED
+from paths import nets_as_found
 
 PHASES = [TRAIN, TEST]
-CORPUS = sorted(path for path in (SHARED / "corpus").rglob("*.prototxt") if "solver" not in path.name)
-OWN = sorted(path for path in (ROOT / "prototxt").rglob("*.prototxt") if "solver" not in path.name)
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 8 dim: 9 dim: 9 } } }\n'
 
 
@@ -77,7 +75,7 @@ def test_nothing_overlaps_whatever_the_wiring(seed: int) -> None:
 
 
 @pytest.mark.slow
-@each("path", [*OWN, *CORPUS], last_parts)
+@each("path", nets_as_found(), last_parts)
 def test_nothing_overlaps_in_nets_as_they_are_found(path: Path) -> None:
     picture = picture_of(
         diagram_of(

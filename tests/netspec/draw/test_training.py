@@ -59,6 +59,7 @@ def test_tests_far_above_the_training_are_in_the_picture() -> None:
     assert training_figure([run]).axes[0].get_ylim()[1] > 3
 
 
+@pytest.mark.slow
 def test_the_command_writes_png_svg_and_html(run: Run_) -> None:
     for ending in ("png", "svg", "html"):
         result = run("plot", CAFFES, "--names", "<a> & $b_1$", "--out", f"x.{ending}")
@@ -109,6 +110,7 @@ def test_a_logarithmic_axis_needs_losses_above_zero(run: Run_) -> None:
     assert (result.status, result.err) == (0, "warning: no loss is above 0: its axis is not logarithmic\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["png", "svg", "html"])
 def test_names_that_cannot_be_written_are_escaped(run: Run_, ending: str) -> None:
     name = "caf\udce9\x1b.log"

@@ -44,16 +44,3 @@ def build(exact: str) -> Callable[..., Layer]:
         return make_layer(text, shapes, context(**{**known, **facts}), tops)
 
     return build_layer
-
-
-@pytest.fixture
-def gradcheck() -> Callable[..., None]:
-    """``gradcheck(layer, *bottoms)``: in double, the gradients of bottoms and blobs are those of the function."""
-
-    def check(layer: Layer, *bottoms: torch.Tensor) -> None:
-        layer.double()
-        inputs = [bottom.double().requires_grad_() for bottom in bottoms]
-        learned = list(layer.blobs) if layer.default_param_lr else []
-        torch.autograd.gradcheck(lambda *args: layer.run(*args[: len(inputs)])[0], (*inputs, *learned))
-
-    return check

@@ -135,18 +135,7 @@ def test_exposed_state_goes_in_and_out_without_gradient(build, kind: str, with_s
 def test_gradients_go_back_through_time(build, gradcheck, kind: str) -> None:
     layer = build(text(kind), (3, N, INPUTS), (3, N), (N, 2))
     cont = torch.tensor([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0]]).double()
-
-    class WithCont(torch.nn.Module):
-        default_param_lr = 1.0
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner, self.blobs = layer, layer.blobs
-
-        def run(self, x: torch.Tensor, static: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            return layer.run(x, cont, static)
-
-    gradcheck(WithCont(), torch.randn(3, N, INPUTS), torch.randn(N, 2))
+    gradcheck(layer, torch.randn(3, N, INPUTS), cont, torch.randn(N, 2), fixed=[1])
 
 
 # LSTMUnit

@@ -166,7 +166,7 @@ def trained(case: str, **options: Any) -> Solver:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize(("backend", "precision"), [("aot_eager", "fp32"), ("inductor", "bf16")], indirect=["backend"])
 def test_a_training_with_tests_and_iter_size_stays(
     backend: str, precision: str, work_in: Callable[..., Path], edited_solver: Callable[[Path], None]
 ) -> None:

@@ -13,10 +13,9 @@ from netspec.errors import SpecError
 from netspec.proto.format import WIDTH, format_text
 from netspec.proto.lexer import END, STRING, SYMBOL, Lexer
 from netspec.proto.text import parse_net_text, parse_solver_text, text_of
-from paths import GOLDEN, ROOT, SHARED
+from paths import GOLDEN, ROOT, SHARED, nets_as_found
 
 OWN = sorted((ROOT / "prototxt").rglob("*.prototxt"))
-OTHERS = [*GOLDEN.rglob("*.prototxt"), *(SHARED / "corpus").rglob("*.prototxt"), *SHARED.glob("golden/**/*.prototxt")]
 
 
 def test_the_form() -> None:
@@ -150,7 +149,7 @@ def comments(text: str) -> list[str]:
 
 
 @pytest.mark.slow
-@each("path", [*OWN, *OTHERS], last_parts)
+@each("path", [*nets_as_found(), *GOLDEN.rglob("*.prototxt"), *SHARED.glob("golden/**/*.prototxt")], last_parts)
 def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
     text = text_of(path)
     formed = format_text(text, str(path))

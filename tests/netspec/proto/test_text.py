@@ -242,6 +242,7 @@ def outcome(text: str) -> Any:
         return error
 
 
+@pytest.mark.slow
 @each("seed", range(300))
 def test_damaged_text_is_refused_or_read_alike(seed: int) -> None:
     """Whatever is done to a text: it is a SpecError, or the message that protobuf reads from it."""

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from google.protobuf import text_format
 
+from cases import read_cases
 from netspec.errors import SpecError
 from netspec.proto.schema import NetParameter, SolverParameter, V1LayerParameter
 from netspec.proto.source_map import Place, SourceMap
@@ -17,123 +18,10 @@ from netspec.proto.upgrade import current as upgrade
 from netspec.proto.upgrade.v0 import merge_padding, upgrade_v0
 from paths import GOLDEN
 
-V0 = """\
-name: "old"
-input: "data"
-input_dim: 1 input_dim: 3 input_dim: 8 input_dim: 8
-state { level: 2 }
-layers {
-  layer { name: "pad1" type: "padding"
-    pad: 2 }
-  bottom: "data" top: "padded"
-}
-layers {
-  layer { name: "conv1" type: "conv"
-    num_output: 4 kernelsize: 5 group: 2 stride: 1 biasterm: false
-    weight_filler { type: "gaussian" std: 0.01 }
-    blobs_lr: 1. blobs_lr: 2.
-    weight_decay: 1. weight_decay: 0.
-  }
-  bottom: "padded"
-  top: "conv1"
-}
-layers {
-  layer { name: "pool1" type: "pool" pool: AVE kernelsize: 3
-    stride: 2 pad: 1 }
-  bottom: "conv1" top: "pool1"
-}
-"""
-
-V0_UPGRADED = """\
-name: "old"
-state { level: 2 }
-layer {
-  name: "input" type: "Input" top: "data"
-  input_param { shape { dim: [1, 3, 8, 8] } }
-}
-layer {
-  name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
-  param { lr_mult: 1 decay_mult: 1 }
-  param { lr_mult: 2 decay_mult: 0 }
-  convolution_param {
-    num_output: 4 kernel_size: 5 group: 2 stride: 1 bias_term: false pad: 2
-    weight_filler { type: "gaussian" std: 0.01 }
-  }
-}
-layer {
-  name: "pool1" type: "Pooling" bottom: "conv1" top: "pool1"
-  pooling_param { pool: AVE kernel_size: 3 stride: 2 pad: 1 }
-}
-"""
-
-V1 = """\
-layers {
-  name: "data" type: DATA top: "data" top: "label"
-  data_param { source: "db"
-    scale: 0.5 mirror: true }
-  include: { phase: TRAIN }
-}
-layers {
-  name: "ip" type: INNER_PRODUCT bottom: "data" top: "ip"
-  param: "w"
-  param: "b"
-  blob_share_mode: PERMISSIVE
-  blobs_lr: 1
-  blobs_lr: 2
-  blobs_lr: 3
-  weight_decay: 0
-  inner_product_param { num_output: 3 }
-  loss_weight: 0.5
-  exclude { stage: "x" }
-}
-"""
-
-V1_UPGRADED = """\
-layer {
-  name: "data" type: "Data" top: "data" top: "label"
-  data_param { source: "db" }
-  transform_param { scale: 0.5 mirror: true }
-  include: { phase: TRAIN }
-}
-layer {
-  name: "ip" type: "InnerProduct" bottom: "data" top: "ip"
-  param { name: "w" share_mode: PERMISSIVE lr_mult: 1 decay_mult: 0 }
-  param { name: "b" lr_mult: 2 }
-  param { lr_mult: 3 }
-  inner_product_param { num_output: 3 }
-  loss_weight: 0.5
-  exclude { stage: "x" }
-}
-"""
-
-SHAPES = 'input: "a"\ninput: "b"\ninput_shape { dim: 1 }\ninput_shape {\n  dim: 2 dim: 3\n}\nlayer { name: "l" }\n'
-SHAPES_UPGRADED = """\
-layer {
-  name: "input" type: "Input" top: "a" top: "b"
-  input_param { shape { dim: 1 } shape { dim: [2, 3] } }
-}
-layer { name: "l" }
-"""
-
-BATCH_NORM = """\
-layer { name: "bn" type: "BatchNorm" param { name: "m" lr_mult: 1 } param { name: "v" } param { decay_mult: 0 } }
-layer { name: "two" type: "BatchNorm" param { lr_mult: 0 } param { lr_mult: 0 } }
-"""
-BATCH_NORM_UPGRADED = """\
-layer { name: "bn" type: "BatchNorm"
-  param { name: "m" lr_mult: 0 decay_mult: 0 }
-  param { name: "v" lr_mult: 0 decay_mult: 0 }
-  param { lr_mult: 0 decay_mult: 0 }
-}
-layer { name: "two" type: "BatchNorm" param { lr_mult: 0 } param { lr_mult: 0 } }
-"""
-
-NETS = {
-    "V0": (V0, V0_UPGRADED),
-    "V1": (V1, V1_UPGRADED),
-    "input shapes": (SHAPES, SHAPES_UPGRADED),
-    "batch norm": (BATCH_NORM, BATCH_NORM_UPGRADED),
-}
+NETS = read_cases("netspec/proto/cases/upgrades.txt")
+V0_LAYERS = read_cases("netspec/proto/cases/v0_layers.txt")
+V0_FAULTS = read_cases("netspec/proto/cases/v0_faults.txt")
+V0, V1 = NETS["V0"]["old"], NETS["V1"]["old"]
 PASSES: list[Callable[[NetParameter, SourceMap], tuple[NetParameter, SourceMap]]] = [
     upgrade_v0,
     upgrade.upgrade_data,
@@ -152,17 +40,17 @@ def leaves(node: Place) -> list[Place]:
     return [node, *(leaf for nodes in node.fields.values() for inner in nodes for leaf in leaves(inner))]
 
 
-@pytest.mark.parametrize(("old", "new"), NETS.values(), ids=NETS.keys())
-def test_net_is_upgraded(old: str, new: str) -> None:
-    net, source = parse_net_text(old, "f")
-    assert write_text(net) == write_text(net_of(new))
+@pytest.mark.parametrize("case", NETS.values(), ids=NETS)
+def test_net_is_upgraded(case: dict[str, str]) -> None:
+    net, source = parse_net_text(case["old"], "f")
+    assert write_text(net) == write_text(net_of(case["new"]))
     assert len(source.layers) == len(net.layer)
     assert not upgrade.net_needs_upgrade(net)
 
 
-@pytest.mark.parametrize(("old", "new"), NETS.values(), ids=NETS.keys())
-def test_passes_change_nothing_they_are_given_and_nothing_twice(old: str, new: str) -> None:
-    net, source = parse_net_text(old, "f", upgrade=False)
+@pytest.mark.parametrize("case", NETS.values(), ids=NETS)
+def test_passes_change_nothing_they_are_given_and_nothing_twice(case: dict[str, str]) -> None:
+    net, source = parse_net_text(case["old"], "f", upgrade=False)
     assert upgrade.net_needs_upgrade(net)
     for step in PASSES:
         before = net.SerializeToString(deterministic=True), source
@@ -172,13 +60,13 @@ def test_passes_change_nothing_they_are_given_and_nothing_twice(old: str, new: s
         assert again is after
         assert again_source is after_source
         net, source = after, after_source
-    assert net == net_of(new)
+    assert net == net_of(case["new"])
 
 
-@pytest.mark.parametrize(("old", "new"), NETS.values(), ids=NETS.keys())
-def test_every_part_has_a_place_with_its_own_value_in_that_line(old: str, new: str) -> None:
-    net, source = parse_net_text(old, "f")
-    lines = old.splitlines()
+@pytest.mark.parametrize("case", NETS.values(), ids=NETS)
+def test_every_part_has_a_place_with_its_own_value_in_that_line(case: dict[str, str]) -> None:
+    net, source = parse_net_text(case["old"], "f")
+    lines = case["old"].splitlines()
     for layer, place in zip(net.layer, source.layers, strict=True):
         for name in ("name", "bottom", "top"):
             for node, value in zip(place.fields.get(name, ()), _values(layer, name), strict=False):
@@ -235,116 +123,11 @@ def test_weights_are_upgraded_without_places() -> None:
 
 # ---- V0 ----
 
-# The fields of a V0 layer, and of the layer that it becomes, type first.
-V0_LAYERS = [
-    (
-        'type: "data" source: "s" batchsize: 2 rand_skip: 3 scale: 0.5 meanfile: "m" cropsize: 4 mirror: true',
-        'type: "Data" data_param { source: "s" batch_size: 2 rand_skip: 3 } transform_param { scale: 0.5 '
-        'mean_file: "m" crop_size: 4 mirror: true }',
-    ),
-    (
-        'type: "images" source: "s" batchsize: 2 rand_skip: 3 shuffle_images: true new_height: 5 new_width: 6',
-        'type: "ImageData" image_data_param { source: "s" batch_size: 2 rand_skip: 3 shuffle: true '
-        "new_height: 5 new_width: 6 }",
-    ),
-    (
-        'type: "window_data" source: "s" batchsize: 2 det_fg_threshold: 0.6 det_bg_threshold: 0.4 '
-        'det_fg_fraction: 0.3 det_context_pad: 7 det_crop_mode: "square"',
-        'type: "WindowData" window_data_param { source: "s" batch_size: 2 fg_threshold: 0.6 '
-        'bg_threshold: 0.4 fg_fraction: 0.3 context_pad: 7 crop_mode: "square" }',
-    ),
-    (
-        'type: "hdf5_data" source: "s" batchsize: 2',
-        'type: "HDF5Data" hdf5_data_param { source: "s" batch_size: 2 }',
-    ),
-    (
-        'type: "hdf5_output" hdf5_output_param { file_name: "o" }',
-        'type: "HDF5Output" hdf5_output_param { file_name: "o" }',
-    ),
-    (
-        'type: "infogain_loss" source: "s"',
-        'type: "InfogainLoss" infogain_loss_param { source: "s" }',
-    ),
-    (
-        'type: "innerproduct" num_output: 2 biasterm: false weight_filler { std: 2 } bias_filler { value: 3 }',
-        'type: "InnerProduct" inner_product_param { num_output: 2 bias_term: false weight_filler { std: '
-        "2 } bias_filler { value: 3 } }",
-    ),
-    (
-        'type: "conv" pad: 1 bias_filler { value: 3 }',
-        'type: "Convolution" convolution_param { pad: 1 bias_filler { value: 3 } }',
-    ),
-    (
-        'type: "pool" pool: STOCHASTIC',
-        'type: "Pooling" pooling_param { pool: STOCHASTIC }',
-    ),
-    (
-        'type: "dropout" dropout_ratio: 0.2',
-        'type: "Dropout" dropout_param { dropout_ratio: 0.2 }',
-    ),
-    (
-        'type: "lrn" local_size: 3 alpha: 2 beta: 0.5 k: 4',
-        'type: "LRN" lrn_param { local_size: 3 alpha: 2 beta: 0.5 k: 4 }',
-    ),
-    (
-        'type: "concat" concat_dim: 0',
-        'type: "Concat" concat_param { concat_dim: 0 }',
-    ),
-    (
-        'type: "accuracy"',
-        'type: "Accuracy"',
-    ),
-    (
-        'type: "bnll"',
-        'type: "BNLL"',
-    ),
-    (
-        'type: "euclidean_loss"',
-        'type: "EuclideanLoss"',
-    ),
-    (
-        'type: "flatten"',
-        'type: "Flatten"',
-    ),
-    (
-        'type: "im2col"',
-        'type: "Im2col"',
-    ),
-    (
-        'type: "multinomial_logistic_loss"',
-        'type: "MultinomialLogisticLoss"',
-    ),
-    (
-        'type: "relu"',
-        'type: "ReLU"',
-    ),
-    (
-        'type: "sigmoid"',
-        'type: "Sigmoid"',
-    ),
-    (
-        'type: "softmax"',
-        'type: "Softmax"',
-    ),
-    (
-        'type: "softmax_loss"',
-        'type: "SoftmaxWithLoss"',
-    ),
-    (
-        'type: "split"',
-        'type: "Split"',
-    ),
-    (
-        'type: "tanh"',
-        'type: "TanH"',
-    ),
-]
 
-
-@pytest.mark.parametrize(("old", "new"), V0_LAYERS, ids=lambda text: text.split('"')[1])
-def test_v0_layer(old: str, new: str, caplog: pytest.LogCaptureFixture) -> None:
-    net, _ = parse_net_text(f'layers {{ layer {{ name: "l" {old} }} top: "t" }}', "f")
-    assert net == net_of(f'layer {{ name: "l" top: "t" {new} }}')
+@pytest.mark.parametrize("case", V0_LAYERS.values(), ids=V0_LAYERS)
+def test_v0_layer(case: dict[str, str], caplog: pytest.LogCaptureFixture) -> None:
+    net, _ = parse_net_text(f'layers {{ layer {{ name: "l" {case["old"]} }} top: "t" }}', "f")
+    assert net == net_of(f'layer {{ name: "l" top: "t" {case["new"]} }}')
     assert "Unknown parameter" not in caplog.text
 
 
@@ -372,40 +155,12 @@ def test_padding_is_merged_where_its_blob_is_used_last_made() -> None:
     assert [(layer.layer.name, layer.layer.HasField("pad")) for layer in net.layers] == [("c1", True), ("c2", False)]
 
 
-PADDING_FAULTS = {
-    "feeds no convolution": (
-        'layers { layer { name: "r" type: "relu" }\n bottom: "p" }',
-        'f:3:2: layer "r" (relu): padding layer "p" feeds it; only a conv or pool layer with one bottom can pad',
-    ),
-    "feeds one of two bottoms": (
-        'layers { layer { name: "c" type: "conv" }\n bottom: "data" bottom: "p" }',
-        'f:3:2: layer "c" (conv): padding layer "p" feeds it; only a conv or pool layer with one bottom can pad',
-    ),
-    "two bottoms": (
-        'layers { layer { name: "q" type: "padding" }\n bottom: "p" bottom: "p" top: "q" }',
-        'f:3:2: layer "q" (padding): a padding layer has one bottom, found 2',
-    ),
-    "no top": (
-        'layers { layer { name: "q" type: "padding" } bottom: "p" }',
-        'f:2:1: layer "q" (padding): a padding layer has one top, found 0',
-    ),
-    "unknown bottom": (
-        'layers { layer { name: "c" type: "conv" }\n bottom: "daat" }',
-        'f:3:2: layer "c" (conv): unknown bottom blob "daat"; did you mean "data"?',
-    ),
-    "unknown type": (
-        'layers { layer { name: "c"\n type: "inner_product" } }',
-        'f:3:2: layer "c": unknown V0 layer type "inner_product"; did you mean "innerproduct"?',
-    ),
-}
-
-
-@pytest.mark.parametrize(("text", "message"), PADDING_FAULTS.values(), ids=PADDING_FAULTS.keys())
-def test_v0_fault(text: str, message: str) -> None:
+@pytest.mark.parametrize("case", V0_FAULTS.values(), ids=V0_FAULTS)
+def test_v0_fault(case: dict[str, str]) -> None:
     start = 'input: "data" layers { layer { name: "p" type: "padding" } bottom: "data" top: "p" }\n'
     with pytest.raises(SpecError) as caught:
-        parse_net_text(start + text, "f")
-    assert str(caught.value) == message
+        parse_net_text(start + case["text"], "f")
+    assert str(caught.value) == case["fault"]
 
 
 # ---- V1 ----

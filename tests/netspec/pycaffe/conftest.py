@@ -7,9 +7,6 @@ from typing import Any
 import pytest
 
 import netspec.pycaffe as caffe
-from netspec.pycaffe import logs
-
-logs.stop()  # pytest keeps it
 
 
 @pytest.fixture

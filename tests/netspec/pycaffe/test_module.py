@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import forked
 import netspec.pycaffe as caffe
 from netspec.pycaffe import mode
 from paths import ROOT
@@ -103,15 +104,7 @@ def test_no_gpu_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.Log
 
 
 def script(code: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    path = {"PYTHONPATH": str(ROOT), **environment}
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, **path},
-    )
+    return forked.run(forked.snippet, code, folder=folder, **environment)
 
 
 @pytest.mark.slow

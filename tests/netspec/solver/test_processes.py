@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+import forked
 from netspec.solver.extra import newest_pair, read_extra
 from netspec.solver.solver import Solver, load_solver
 from paths import GOLDEN
@@ -58,12 +59,12 @@ def start(*options: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True)
 
 
-def train(*options: str) -> str:
+def train(*options: str, status: int = 0) -> str:
     """Train in two processes and return what they wrote to stderr."""
-    started = start(*options)
-    _, told = started.communicate(timeout=LIMIT)
-    assert started.returncode == 0, told
-    return told
+    words = [*TORCHRUN[2:], "-m", "netspec", "train", "--solver", "solver.prototxt", *options]
+    done = forked.run(forked.main, TORCHRUN[2], words, folder=Path.cwd())
+    assert (done.returncode != 0) == (status != 0), done.stderr
+    return done.stderr
 
 
 def weights(solver: Solver, snapshot: str = "") -> list[np.ndarray]:
@@ -114,9 +115,9 @@ def test_two_processes_follow_one_with_twice_the_batch() -> None:
     alone.close()
 
 
-def test_each_process_has_its_own_statistics_and_draws() -> None:
+def test_each_process_has_its_own_statistics_and_draws_and_a_training_goes_on_to_the_bit() -> None:
     """As the replicas of one process, to the bit: also where batches of half the size are not one of the whole."""
-    write(batch=8, iterations=10, middle=OWN)
+    write(batch=8, iterations=20, middle=OWN, snapshot=10)
     train()
     together = load_solver("solver.prototxt", device=[CPU, CPU])
     together.step(10)
@@ -128,21 +129,17 @@ def test_each_process_has_its_own_statistics_and_draws() -> None:
         assert np.array_equal(mine, theirs)
     together.close()
 
-
-def test_a_training_goes_on_to_the_bit() -> None:
-    write(batch=8, iterations=20, prefix="whole", middle=OWN)
-    train()
-    write(batch=8, iterations=10, prefix="parts", middle=OWN)
-    train()
-    write(batch=8, iterations=20, prefix="parts", middle=OWN)
-    assert "as if it had never stopped" in train("--resume")
-    model = "{}_iter_20.caffemodel"
-    assert Path(model.format("whole")).read_bytes() == Path(model.format("parts")).read_bytes()
-    extras = [read_extra(f"{prefix}_iter_20.solverstate") for prefix in ("whole", "parts")]
-    assert extras[0] is not None
-    assert extras[1] is not None
-    assert len(extras[0].nets) == 3, "two of training and one of testing"
-    assert (extras[0].nets, extras[0].losses) == (extras[1].nets, extras[1].losses)
+    ends = []
+    for words in ([], ["--resume"]):
+        if words:
+            assert "as if it had never stopped" in train(*words)
+        extra = read_extra("x_iter_20.solverstate")
+        assert extra is not None
+        assert len(extra.nets) == 3, "two of training and one of testing"
+        ends.append((Path("x_iter_20.caffemodel").read_bytes(), extra.nets, extra.losses))
+        for path in Path().glob("x_iter_20.*"):
+            path.unlink()
+    assert ends[0] == ends[1]
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
@@ -176,15 +173,10 @@ def test_a_killed_process_ends_the_training_and_the_last_snapshot_is_whole() -> 
 def test_a_fault_of_the_files_is_told_once() -> None:
     write(batch=8, iterations=10)
     Path("net.prototxt").write_text(Path("net.prototxt").read_text().replace("Convolution", "Convolutoin", 1))
-    started = start()
-    _, told = started.communicate(timeout=LIMIT)
-    assert started.returncode != 0
+    told = train(status=1)
     assert len([line for line in told.splitlines() if line.startswith("net.prototxt:")]) == 1, told
 
 
 def test_a_gpu_is_not_chosen_where_torchrun_chooses() -> None:
     write(batch=8, iterations=10)
-    started = start("--gpu", "0,1")
-    _, told = started.communicate(timeout=LIMIT)
-    assert started.returncode != 0
-    assert "leave out --gpu" in told
+    assert "leave out --gpu" in train("--gpu", "0,1", status=1)
