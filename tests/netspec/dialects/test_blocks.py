@@ -163,22 +163,6 @@ def test_interp(build: Build, gradcheck: Gradcheck, settings: str, size: tuple[i
     gradcheck(layer, *bottoms, fixed=(1,))
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ("", "found none of them"),
-        ("height: 3", "found height"),
-        ("zoom_factor: 2 height: 3 width: 3", "found zoom_factor, height, width"),
-        ("zoom_factor: 0", "zoom_factor must be at least 1, found 0"),
-        ("zoom_factor: 2 pad_beg: 1", "pad_beg must be 0, or negative"),
-        ("zoom_factor: 2 pad_end: -5", "leave nothing of a map of 5 x 6"),
-    ],
-)
-def test_interp_refuses(build: Build, settings: str, message: str) -> None:
-    with pytest.raises(SpecError, match=message):
-        build("blocks", f"type: 'Interp' interp_param {{ {settings} }}", (1, 1, 5, 6))
-
-
 def test_upsample_repeats_pixels_without_a_mask(build: Build, gradcheck: Gradcheck) -> None:
     x = numbers(2, 3, 2, 3)
     layer = build("blocks", "type: 'Upsample' upsample_param { scale: 2 }", x.shape)
@@ -233,21 +217,6 @@ def test_upsample_undoes_pooling() -> None:
     kept = top != 0
     assert int(kept.sum()) == 2 * 3 * 3
     assert torch.equal(top[kept], x[kept])
-
-
-@pytest.mark.parametrize(
-    ("settings", "shapes", "message"),
-    [
-        ("upsample_h: 7", [(1, 1, 3, 2)] * 2, "found upsample_h alone, expected upsample_h and upsample_w"),
-        ("scale: 3 pad_out_w: true", [(1, 1, 3, 2)] * 2, "pad_out_w needs a scale of 2, found 3"),
-        ("scale_h: 3 scale_w: 2", [(1, 1, 3, 2)], "without a mask as second bottom only scale can be set"),
-        ("scale: 0", [(1, 1, 3, 2)], "the top would have no pixel, 0 x 0"),
-        ("scale: 2", [(1, 1, 3, 2), (1, 1, 2, 2)], "the mask's the same"),
-    ],
-)
-def test_upsample_refuses(build: Build, settings: str, shapes: list[tuple[int, ...]], message: str) -> None:
-    with pytest.raises(SpecError, match=message):
-        build("blocks", f"type: 'Upsample' upsample_param {{ {settings} }}", *shapes)
 
 
 def test_upsample_refuses_a_mask_of_a_larger_map(build: Build) -> None:

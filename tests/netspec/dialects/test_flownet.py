@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.errors import SpecError
 from netspec.layers import Layer
 
 Build = Callable[..., Layer]
@@ -102,17 +101,3 @@ def test_the_length_of_the_channels(build: Build, gradcheck: Gradcheck) -> None:
     layer = build("flownet", "type: 'ChannelNorm'", maps.shape)
     torch.testing.assert_close(layer.run(maps)[0][:, 0], maps.square().sum(1).sqrt())
     gradcheck(layer, maps)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (CORRELATION.format("max_displacement: 1"), "kernel_size must be at least 1"),
-        (CORRELATION.format("kernel_size: 1 max_displacement: 9"), "the top would have no pixel"),
-        (CORRELATION.format("kernel_size: 2 max_displacement: 1"), "expected an odd kernel_size"),
-        ("type: 'FlowWarp'", r"expected \(N, 2, H, W\)"),
-    ],
-)
-def test_what_is_refused(build: Build, text: str, message: str) -> None:
-    with pytest.raises(SpecError, match=message):
-        build("flownet", text, (1, 3, 5, 6), (1, 3, 5, 6))

@@ -161,26 +161,6 @@ def test_prior_boxes_are_clipped_and_have_their_variances(build: Build) -> None:
     np.testing.assert_array_equal(top[0, 1].numpy(), np.tile(np.array([0.1, 0.2, 0.3, 0.4], np.float32), 4))
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ("", "min_size must be given"),
-        ("min_size: 0.5 img_size: 9", "min_size must be given and be at least 1"),
-        ("min_size: 5 max_size: 9 max_size: 10 img_size: 9", "found 2 max_size, expected none or 1"),
-        ("min_size: 5 max_size: 5 img_size: 9", "max_size 5 must be greater than its min_size 5"),
-        ("min_size: 5 variance: 0.1 variance: 0.1 img_size: 9", "variance must be one number or four"),
-        ("min_size: 5 aspect_ratio: 0 img_size: 9", "aspect_ratio must be above 0"),
-        ("min_size: 5 img_size: 9 img_h: 9", "expected img_size, or both img_h and img_w.*found img_size and img_h"),
-        ("min_size: 5 img_size: 9 step_h: 9", "expected step, or both step_h and step_w.*found step_h"),
-        ("min_size: 5 img_size: 9 step: -1", "above 0; found step"),
-        ("min_size: 5", "the image is missing"),
-    ],
-)
-def test_prior_box_refuses(build: Build, settings: str, message: str) -> None:
-    with pytest.raises(SpecError, match=message):
-        build("ssd", f"type: 'PriorBox' prior_box_param {{ {settings} }}", (1, 1, 2, 2))
-
-
 # ---- DetectionOutput ----
 
 
@@ -318,26 +298,6 @@ def test_detection_output_with_the_variance_in_the_target(build: Build) -> None:
     prior = torch.tensor([[[0.1, 0.1, 0.5, 0.5], [9.0, 9.0, 9.0, 9.0]]])
     top = run(layer, torch.full((1, 4), 0.25), torch.tensor([[0.1, 0.9]]), prior)
     np.testing.assert_allclose(top[0, 0], [[0, 1, 0.9, 0.35, 0.35, 0.75, 0.75]], rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("settings", "shapes", "message"),
-    [
-        ("", [(1, 8), (1, 4), (1, 2, 8)], "num_classes must be given"),
-        (
-            "num_classes: 2",
-            [(1, 12), (1, 4), (1, 2, 8)],
-            r"found numbers of boxes of shape \(1, 12\), expected \(1, 8\)",
-        ),
-        ("num_classes: 2", [(1, 8), (2, 4), (1, 2, 8)], r"found confidences of shape \(2, 4\), expected \(1, 4\)"),
-        ("num_classes: 2", [(1, 8), (1, 4), (2, 8)], r"found priors of shape \(2, 8\)"),
-        ("num_classes: 2 nms_param { eta: 0 }", [(1, 8), (1, 4), (1, 2, 8)], "eta must be above 0, at most 1"),
-        ("num_classes: 2 nms_param { nms_threshold: -1 }", [(1, 8), (1, 4), (1, 2, 8)], "must not be negative"),
-    ],
-)
-def test_detection_output_refuses(build: Build, settings: str, shapes: list[tuple[int, ...]], message: str) -> None:
-    with pytest.raises(SpecError, match=message):
-        build("ssd", f"type: 'DetectionOutput' detection_output_param {{ {settings} }}", *shapes)
 
 
 def test_what_detection_output_does_not_do_is_named(caplog: pytest.LogCaptureFixture) -> None:

@@ -132,29 +132,6 @@ def test_prelu_learns_one_slope_a_channel_or_one_for_all(build, gradcheck) -> No
     gradcheck(layer, torch.randn(2, 3, 4))
 
 
-@pytest.mark.parametrize(
-    ("text", "shapes", "message"),
-    [
-        ('type: "PReLU"', [(3,)], "bottom: bottom has shape (3,), expected at least 2 axes (N, C, ...)"),
-        (
-            'type: "Exp" exp_param { base: -2 }',
-            [(3,)],
-            "exp_param.base: found base -2, expected a positive one, or -1 for e",
-        ),
-        (
-            'type: "Log" log_param { base: 1 }',
-            [(3,)],
-            "log_param.base: found base 1, expected a positive one other than 1, or -1 for e",
-        ),
-        ('type: "ReLU"', [(3,), (3,)], "bottom: found 2 bottom blob(s), expected 1"),
-    ],
-)
-def test_bad_activation_is_refused(build, text: str, shapes: list, message: str) -> None:
-    with pytest.raises(SpecError) as fault:
-        build(text, *shapes)
-    assert str(fault.value) == message
-
-
 def test_clip_without_both_ends_is_refused(build) -> None:
     from netspec.layers import layer_class
     from netspec.proto.schema import LayerParameter

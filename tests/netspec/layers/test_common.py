@@ -42,20 +42,6 @@ def test_inner_product_takes_another_batch_but_no_other_length(build) -> None:
         layer.run(torch.randn(2, 3, 5))
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ("", "inner_product_param.num_output: num_output must be at least 1"),
-        ("num_output: 3 axis: 2", "inner_product_param.axis: axis 2 is out of range"),
-        ('num_output: 3 weight_filler { type: "gauss" }', 'unknown filler "gauss"; did you mean'),
-    ],
-)
-def test_a_wrong_inner_product_is_refused(build, settings: str, words: str) -> None:
-    with pytest.raises(SpecError) as error:
-        build(f'type: "InnerProduct" inner_product_param {{ {settings} }}', (2, 3))
-    assert words in str(error.value)
-
-
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 0.8])
 def test_dropout_zeroes_a_share_and_scales_the_rest_in_training(build, ratio: float) -> None:
     layer = build(f'type: "Dropout" dropout_param {{ dropout_ratio: {ratio} }}', (40, 1000), phase=TRAIN)

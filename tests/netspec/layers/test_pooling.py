@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.errors import SpecError
 from netspec.proto.schema import TRAIN
 
 LOWEST = np.finfo(np.float32).min  # -FLT_MAX
@@ -224,42 +223,6 @@ def test_stochastic_pooling_in_the_test_phase_weights_each_pixel_by_itself(build
     assert layer.run(torch.zeros(1, 1, 4, 4))[0].count_nonzero() == 0  # 0 / FLT_MIN
 
 
-@pytest.mark.parametrize(
-    ("settings", "shape", "tops", "words"),
-    [
-        (
-            "stride: 2",
-            (1, 1, 4, 4),
-            1,
-            "pooling_param: kernel_size (or kernel_h and kernel_w, or global_pooling) is",
-        ),
-        ("kernel_size: 0", (1, 1, 4, 4), 1, "pooling_param.kernel_size: kernel_size must be at least 1, found 0 x 0"),
-        ("kernel_h: 2", (1, 1, 4, 4), 1, "pooling_param.kernel_h: found kernel_h only"),
-        ("kernel_size: 2 kernel_h: 2 kernel_w: 2", (1, 1, 4, 4), 1, "found both kernel_size and kernel_h"),
-        ("kernel_size: 2 stride: 0", (1, 1, 4, 4), 1, "pooling_param.stride: stride must be at least 1"),
-        ("kernel_size: 2 stride_h: 2 stride_w: 0", (1, 1, 4, 4), 1, "stride must be at least 1, found 2 x 0"),
-        ("kernel_size: 2 pad: 1 pad_h: 1 pad_w: 1", (1, 1, 4, 4), 1, "found both pad and pad_h"),
-        ("kernel_size: 2 pad: 2", (1, 1, 4, 4), 1, "pad (2, 2) must be less than the kernel (2, 2)"),
-        ("pool: STOCHASTIC kernel_size: 2 pad: 1", (1, 1, 4, 4), 1, "STOCHASTIC pooling does not support padding"),
-        (
-            "global_pooling: true kernel_size: 2",
-            (1, 1, 4, 4),
-            1,
-            "pooling_param.kernel_size: global_pooling takes the",
-        ),
-        ("global_pooling: true stride: 2", (1, 1, 4, 4), 1, "global_pooling requires pad 0 and stride 1"),
-        ("global_pooling: true pad: 1", (1, 1, 4, 4), 1, "global_pooling requires pad 0 and stride 1"),
-        ("pool: AVE kernel_size: 2", (1, 1, 4, 4), 2, "top.1: only MAX pooling has a second top"),
-        ("kernel_size: 2", (1, 4, 4), 1, "bottom: pooling needs a bottom of 4 axes"),
-        ("kernel_size: 5", (1, 1, 4, 4), 1, "no window of (5, 5) at stride (1, 1), pad (0, 0), fits a map of (4, 4)"),
-    ],
-)
-def test_wrong_pooling_is_refused(build, settings: str, shape: tuple, tops: int, words: str) -> None:
-    with pytest.raises(SpecError) as error:
-        build(f'type: "Pooling" pooling_param {{ {settings} }}', shape, tops=tops)
-    assert words in str(error.value)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["MAX", "AVE"])
 def test_spp_puts_the_levels_side_by_side(build, gradcheck, method: str) -> None:
@@ -284,18 +247,3 @@ def test_spp_of_one_level_keeps_four_axes(build) -> None:
     data = torch.randn(2, 3, 5, 7)
     assert layer.top_shapes == [(2, 3, 1, 1)]
     assert torch.equal(layer.run(data)[0], data.amax((2, 3), keepdim=True))
-
-
-@pytest.mark.parametrize(
-    ("settings", "shape", "words"),
-    [
-        ("", (2, 3, 9, 9), "spp_param.pyramid_height: pyramid_height must be at least 1"),
-        ("pyramid_height: 3", (2, 3, 5, 9), "spp_param: pad (2, 2) must be less than the kernel (2, 3)"),
-        ("pyramid_height: 2 pool: STOCHASTIC", (2, 3, 5, 9), "STOCHASTIC pooling does not support padding"),
-        ("pyramid_height: 2", (2, 3, 5), "SPP needs a bottom of 4 axes"),
-    ],
-)
-def test_wrong_spp_is_refused(build, settings: str, shape: tuple, words: str) -> None:
-    with pytest.raises(SpecError) as error:
-        build(f'type: "SPP" spp_param {{ {settings} }}', shape)
-    assert words in str(error.value)

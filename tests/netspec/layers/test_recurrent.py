@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.errors import SpecError
-
 T, N, INPUTS, STATIC, D = 4, 2, 3, 5, 6
 PARAM = (
     f"recurrent_param {{ num_output: {D} expose_hidden: %s "
@@ -162,82 +160,3 @@ def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
 
 
 # Faults
-
-
-@pytest.mark.parametrize(
-    ("layer", "shapes", "tops", "message"),
-    [
-        (
-            'type: "LSTM"',
-            [(T, N, 3), (T, N)],
-            1,
-            "recurrent_param.num_output: found num_output 0, expected a positive number",
-        ),
-        (
-            text("LSTM"),
-            [(T, N, 3), (N, T)],
-            1,
-            "bottom.1: found cont of shape (2, 4), expected (4, 2) for x of shape (4, 2, 3)",
-        ),
-        (
-            text("LSTM"),
-            [(T,), (T, N)],
-            1,
-            "bottom.0: found a bottom of shape (4,), expected (time steps, streams, inputs, ...)",
-        ),
-        (
-            text("RNN"),
-            [(T, N), (T, N)],
-            1,
-            "bottom.0: found a bottom of shape (4, 2), expected (time steps, streams, inputs, ...)",
-        ),
-        (
-            text("RNN"),
-            [(T, N, 3), (T, N), (N,)],
-            1,
-            "bottom.2: found x_static of shape (2,), expected (streams, inputs, ...)",
-        ),
-        (
-            text("RNN"),
-            [(T, N, 3), (T, N), (T, 5)],
-            1,
-            "bottom.2: found x_static of shape (4, 5), expected (2, ...) for x of shape (4, 2, 3)",
-        ),
-        (text("LSTM"), [(T, N, 3), (T, N)], 3, "top: found 3 top blob(s), expected the output"),
-        (
-            text("LSTM", True),
-            [(T, N, 3), (T, N), (1, N, D)],
-            3,
-            "bottom: found 3 bottom blob(s), expected x, cont, [x_static], h, c",
-        ),
-        (
-            text("LSTM", True),
-            [(T, N, 3), (T, N), (1, N, D), (1, N, D)],
-            1,
-            "top: found 1 top blob(s), expected the output, h, c",
-        ),
-        (
-            text("LSTM", True),
-            [(T, N, 3), (T, N), (1, N, D), (N, D)],
-            3,
-            "bottom.3: found c of shape (2, 6), expected (1, 2, 6)",
-        ),
-        (
-            'type: "LSTMUnit"',
-            [(1, N, D), (1, N, D), (1, N)],
-            2,
-            "bottom.1: found gates of shape (1, 2, 6), expected (1, 2, 24)",
-        ),
-        ('type: "LSTMUnit"', [(N, D), (1, N, D), (1, N)], 2, "bottom.0: found a cell of shape (2, 6), expected (1,"),
-        (
-            'type: "LSTMUnit"',
-            [(1, N, D), (1, N, 4 * D), (N,)],
-            2,
-            "bottom.2: found cont of shape (2,), expected (1, 2)",
-        ),
-    ],
-)
-def test_bad_recurrence_is_refused(build, layer: str, shapes: list, tops: int, message: str) -> None:
-    with pytest.raises(SpecError) as fault:
-        build(layer, *shapes, tops=tops)
-    assert str(fault.value).startswith(message)

@@ -1,0 +1,22 @@
+"""What layers refuse when they are built: settings and bottoms, each in one line that names the field."""
+
+import pytest
+
+from cases import read_cases
+from contexts import context
+from netspec.errors import SpecError, Where
+from netspec.net.one_layer import make_layer
+
+CASES = read_cases("netspec/layers/cases/refused.txt")
+
+
+def at(*path: str | int) -> Where:
+    return Where(".".join(map(str, path)))
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_it_is_refused_at_its_field(case: dict[str, str]) -> None:
+    shapes = [tuple(map(int, line.split())) for line in case["bottoms"].splitlines()]
+    with pytest.raises(SpecError) as fault:
+        make_layer(case["layer"], shapes, context(at=at), int(case.get("tops", 1)))
+    assert str(fault.value) == case["fault"]
