@@ -54,7 +54,7 @@ def run(function: Callable[..., None], *arguments: object, folder: Path, **envir
     out, err = folder / "out.log", folder / "err.log"
     status = wait(start(function, *arguments, folder=folder, out=out, err=err, environment=environment))
     assert status is not None, f"it does not end: {err.read_text()}"
-    return CompletedProcess(arguments, status, out.read_text(), err.read_text())
+    return CompletedProcess(str(arguments), status, out.read_text(), err.read_text())
 
 
 def _begin(

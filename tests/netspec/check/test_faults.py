@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import netspec
-from cases import read_cases
+from case_files import read_cases
 from netspec.data.blobs import from_array
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum

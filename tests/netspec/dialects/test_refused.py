@@ -2,7 +2,7 @@
 
 import pytest
 
-from cases import read_cases
+from case_files import read_cases
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Context

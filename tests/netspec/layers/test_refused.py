@@ -2,7 +2,7 @@
 
 import pytest
 
-from cases import read_cases
+from case_files import read_cases
 from contexts import context
 from netspec.errors import SpecError, Where
 from netspec.net.one_layer import make_layer

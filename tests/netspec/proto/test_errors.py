@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from cases import read_cases
+from case_files import read_cases
 from netspec.errors import SpecError
 from netspec.proto.text import parse_net_text, parse_solver_text, read_net, read_solver
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from google.protobuf import text_format
 
-from cases import read_cases
+from case_files import read_cases
 from netspec.errors import SpecError
 from netspec.proto.schema import NetParameter, SolverParameter, V1LayerParameter
 from netspec.proto.source_map import Place, SourceMap

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-from cases import read_cases
+from case_files import read_cases
 from each import each
 
 pytestmark = pytest.mark.slow

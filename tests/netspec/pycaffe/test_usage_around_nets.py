@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as pycaffe
-from cases import read_cases
+from case_files import read_cases
 from each import each
 from netspec.dialects import use_dialect
 from netspec.scripts import finder
