@@ -157,3 +157,6 @@ def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
     torch.autograd.gradcheck(lambda cell, gates: layer.run(cell, gates, cont), (cell, gates))
     torch.autograd.backward([top.sum() for top in layer.run(cell, gates, cont)])
     assert cont.grad is None
+
+
+# Faults

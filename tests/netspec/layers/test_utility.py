@@ -310,7 +310,7 @@ def test_softmax_gradient_is_made_of_what_memory_holds(build) -> None:
     assert layer.caffes_gradient(torch.zeros(1, 3), top, diff).tolist() == [[0, -5, 2]]
 
 
-# Gradients
+# Gradients and faults
 
 
 @pytest.mark.parametrize(

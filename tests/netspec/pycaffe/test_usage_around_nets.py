@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as pycaffe
-from case_files import read_cases
 from each import each
 from netspec.dialects import use_dialect
 from netspec.scripts import finder
@@ -33,7 +32,85 @@ net = caffe.Net('deploy.prototxt', caffe.TEST)
 transformer = caffe.io.Transformer({'data': net.blobs['data'].data.shape})
 image = np.random.rand(8, 6, 3)
 """
-USES = read_cases("netspec/pycaffe/cases/usage_around_nets.txt")
+USES = {
+    "from caffe.proto import caffe_pb2": "assert caffe_pb2.NetParameter is caffe.proto.caffe_pb2.NetParameter",
+    "import caffe.proto.caffe_pb2": "import caffe.proto.caffe_pb2; caffe.proto.caffe_pb2.NetParameter()",
+    "from caffe.proto.caffe_pb2 import NetParameter": "from caffe.proto.caffe_pb2 import NetParameter; NetParameter()",
+    "from caffe.proto.caffe_pb2 import LayerParameter": "from caffe.proto.caffe_pb2 import LayerParameter",
+    "caffe.proto.caffe_pb2": "assert caffe.proto.caffe_pb2.__name__.endswith('caffe_pb2')",
+    "caffe.proto.caffe_pb2.NetParameter": (
+        "from google.protobuf import text_format\n"
+        "p = caffe_pb2.NetParameter(); text_format.Merge(open('deploy.prototxt').read(), p)\n"
+        "assert [layer.name for layer in p.layer] == ['data', 'pool']"
+    ),
+    "caffe.proto.caffe_pb2.BlobProto": "b = caffe_pb2.BlobProto(); b.data.extend([1, 2]); b.shape.dim.extend([2])",
+    "caffe.proto.caffe_pb2.SolverParameter": "s = caffe_pb2.SolverParameter(); s.base_lr = 0.1; s.test_iter.append(3)",
+    "caffe.proto.caffe_pb2.SolverParameter.GPU": "assert caffe_pb2.SolverParameter.GPU == 1",
+    "caffe.proto.caffe_pb2.Datum": "d = caffe_pb2.Datum(); d.ParseFromString(caffe_pb2.Datum().SerializeToString())",
+    "caffe.proto.caffe_pb2.Datum.FromString": "assert caffe_pb2.Datum.FromString(b'').label == 0",
+    "caffe.proto.caffe_pb2.LayerParameter": "caffe_pb2.LayerParameter(name='x', bottom=['a'])",
+    "caffe.proto.caffe_pb2.ParamSpec": "assert caffe_pb2.ParamSpec(lr_mult=2).decay_mult == 1",
+    "caffe.proto.caffe_pb2.TRAIN": "assert caffe_pb2.TRAIN == caffe.TRAIN",
+    "caffe.proto.caffe_pb2.TEST": "assert caffe_pb2.TEST == caffe.TEST",
+    "caffe.proto.caffe_pb2.Phase.Value": "assert caffe_pb2.Phase.Value('TEST') == 1",
+    "caffe.proto.caffe_pb2.DataParameter.LMDB": "assert caffe_pb2.DataParameter.LMDB == P.Data.LMDB",
+    "caffe.proto.caffe_pb2.PoolingParameter.AVE": "assert caffe_pb2.PoolingParameter.AVE == P.Pooling.AVE",
+    "caffe.proto.caffe_pb2.LabelMap": "m = caffe_pb2.LabelMap(); m.item.add(name='n', label=1, display_name='d')",
+    "caffe.proto.caffe_pb2.BNParameter.INFERENCE": "assert caffe_pb2.BNParameter.INFERENCE == 1",
+    "caffe.io.load_image": "assert caffe.io.load_image('image.png').shape == (8, 6, 3)",
+    "caffe.io.resize_image": "assert caffe.io.resize_image(image, (4, 4)).shape == (4, 4, 3)",
+    "caffe.io.resize": "assert caffe.io.resize(image, (4, 4)).shape == (4, 4, 3)",
+    "caffe.io.oversample": "assert caffe.io.oversample([image], (4, 4)).shape == (10, 4, 4, 3)",
+    "caffe.io.array_to_datum": "assert caffe.io.array_to_datum(image.transpose(2, 0, 1), 1).label == 1",
+    "caffe.io.datum_to_array": "assert caffe.io.datum_to_array(caffe.io.array_to_datum(image)).shape == image.shape",
+    "caffe.io.blobproto_to_array": (
+        "b = caffe_pb2.BlobProto(data=[1, 2], num=1, channels=2, height=1, width=1)\n"
+        "assert caffe.io.blobproto_to_array(b)[0].mean(1).mean(1).tolist() == [1, 2]"
+    ),
+    "caffe.io.caffe_pb2.BlobProto.FromString": "assert not caffe.io.caffe_pb2.BlobProto.FromString(b'').data",
+    "caffe.io.Transformer": "assert transformer.inputs['data'] == (2, 3, 8, 6)",
+    ".set_transpose(..)": "transformer.set_transpose('data', (2, 0, 1))",
+    ".set_mean(..)": "transformer.set_mean('data', np.array([104, 117, 123]))",
+    ".set_channel_swap(..)": "transformer.set_channel_swap('data', (2, 1, 0))",
+    ".set_raw_scale(..)": "transformer.set_raw_scale('data', 255)",
+    ".set_input_scale(..)": "transformer.set_input_scale('data', 0.017)",
+    ".preprocess(..)": (
+        "transformer.set_transpose('data', (2, 0, 1))\n"
+        "net.blobs['data'].data[...] = transformer.preprocess('data', image)\n"
+        "assert np.allclose(net.forward()['prob'][1, :, 0, 0], image.mean((0, 1)), rtol=1e-5)"
+    ),
+    ".deprocess(..)": (
+        "transformer.set_transpose('data', (2, 0, 1))\n"
+        "assert transformer.deprocess('data', net.blobs['data'].data[0]).shape == (8, 6, 3)"
+    ),
+    "caffe.Classifier": "caffe.Classifier('deploy.prototxt', 'net.caffemodel', mean=np.ones(3), image_dims=(9, 9))",
+    ".predict(..)": "assert len(caffe.Classifier('deploy.prototxt', 'net.caffemodel').predict([image], False)) == 1",
+    "from caffe import params": "from caffe import params as P; assert P.Pooling.MAX == 0",
+    "from caffe import layers": "from caffe import layers as L; L.ReLU(L.Input())",
+    "caffe.layers.<Type>": "assert caffe.layers.ReLU(caffe.layers.Input()).fn.type_name == 'ReLU'",
+    "caffe.params.<X>": "assert caffe.params.Eltwise.SUM == 1",
+    "caffe.NetSpec": "n = caffe.NetSpec(); n.data = L.Input(); assert n.to_proto().layer[0].name == 'data'",
+    ".to_proto(..)": "assert L.ReLU(L.Input()).to_proto().layer[1].type == 'ReLU'",
+    "from caffe import to_proto": "from caffe import to_proto; assert len(to_proto(L.Input()).layer) == 1",
+    "caffe.to_proto": "assert 'type: \"Input\"' in str(caffe.to_proto(L.Input()))",
+    "from caffe.coord_map import crop": "from caffe.coord_map import crop",
+    "caffe.coord_map.crop": (
+        "data = L.Input(); up = L.Deconvolution(L.Pooling(data, kernel_size=2, stride=2), kernel_size=4, stride=2)\n"
+        "import caffe.coord_map\n"
+        "assert caffe.coord_map.crop(up, data).fn.params['crop_param']['offset'] == [1]"
+    ),
+    "import caffe.draw": "import caffe.draw; caffe.draw.draw_net_to_file",
+    "caffe.draw.draw_net_to_file": (
+        "import caffe.draw\ncaffe.draw.draw_net_to_file(L.ReLU(L.Input()).to_proto(), 'net.dot', 'TB')"
+    ),
+    "from caffe.draw import get_pydot_graph": "from caffe.draw import get_pydot_graph",
+    "caffe.draw.get_pydot_graph": (
+        "import caffe.draw\nassert caffe.draw.get_pydot_graph(L.ReLU(L.Input()).to_proto(), 'TB').get_nodes()"
+    ),
+    ".param_str": "p = L.Python(param_str='{}').to_proto().layer[0]; assert p.python_param.param_str == '{}'",
+    "caffe._caffe.BlobVec": "import caffe._caffe; caffe._caffe.BlobVec",
+    "import caffe": "import caffe; assert caffe.__name__ == 'netspec.pycaffe'",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -57,6 +134,6 @@ def as_in_netspec_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
 def test_what_scripts_do(use: str) -> None:
     if "draw" in use:
         pytest.importorskip("pydot")
-    if any(word in USES[use]["code"] for word in ("load_image", "resize", "Classifier")):
+    if any(word in USES[use] for word in ("load_image", "resize", "Classifier")):
         pytest.importorskip("skimage")
-    exec(BEFORE + USES[use]["code"], {})
+    exec(BEFORE + USES[use], {})
