@@ -23,10 +23,11 @@ def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     files.announce_known()
     monkeypatch.setattr(dialect, "_known", dict(dialect._known))
     keep_registry(monkeypatch)
+    before = set(sys.modules)
     yield
     files.waiting.clear()  # switched on, never run
     for name in dialect.active():
         dialect.deactivate(name)
-    own = [file.module for file in files.known_files().values()]
-    for name in [name for name in sys.modules if name in own or name.startswith("netspec_dialect_")]:
+    own = {file.module for file in files.known_files().values()} & sys.modules.keys()
+    for name in own | {name for name in sys.modules.keys() - before if name.startswith("netspec_dialect_")}:
         del sys.modules[name]
