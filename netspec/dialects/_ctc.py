@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.layers import Layer
 from netspec.layers.base import Shape
@@ -55,7 +54,6 @@ class CTCGreedyDecoder(Layer):
     label_bottoms = frozenset({0, 1})
     not_exported = "how long a text is follows from the values"
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores = bottom_shapes[0]
         if len(scores) < 3 or any(size != 1 for size in scores[3:]):
@@ -64,7 +62,6 @@ class CTCGreedyDecoder(Layer):
             raise self.error(f"found labels of shape {bottom_shapes[1]}, expected ({scores[1]}, L)", "bottom", 1)
         return [(1, 2, 1, 1) if len(bottom_shapes) > 1 else (scores[1], scores[0], 1, 1)]
 
-    @override
     def forward(self, scores: torch.Tensor, *labels: torch.Tensor) -> torch.Tensor:
         """Return the classes, or how well they agree with the labels."""
         param = value(self.param, DECODER)
@@ -105,14 +102,12 @@ class LabelsequenceAccuracy(Layer):
     label_bottoms = frozenset({0, 1})
     not_exported = "it is for tests"
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores, labels = bottom_shapes
         if len(scores) < 3 or labels[:1] != scores[1:2]:
             raise self.error(f"found shapes {scores} and {labels}, expected (T, N, C) and (N, L)", "bottom")
         return [()]
 
-    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         blank = value(self.param, "labelsequence_accuracy_param").blank_label
         paths, texts = first_maxima(scores.flatten(2)).T.tolist(), labels.flatten(1).long().tolist()
@@ -127,7 +122,6 @@ class _Ctc(torch.autograd.Function):
     """The mean of the costs, 0 for a text that does not fit; the gradient is that of their sum, as warp-ctc's is."""
 
     @staticmethod
-    @override
     def forward(ctx: Any, scores: torch.Tensor, given: tuple[Any, ...], blank: int) -> torch.Tensor:
         flat, steps, lengths = given
         with torch.enable_grad():
@@ -138,7 +132,6 @@ class _Ctc(torch.autograd.Function):
         return total.detach() / len(lengths)
 
     @staticmethod
-    @override
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         return ctx.saved_tensors[0] * grads[0], None, None
 
@@ -183,7 +176,6 @@ class CTCLoss(_CtcLoss):
 
     bottoms = (2, 4)
 
-    @override
     def setup(self) -> None:
         """Refuse what warp-ctc does not compute."""
         param = value(self.param, LOSS)
@@ -193,7 +185,6 @@ class CTCLoss(_CtcLoss):
             )
         self.blank: int = param.blank_index
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the scalar top's shape; the bottoms must have as many sequences."""
         scores, *others = bottom_shapes
@@ -205,7 +196,6 @@ class CTCLoss(_CtcLoss):
                 raise self.error(f"found shape {shape}, expected {items} sequences along axis {axis}", "bottom", i)
         return [()]
 
-    @override
     def forward(self, scores: torch.Tensor, *others: torch.Tensor) -> torch.Tensor:
         """Return the loss."""
         count, items, classes = scores.shape[:3]
@@ -250,14 +240,12 @@ class CtcLoss(_CtcLoss):
 
     bottoms = (2, 2)
 
-    @override
     def setup(self) -> None:
         self.settings = param = value(self.param, LOSS)
         for name in ("alphabet_size", "time_step"):
             if getattr(param, name) < 1:
                 raise self.error(f"{name} must be given and be at least 1", LOSS, name)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores, labels = bottom_shapes
         self.check_scores(scores)
@@ -267,7 +255,6 @@ class CtcLoss(_CtcLoss):
             raise self.error(f"found shapes {scores} and {labels}, expected {expected}", "bottom")
         return [()]
 
-    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         blank = self.settings.blank_label
         texts = [[int(label) for label in row if int(label) != blank] for row in labels.flatten(1).tolist()]

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from typing_extensions import override
 
 from netspec.dialects._boxes import (
     CENTER_SIZE,
@@ -52,7 +51,6 @@ class DetectionOutput(Layer):
         for name in ("save_output_param", "visualize", "visualize_threshold", "save_file")
     )
 
-    @override
     def setup(self) -> None:
         param = value(self.param, "detection_output_param")
         if param.num_classes < 1:
@@ -64,7 +62,6 @@ class DetectionOutput(Layer):
             raise self.error("eta must be above 0, at most 1", "detection_output_param", "nms_param", "eta")
         self.kinds = 1 if param.share_location else param.num_classes
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of one detection; the predictions must suit the priors."""
         param = value(self.param, "detection_output_param")
@@ -75,7 +72,6 @@ class DetectionOutput(Layer):
                 raise self.error(f"{message} for {self.priors} priors", "bottom", i)
         return [(1, 1, 1, 7)]
 
-    @override
     def forward(self, loc: torch.Tensor, conf: torch.Tensor, prior: torch.Tensor, *more: torch.Tensor) -> torch.Tensor:
         param = value(self.param, "detection_output_param")
         priors, variances = as_array(prior).reshape(2, self.priors, 4)

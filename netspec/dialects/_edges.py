@@ -19,9 +19,7 @@ from netspec.data.transformer import Transformer
 from netspec.dialects._pairs import Array, Pair, PairSource, read_labels, read_pairs
 from netspec.layers.base import Shape
 from netspec.layers.data.files import ImageData
-from netspec.layers.exporting import refusal
 from netspec.layers.loss.losses import SigmoidCrossEntropyLoss
-from netspec.layers.targets import OnnxGraph, TorchCode
 
 
 class EdgeMaps(ImageData):
@@ -82,16 +80,9 @@ class Balanced(SigmoidCrossEntropyLoss):
     of_others: ClassVar[float]  # what all that is no edge is weighed by besides
     not_exported = "it is for training"
 
-    @override
     def forward(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
         x, targets = x.reshape(len(x), -1), targets.detach().reshape(len(x), -1)
         edges, others = (targets == 1).to(x), (targets == 0).to(x)
         count = (edges.sum(1, keepdim=True), others.sum(1, keepdim=True))
         weights = (edges * count[1] + self.of_others * others * count[0]) / (count[0] + count[1])
         return F.binary_cross_entropy_with_logits(x, targets.clamp(0, 1), weights, reduction="sum") / len(x)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        raise refusal(self, "ONNX", self.not_exported)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        raise refusal(self, "PyTorch", self.not_exported)

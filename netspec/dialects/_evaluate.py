@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from typing_extensions import override
 
 from netspec.dialects._boxes import Array, as_array, highest, overlaps
 from netspec.errors import SpecError, Where
@@ -46,7 +45,6 @@ class DetectionEvaluate(Layer):
     remembers = True  # which image comes next
     solver_reads = frozenset({"eval_type", "ap_version", "show_per_class_result"})
 
-    @override
     def setup(self) -> None:
         param = value(self.param, "detection_evaluate_param")
         if param.num_classes < 1:
@@ -73,7 +71,6 @@ class DetectionEvaluate(Layer):
                 raise SpecError(f'found "{line}", expected a name, a height and a width', Where(file, number, 1))
         return np.array([(int(row[2]), int(row[1])) for row in rows], np.float32)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         for i, (shape, columns) in enumerate(zip(bottom_shapes, (7, 8), strict=True)):
             if len(shape) != 4 or shape[:2] != (1, 1) or shape[3] != columns:
@@ -83,7 +80,6 @@ class DetectionEvaluate(Layer):
     def restart(self) -> None:
         self._image = 0
 
-    @override
     def forward(self, detections: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         param = value(self.param, "detection_evaluate_param")
         found, boxes = as_array(detections).reshape(-1, 7), as_array(truth).reshape(-1, 8)

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from typing_extensions import override
 
 from netspec.data.images import read_image
 from netspec.dialects._boxes import Array, as_array
@@ -107,13 +106,11 @@ class AnchorTarget(_Sampling):
     bottoms, tops = (3, 4), (4, 4)
     label_bottoms = frozenset(range(4))
 
-    @override
     def setup(self) -> None:
         found = settings(self, feat_stride=1)
         self.stride, self.border = int(found["feat_stride"]), found.get("allowed_border", 0)
         self.anchors = base_anchors(16, RATIOS, found.get("scales", SCALES))
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if len(bottom_shapes[0]) != 4 or bottom_shapes[0][0] != 1:
             raise self.error(f"found scores of shape {bottom_shapes[0]}, expected (1, C, H, W)", "bottom", 0)
@@ -122,7 +119,6 @@ class AnchorTarget(_Sampling):
         count, (height, width) = len(self.anchors), bottom_shapes[0][2:]
         return [(1, 1, count * height, width), *[(1, 4 * count, height, width)] * 3]
 
-    @override
     def forward(
         self, scores: torch.Tensor, boxes: torch.Tensor, image: torch.Tensor, *more: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
@@ -170,11 +166,9 @@ class ProposalTarget(_Sampling):
     label_bottoms = frozenset({0, 1})
     counted_axis = 0
 
-    @override
     def setup(self) -> None:
         self.classes = int(settings(self, num_classes=1)["num_classes"])
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if bottom_shapes[0][1:] != (5,):
             raise self.error(f"found proposals of shape {bottom_shapes[0]}, expected (R, 5)", "bottom", 0)
@@ -182,7 +176,6 @@ class ProposalTarget(_Sampling):
             raise self.error(f"found true boxes of shape {bottom_shapes[1]}, expected (n, 5)", "bottom", 1)
         return [(1, 5), (1,), *[(1, 4 * self.classes)] * 3]
 
-    @override
     def forward(self, proposals: torch.Tensor, boxes: torch.Tensor) -> tuple[torch.Tensor, ...]:
         truth = as_array(boxes)
         if truth.shape[1] != 5:
@@ -224,7 +217,6 @@ class RoIData(_Sampling):
     bottoms, tops = (0, 0), (3, 3)
     promises = False  # images differ in size
 
-    @override
     def setup(self) -> None:
         self.entries: Sequence[Mapping[str, Any]] = ()
         self.waiting: list[int] = []
@@ -244,13 +236,11 @@ class RoIData(_Sampling):
     def restart(self) -> None:
         self.waiting = []
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         given = self.context.options.given_shapes
         default = [(1, 3, SHORTEST, LONGEST), (1, 3), (1, 5)]
         return [given.get(name, shape) for name, shape in zip(self.param.top, default, strict=True)]
 
-    @override
     def forward(self) -> tuple[torch.Tensor, ...]:
         if not self.entries:
             raise self.error("no images were given; call net.layers[0].set_roidb(entries)")

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.dialects._boxes import (
     CENTER_SIZE,
@@ -144,7 +143,6 @@ class MultiBoxLoss(Layer):
     not_exported = "it is a training loss; which boxes count depends on their values"
     label_bottoms = frozenset({2, 3})
 
-    @override
     def setup(self) -> None:
         """Check what the parameters say of each other."""
         self.settings: Any = value(self.param, "multibox_loss_param")
@@ -168,7 +166,6 @@ class MultiBoxLoss(Layer):
         self.normalization = normalization_mode(self.param.loss_param, VALID)
         self.parts = list(self.param.propagate_down[:2]) or [True, True]
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the scalar top's shape; the predictions must suit the priors."""
         self.priors = check_predictions(self, bottom_shapes, self.kinds, self.settings.num_classes)
@@ -176,7 +173,6 @@ class MultiBoxLoss(Layer):
             raise self.error(f"found true boxes of shape {bottom_shapes[3]}, expected rows of 8 numbers", "bottom", 3)
         return [()]
 
-    @override
     def forward(self, loc: torch.Tensor, conf: torch.Tensor, prior: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
         """Return the loss; raise SpecError for a true box that cannot be one."""
         p, images = self.settings, loc.shape[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from typing_extensions import override
 
 from netspec.data.blobs import Shape
 from netspec.layers import Layer
@@ -17,14 +16,12 @@ class Reordered(Layer):
 
     order: list[int]
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if len(bottom_shapes[0]) != len(self.order):
             message = f"found a bottom of shape {bottom_shapes[0]}, expected {len(self.order)} axes as before"
             raise self.error(message, "bottom")
         return [tuple(bottom_shapes[0][axis] for axis in self.order)]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.permute(self.order).contiguous()
 

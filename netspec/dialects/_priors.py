@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from typing_extensions import override
 
 from netspec.dialects._boxes import (
     Array,
@@ -36,7 +35,6 @@ class PriorBox(Layer):
     bottoms = (1, 2)
     label_bottoms = frozenset({0, 1})
 
-    @override
     def setup(self) -> None:
         param = value(self.param, "prior_box_param")
         if not param.min_size or min(param.min_size) < 1:
@@ -99,7 +97,6 @@ class PriorBox(Layer):
             raise self.error(message, "prior_box_param", given[0])
         return getattr(param, given[0]), getattr(param, given[-1])
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of the boxes; lay them."""
         if any(len(shape) != 4 for shape in bottom_shapes):
@@ -119,7 +116,6 @@ class PriorBox(Layer):
         self.boxes = np.stack([boxes.reshape(-1), np.tile(self.variances, boxes.size // 4)])[None]
         return [self.boxes.shape]
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return torch.from_numpy(self.boxes).to(bottoms[0])
 

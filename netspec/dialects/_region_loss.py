@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from typing_extensions import override
 
 from netspec.dialects._boxes import Array, as_array, overlaps
 from netspec.layers.base import Shape
@@ -37,7 +36,6 @@ class RegionLoss(Loss):
 
     not_exported = "it is for training"
 
-    @override
     def setup(self) -> None:
         self.settings = param = value(self.param, GROUP)
         if len(param.biases) != 2 * param.num or param.coords != OBJECT:
@@ -47,7 +45,6 @@ class RegionLoss(Loss):
             raise self.error("a tree or map of classes is not known here", GROUP, "softmax_tree")
         self.anchors = np.array(param.biases, np.float32).reshape(-1, 2)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the scalar top's shape; the map must be square, with the channels of its boxes."""
         maps, truth = bottom_shapes
@@ -58,7 +55,6 @@ class RegionLoss(Loss):
             raise self.error(f"found true boxes of shape {truth}, expected ({maps[0]}, 1, n, 5)", "bottom", 1)
         return [()]
 
-    @override
     def forward(self, maps: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         items, side = maps.shape[0], maps.shape[2]
         cells = as_array(maps).reshape(items, self.settings.num, -1, side, side)
@@ -108,13 +104,11 @@ class _Moved(torch.autograd.Function):
     """The sum of the squares of moves / N; its gradient is the moves / N, as in the fork, not their derivative."""
 
     @staticmethod
-    @override
     def forward(ctx: Any, maps: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(moves)
         return moves.square().sum() / len(maps)
 
     @staticmethod
-    @override
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
         (moves,) = ctx.saved_tensors
         return moves * (grads[0] / len(moves)), None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.layers.activation import Activation
 from netspec.layers.targets import OnnxGraph, TorchCode
@@ -19,7 +18,6 @@ class Capped(Activation):
     gradient_reads = frozenset({"bottom"})
     slope: float
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return torch.where(x >= 6, 6, F.leaky_relu(x, self.slope) if self.slope else F.relu(x))
 

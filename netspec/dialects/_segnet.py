@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.layers import Layer
 from netspec.layers.base import Shape
@@ -54,7 +53,6 @@ class Upsample(Layer):
     bottoms = (1, 2)
     label_bottoms = frozenset({1})
 
-    @override
     def setup(self) -> None:
         param = value(self.param, "upsample_param")
         given = {field.name for field, _ in param.ListFields()}
@@ -72,7 +70,6 @@ class Upsample(Layer):
             if getattr(param, name) and along != 2:
                 raise self.error(f"{name} needs a scale of 2, found {along}", "upsample_param", name)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         param, shape = value(self.param, "upsample_param"), bottom_shapes[0]
         if len(shape) != 4 or any(other != shape for other in bottom_shapes):
@@ -85,7 +82,6 @@ class Upsample(Layer):
             raise self.error(f"the top would have no pixel, {size[0]} x {size[1]}", "upsample_param")
         return [(*shape[:2], *size)]
 
-    @override
     def forward(self, data: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Return the enlarged maps; raise SpecError for a mask of another size."""
         if mask is None:
@@ -146,7 +142,6 @@ class BN(Layer):
     Fork: hszhao/PSPNet and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         param, shape = value(self.param, "bn_param"), self.bottom_shapes[0]
         if not 2 <= len(shape) <= 4:
@@ -168,11 +163,9 @@ class BN(Layer):
             self.add_blob(size, value=float(param.frozen))
             self.not_learned = frozenset(range(4) if param.frozen else (2, 3))
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return as_before(self, bottom_shapes, self.channels)
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalized values; in training also move the averages."""
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (0, 1))

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.dialects._relu6 import Capped
 from netspec.dialects._segnet import BN, Upsample
@@ -91,7 +90,6 @@ class Axpy(Layer):
 
     bottoms = (3, 3)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         a, x, y = bottom_shapes
         if len(a) < 2 or a[:2] != x[:2] or any(size != 1 for size in a[2:]) or x != y:
@@ -99,7 +97,6 @@ class Axpy(Layer):
             raise self.error(message, "bottom")
         return [x]
 
-    @override
     def forward(self, a: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         return torch.addcmul(y, a.reshape(*a.shape[:2], *(1,) * (x.dim() - 2)), x)
 
@@ -127,7 +124,6 @@ class ReLU6(Capped):
     Fork: chuanqi305/ssd and others, src/caffe/layers/relu6_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         self.slope: float = value(self.param, "relu6_param").negative_slope
 
@@ -143,7 +139,6 @@ class DepthwiseConvolution(Convolution):
     Fork: yonghenglh6/DepthwiseConvolution
     """
 
-    @override
     def setup(self) -> None:
         """Set up as Convolution; refuse filters over more than one channel."""
         super().setup()
@@ -167,7 +162,6 @@ class ConvolutionDepthwise(Convolution):
     tops = (1, 1)
     ignores = frozenset({"convolution_param.group"})
 
-    @override
     def setup(self) -> None:
         self.read_geometry()
         if self.spatial_axes != 2:
@@ -190,7 +184,6 @@ class ShuffleChannel(Layer):
     Fork: farmingyard/ShuffleNet, shuffle_channel_layer.cpp
     """
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape, self.group = bottom_shapes[0], value(self.param, "shuffle_channel_param").group
         if len(shape) < 2 or self.group < 1 or shape[1] % self.group:
@@ -198,7 +191,6 @@ class ShuffleChannel(Layer):
             raise self.error(message, "shuffle_channel_param", "group")
         return [shape]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.unflatten(1, (self.group, -1)).transpose(1, 2).flatten(1, 2)
 
@@ -227,7 +219,6 @@ class Interp(Layer):
     bottoms = (1, 2)
     label_bottoms = frozenset({1})
 
-    @override
     def setup(self) -> None:
         param: Any = value(self.param, "interp_param")
         factors = [name for name in ("shrink_factor", "zoom_factor") if param.HasField(name)]
@@ -245,7 +236,6 @@ class Interp(Layer):
                 message = f"{name} must be 0, or negative to cut off pixels, found {getattr(param, name)}"
                 raise self.error(message, "interp_param", name)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         param, shape = value(self.param, "interp_param"), bottom_shapes[0]
         if any(len(each) != 4 for each in bottom_shapes):
@@ -262,7 +252,6 @@ class Interp(Layer):
             size = tuple(length + (length - 1) * (param.zoom_factor - 1) for length in shrunk)
         return [(*shape[:2], *size)]
 
-    @override
     def forward(self, data: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
         param = value(self.param, "interp_param")
         cut = [param.pad_beg, param.pad_end] * 2
@@ -310,7 +299,6 @@ class DeephiResize(Layer):
     Fork: Xilinx' Caffe, src/caffe/layers/deephi_resize_layer.cpp, without its rounding for the DPU
     """
 
-    @override
     def setup(self) -> None:
         self.settings = p = value(self.param, "deephi_resize_param")
         self.nearest = p.resize_type == p.NEAREST
@@ -320,7 +308,6 @@ class DeephiResize(Layer):
                 "expected new_height and new_width, or scale_h and scale_w, above 0", "deephi_resize_param"
             )
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, (shape,) = self.settings, bottom_shapes
         size = p.new_height, p.new_width
@@ -332,7 +319,6 @@ class DeephiResize(Layer):
             )
         return [(*shape[:2], *size)]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return F.interpolate(data, self.top_shapes[0][2:], mode="nearest" if self.nearest else "bilinear")
 

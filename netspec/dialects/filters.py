@@ -21,7 +21,7 @@ from netspec.layers.exporting import refusal
 from netspec.layers.preparing import Kernel, Preparation
 from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision import convolution, pooling, windows
-from netspec.proto.schema import TRAIN, added_value, has, value
+from netspec.proto.schema import TRAIN, LayerParameter, added_value, has, value
 
 DECLARATIONS = """
 extend ConvolutionParameter {
@@ -97,7 +97,6 @@ class Convolution(convolution.Convolution):
             return shape
         return (*shape[:-2], shape[-2] + top + bottom, shape[-1] + left + right)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return super().reshape([self._framed(shape) for shape in bottom_shapes])
 
@@ -105,7 +104,6 @@ class Convolution(convolution.Convolution):
     def overhang(self, shape: Shape) -> list[int]:
         return super().overhang(self._framed(shape))
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         if any(self.sides):
             bottoms = tuple(F.pad(bottom, self.sides) for bottom in bottoms)
@@ -140,7 +138,19 @@ class Convolution(convolution.Convolution):
 POOLING = "pooling_param"
 
 
-@register("Pooling", POOLING, *(f"{POOLING}.{name}" for name in ("pool", *SIDES)), replaces=pooling.Pooling)
+def _differs(param: LayerParameter) -> bool:
+    """Return whether a Pooling layer has one of these fields."""
+    p = param.pooling_param
+    return bool(added_value(p, "pool")) or any(value(p, name) for name in SIDES)
+
+
+@register(
+    "Pooling",
+    POOLING,
+    *(f"{POOLING}.{name}" for name in ("pool", *SIDES)),
+    replaces=pooling.Pooling,
+    where=_differs,
+)
 class Pooling(pooling.Pooling):
     """Caffe's Pooling, with pad_l, pad_r, pad_t and pad_b, and AVE_EXC_PAD: the mean of a window's pixels alone.
 
@@ -152,14 +162,8 @@ class Pooling(pooling.Pooling):
     Fork: foss-for-synopsys-dwc-arc-processors/synopsys-caffe, src/caffe/layers/pooling_layer.cpp
     """
 
-    def __new__(cls, param: Any = None, *arguments: Any) -> Any:
-        """Make Caffe's own layer where the prototxt has none of these fields; a copy is made without a ``param``."""
-        p = None if param is None else param.pooling_param
-        if p is not None and not added_value(p, "pool") and not any(value(p, name) for name in SIDES):
-            return pooling.Pooling(param, *arguments)
-        return super().__new__(cls)
+    not_exported = "it has no pooling with a pad for each side, or of pixels alone"
 
-    @override
     def setup(self) -> None:
         super().setup()
         param = self.param.pooling_param
@@ -175,7 +179,6 @@ class Pooling(pooling.Pooling):
             raise self.error("found both pad and a pad for each side; give one of them", POOLING)
         self.sides = ((up, down), (left, right)) if any((left, right, up, down)) else [(p, p) for p in self.pad]
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the top's shape; each side's pad must be less than the kernel."""
         shape, param = bottom_shapes[0], self.param.pooling_param
@@ -198,7 +201,6 @@ class Pooling(pooling.Pooling):
             self.lengths.append([min(start + kernel, limits[1]) - max(start, limits[0]) for start in starts])
         return [(*shape[:2], *counts)]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         if self.method == pooling.MAX:
             return F.max_pool2d(F.pad(data, self.frame, value=windows.LOWEST), self.kernel, self.stride)
@@ -224,11 +226,14 @@ class Pooling(pooling.Pooling):
         shares = (self._areas() / math.prod(self.kernel)).float()
         return graph.node("Div", graph.node("AveragePool", framed, **geometry), graph.constant(shares[None, None]))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        raise refusal(self, "PyTorch", "it has no pooling with a pad for each side, or of pixels alone")
 
-
-@register("ReLU", "relu_param", "relu_param.relu6", replaces=activation.ReLU)
+@register(
+    "ReLU",
+    "relu_param",
+    "relu_param.relu6",
+    replaces=activation.ReLU,
+    where=lambda param: value(param.relu_param, "relu6"),
+)
 class ReLU(Capped):
     """Caffe's ReLU; with relu6 no more than 6: min(max(x, 0) + negative_slope min(x, 0), 6).
 
@@ -237,13 +242,6 @@ class ReLU(Capped):
     Fork: foss-for-synopsys-dwc-arc-processors/synopsys-caffe, src/caffe/layers/relu_layer.cpp
     """
 
-    def __new__(cls, param: Any = None, *arguments: Any) -> Any:
-        """Make Caffe's own layer where the prototxt does not ask for relu6; a copy is made without a ``param``."""
-        if param is not None and not value(param.relu_param, "relu6"):
-            return activation.ReLU(param, *arguments)
-        return super().__new__(cls)
-
-    @override
     def setup(self) -> None:
         self.slope: float = self.param.relu_param.negative_slope
 
@@ -265,13 +263,11 @@ class Dropout(common.Dropout):
     Fork: rbgirshick/caffe-fast-rcnn; alexgkendall/caffe-segnet, src/caffe/layers/dropout_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         super().setup()
         if value(self.param.dropout_param, "sample_weights_test"):
             self.phase = TRAIN
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         top = super().forward(data)
         return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)

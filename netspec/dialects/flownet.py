@@ -10,7 +10,6 @@ from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape
@@ -82,7 +81,6 @@ class Correlation(_OfMaps):
     bottoms = (2, 2)
     same = slice(None)
 
-    @override
     def setup(self) -> None:
         self.settings = p = value(self.param, "correlation_param")
         for name, least in (("kernel_size", 1), ("stride_1", 1), ("stride_2", 1)):
@@ -92,7 +90,6 @@ class Correlation(_OfMaps):
             found = f"found kernel_size {p.kernel_size}, single_direction {p.single_direction}, do_abs {p.do_abs}"
             raise self.error(f"expected an odd kernel_size, and both directions without do_abs; {found}")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.check_maps(bottom_shapes)
         p, (images, _, *sides) = self.settings, bottom_shapes[0]
@@ -102,7 +99,6 @@ class Correlation(_OfMaps):
             raise self.error(f"the top would have no pixel, {size[0]} x {size[1]}", "correlation_param")
         return [(images, (2 * (p.max_displacement // p.stride_2) + 1) ** 2, *size)]
 
-    @override
     def forward(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
         p, (_, _, *size) = self.settings, self.top_shapes[0]
         height, width = ((side - 1) * p.stride_1 + p.kernel_size for side in size)
@@ -135,13 +131,11 @@ class Resample(_OfMaps):
     label_bottoms = frozenset({0, 1})
     same = slice(0, 0)
 
-    @override
     def setup(self) -> None:
         self.settings = value(self.param, "resample_param")
         if self.settings.type == AREA:
             raise self.error("AREA is not there, in the fork neither", "resample_param", "type")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.check_maps(bottom_shapes)
         size = (self.settings.height, self.settings.width) if len(bottom_shapes) == 1 else bottom_shapes[1][2:]
@@ -149,7 +143,6 @@ class Resample(_OfMaps):
             raise self.error("height and width must be at least 1", "resample_param")
         return [(*bottom_shapes[0][:2], *size)]
 
-    @override
     def forward(self, maps: torch.Tensor, *others: torch.Tensor) -> torch.Tensor:
         steps = [old / new for old, new in zip(maps.shape[2:], self.top_shapes[0][2:], strict=True)]
         rows, columns = (self._weights(maps, axis, steps).to(maps) for axis in (0, 1))
@@ -187,14 +180,12 @@ class FlowWarp(_OfMaps):
     bottoms = (2, 2)
     same = slice(2, None)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.check_maps(bottom_shapes)
         if bottom_shapes[1][:2] != (bottom_shapes[0][0], 2):
             raise self.error(f"found a flow of shape {bottom_shapes[1]}, expected (N, 2, H, W)", "bottom", 1)
         return [bottom_shapes[0]]
 
-    @override
     def forward(self, image: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
         height, width = image.shape[2:]
         grid = torch.meshgrid(*(torch.arange(side, device=flow.device) for side in (height, width)), indexing="ij")
@@ -227,11 +218,9 @@ class ChannelNorm(_OfMaps):
 
     same = slice(0, 0)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.check_maps(bottom_shapes)
         return [(bottom_shapes[0][0], 1, *bottom_shapes[0][2:])]
 
-    @override
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         return maps.norm(dim=1, keepdim=True)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from typing_extensions import override
 
 from netspec.dialects._order import Reordered
 from netspec.layers import Layer, register
@@ -51,7 +50,6 @@ class Transpose(Reordered):
     Fork: senlinuc/caffe_ocr and others, transpose_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         """Read the order, in which each axis has its place."""
         self.order = list(value(self.param, "transpose_param").dim)
@@ -74,7 +72,6 @@ class Reorg(Layer):
     Fork: caffe-yolov2, reorg_layer.cpp; Darknet's reorg_cpu
     """
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         param, shape = value(self.param, "reorg_param"), bottom_shapes[0]
         self.stride: int = param.stride
@@ -92,7 +89,6 @@ class Reorg(Layer):
             return [(images, channels // area, height * self.stride, width * self.stride)]
         return [(images, channels * area, height // self.stride, width // self.stride)]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         images, channels, height, width = data.shape
         few, s = channels // self.stride**2, self.stride
@@ -118,7 +114,6 @@ class MergeCrop(Layer):
 
     bottoms = (2, 2)
 
-    @override
     def setup(self) -> None:
         """Read what passes each bottom."""
         param: Any = value(self.param, "mergecrop_param")
@@ -130,7 +125,6 @@ class MergeCrop(Layer):
         self.learns = [*param.backward, *(True, False)[len(param.backward) :]]
         self.stacks: bool = param.operation == STACK
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         small, large = bottom_shapes
         fits = len(small) == len(large) > 2 and small[0] == large[0] and (self.stacks or small[1] == large[1])
@@ -141,7 +135,6 @@ class MergeCrop(Layer):
         self.window = (..., *(slice(cut, cut + a) for cut, a in zip(cuts, small[2:], strict=True)))
         return [(small[0], small[1] + large[1] * self.stacks, *small[2:])]
 
-    @override
     def forward(self, small: torch.Tensor, large: torch.Tensor) -> torch.Tensor:
         parts = []
         for part, copied, learns in zip((small, large[self.window]), self.copied, self.learns, strict=True):
@@ -159,7 +152,6 @@ class CropCenter(Layer):
     Fork: lltcggie/caffe, src/caffe/layers/crop_center_layer.cpp
     """
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape, cuts = bottom_shapes[0], list(value(self.param, "crop_center_param").crop_size)
         if len(cuts) != len(shape) or any(size <= 2 * cut for size, cut in zip(shape, cuts, strict=False)):
@@ -168,7 +160,6 @@ class CropCenter(Layer):
         self.window = tuple(slice(cut, size - cut) for size, cut in zip(shape, cuts, strict=True))
         return [tuple(size - 2 * cut for size, cut in zip(shape, cuts, strict=True))]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data[self.window].clone()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from typing_extensions import override
 
 from netspec.layers import normalization, register
 from netspec.layers.folding import Affine, blob_in_double
@@ -44,7 +43,6 @@ class BatchNorm(normalization.BatchNorm):
     default_param_lr = 1.0
     not_learned = frozenset(range(SLOPES))
 
-    @override
     def setup(self) -> None:
         super().setup()
         param = self.param.batch_norm_param
@@ -52,7 +50,6 @@ class BatchNorm(normalization.BatchNorm):
         for name, start in (("scale_filler", 1.0), ("bias_filler", 0.0)) if self.scales else ():
             self.add_blob((self.channels,), value(param, name) if has(param, name) else None, value=start)
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         top = super().forward(data)
         if not self.scales:

@@ -14,7 +14,6 @@ from functools import reduce
 import numpy as np
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.dialects._boxes import as_array
 from netspec.dialects._faster import RATIOS, SCALES, AnchorTarget, ProposalTarget, RoIData, settings
@@ -67,7 +66,8 @@ class ROIPooling(RegionPooling):
     Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/roi_pooling_layer.cpp
     """
 
-    @override
+    not_exported = "PyTorch has no pooling of regions; torchvision's roi_pool is near to it"
+
     def setup(self) -> None:
         param = value(self.param, "roi_pooling_param")
         for name in ("pooled_h", "pooled_w"):
@@ -76,11 +76,9 @@ class ROIPooling(RegionPooling):
         self.bins = (param.pooled_h, param.pooled_w)
         self.scale: float = param.spatial_scale
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return [(self.check_regions(bottom_shapes), bottom_shapes[0][1], *self.bins)]
 
-    @override
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
         images, channels, height, width = maps.shape
         with torch.no_grad():
@@ -110,9 +108,6 @@ class ROIPooling(RegionPooling):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         regions = graph.reshape(bottoms[1], [-1, 5])
         return graph.node("MaxRoiPool", bottoms[0], regions, pooled_shape=self.bins, spatial_scale=self.scale)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        raise refusal(self, "PyTorch", "PyTorch has no pooling of regions; torchvision's roi_pool is near to it")
 
 
 Table = tuple[torch.Tensor, torch.Tensor]  # values and the pixels that they come from
@@ -181,7 +176,6 @@ class Proposal(Layer):
     tops = (1, 2)
     label_bottoms = frozenset({0, 1, 2})
 
-    @override
     def setup(self) -> None:
         """Make the anchors of one pixel."""
         self.settings = param = value(self.param, "proposal_param")
@@ -193,7 +187,6 @@ class Proposal(Layer):
                 raise self.error(f"{name} must be above 0", "proposal_param", name)
         self.anchors = base_anchors(param.base_size, param.ratio or (0.5, 1, 2), param.scale or (8, 16, 32))
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores, deltas, image = bottom_shapes
         count = len(self.anchors)
@@ -207,7 +200,6 @@ class Proposal(Layer):
         most = self.settings.post_nms_topn
         return [(most, 5), (most,)][: self.num_tops]
 
-    @override
     def forward(self, scores: torch.Tensor, deltas: torch.Tensor, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the regions and their scores."""
         param = self.settings
@@ -241,7 +233,6 @@ class ProposalLayer(Proposal):
     Fork: rbgirshick/py-faster-rcnn, lib/rpn/proposal_layer.py
     """
 
-    @override
     def setup(self) -> None:
         found = settings(self, feat_stride=1)
         self.settings = param = copy.deepcopy(value(self.param, "proposal_param"))
@@ -272,14 +263,12 @@ class SmoothL1Loss(Loss):
     bottoms = (2, 4)
     label_bottoms = frozenset({2, 3})
 
-    @override
     def setup(self) -> None:
         sigma = value(self.param, "smooth_l1_loss_param").sigma
         if sigma <= 0:
             raise self.error(f"sigma must be above 0, found {sigma:g}", "smooth_l1_loss_param", "sigma")
         self.knee = 1 / (sigma * sigma)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the scalar top's shape; the bottoms must be of one shape, but for ones at its end."""
         full = [(*shape, 1, 1, 1)[: max(4, len(shape))] for shape in bottom_shapes]
@@ -289,7 +278,6 @@ class SmoothL1Loss(Loss):
                 raise self.error(message, "bottom", i)
         return super().reshape(bottom_shapes)
 
-    @override
     def forward(self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
         inside, outside = (*(weight.detach().reshape_as(predictions) for weight in weights), None, None)[:2]
         difference = predictions - targets.reshape_as(predictions)

@@ -16,10 +16,8 @@ from netspec.dialects._boxes import as_array, highest
 from netspec.dialects._regions import RegionPooling, whole
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape
-from netspec.layers.exporting import refusal
 from netspec.layers.loss.base import VALID, Loss, normalization_mode, normalizer, total
 from netspec.layers.loss.scores import SoftmaxWithLoss
-from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import added_value, value
 
 DECLARATIONS = """
@@ -62,7 +60,6 @@ class PSROIPooling(RegionPooling):
 
     not_exported = "there is no position-sensitive pooling of regions"
 
-    @override
     def setup(self) -> None:
         param = value(self.param, "psroi_pooling_param")
         for name in ("output_dim", "group_size"):
@@ -70,7 +67,6 @@ class PSROIPooling(RegionPooling):
                 raise self.error(f"{name} must be given and be at least 1", "psroi_pooling_param", name)
         self.channels, self.bins, self.scale = param.output_dim, param.group_size, param.spatial_scale
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of all regions' bins; the map must have a channel for each."""
         regions = self.check_regions(bottom_shapes)
@@ -80,7 +76,6 @@ class PSROIPooling(RegionPooling):
             raise self.error(message, "bottom", 0)
         return [(regions, self.channels, self.bins, self.bins)]
 
-    @override
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
             regions = regions.reshape(-1, 5)
@@ -133,11 +128,9 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
     tops = (1, 3)
     not_exported = "it is for training"
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return [*super().reshape(bottom_shapes), _four(bottom_shapes[1])][: self.num_tops]
 
-    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss, the softmax, and the losses."""
         tops = super().forward(scores, labels)
@@ -149,12 +142,6 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
             losses = losses.where(valid, 0)
         self._losses = losses.detach()
         return total(losses, exact) / _divisor(self, self.outer, self.inner, valid)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        raise refusal(self, "ONNX", self.not_exported)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        raise refusal(self, "PyTorch", self.not_exported)
 
 
 @register("SmoothL1LossOHEM", *NORMALIZED)
@@ -177,7 +164,6 @@ class SmoothL1LossOHEM(Loss):
     label_bottoms = frozenset({2})
     not_exported = "it is for training"
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         full = [_four(shape) for shape in bottom_shapes]
         for i, shape in enumerate(full):
@@ -187,7 +173,6 @@ class SmoothL1LossOHEM(Loss):
         items, _, *pixels = full[0]
         return [(), (items, 1, *pixels)][: self.num_tops]
 
-    @override
     def forward(
         self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
@@ -220,13 +205,11 @@ class BoxAnnotatorOHEM(Layer):
     label_bottoms = frozenset(range(4))
     not_exported = "it is for training"
 
-    @override
     def setup(self) -> None:
         self.settings = value(self.param, "box_annotator_ohem_param")
         if self.settings.roi_per_img < 1:
             raise self.error("roi_per_img must be given and be at least 1", "box_annotator_ohem_param", "roi_per_img")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         full = [_four(shape) for shape in bottom_shapes]
         (count, five, *pixels), *others = full
@@ -235,7 +218,6 @@ class BoxAnnotatorOHEM(Layer):
                 raise self.error(f"found shape {bottom_shapes[i]}, expected ({count}, {channels})", "bottom", i)
         return [(count, 1, 1, 1), (count, others[2][1], 1, 1)]
 
-    @override
     def forward(
         self, regions: torch.Tensor, losses: torch.Tensor, labels: torch.Tensor, weights: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:

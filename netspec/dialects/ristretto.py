@@ -5,7 +5,6 @@ Not here are MINIFLOAT and LRNRistretto.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,8 +12,6 @@ from typing_extensions import override
 
 from netspec.layers import Layer, register
 from netspec.layers.common import InnerProduct
-from netspec.layers.exporting import refusal
-from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.convolution import Convolution, Deconvolution
 from netspec.proto.schema import TEST, value
 
@@ -66,11 +63,8 @@ def power_of_two(x: torch.Tensor, least: int, most: int) -> torch.Tensor:
 class _Quantized(Layer):
     """What the layers have in common: bottoms, blobs and tops are rounded as quantization_param says."""
 
-    @property
-    def absorbs(self) -> bool:
-        return False
+    not_exported = "its numbers are rounded to few bits"
 
-    @override
     def setup(self) -> None:
         super().setup()
         param = value(self.param, GROUP)
@@ -89,24 +83,13 @@ class _Quantized(Layer):
             return fixed_point(blob, param.bw_params, param.fl_params)
         return power_of_two(blob, param.exp_min, param.exp_max) if index == 0 else blob
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> Any:
         param: Any = value(self.param, GROUP)
         if not self.fixed:
             return super().forward(*bottoms)
         tops = super().forward(*(fixed_point(bottom, param.bw_layer_in, param.fl_layer_in) for bottom in bottoms))
-        rounded = [fixed_point(top, param.bw_layer_out, param.fl_layer_out) for top in _as_tuple(tops)]
-        return tuple(rounded) if isinstance(tops, tuple) else rounded[0]
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        raise refusal(self, "ONNX", "its numbers are rounded to few bits")
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        raise refusal(self, "PyTorch", "its numbers are rounded to few bits")
-
-
-def _as_tuple(tops: Any) -> tuple[torch.Tensor, ...]:
-    return tops if isinstance(tops, tuple) else (tops,)
+        several = tops if isinstance(tops, tuple) else (tops,)
+        return tuple(fixed_point(top, param.bw_layer_out, param.fl_layer_out) for top in several)
 
 
 @register("ConvolutionRistretto", "convolution_param", GROUP)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import torch
 from typing_extensions import override
@@ -17,9 +16,7 @@ from netspec.errors import SpecError
 from netspec.layers import register
 from netspec.layers.base import Shape
 from netspec.layers.data.files import ReadingLayer
-from netspec.layers.exporting import refusal
 from netspec.layers.loss import scores as losses
-from netspec.layers.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import value
 
 DECLARATIONS = """
@@ -139,6 +136,7 @@ class DenseImageData(ReadingLayer):
     "loss_param.weight_by_label_freqs",
     "loss_param.class_weighting",
     replaces=losses.SoftmaxWithLoss,
+    where=lambda param: value(param.loss_param, "weight_by_label_freqs"),
 )
 class SoftmaxWithLoss(losses.SoftmaxWithLoss):
     """Caffe's SoftmaxWithLoss; with weight_by_label_freqs each prediction's loss counts class_weighting[label] times.
@@ -152,18 +150,12 @@ class SoftmaxWithLoss(losses.SoftmaxWithLoss):
     Fork: alexgkendall/caffe-segnet, src/caffe/layers/softmax_loss_layer.cpp
     """
 
-    def __new__(cls, param: Any = None, *arguments: Any) -> Any:
-        """Make Caffe's own layer where the prototxt weighs no classes; a copy is made without a ``param``."""
-        if param is not None and not value(param.loss_param, "weight_by_label_freqs"):
-            return losses.SoftmaxWithLoss(param, *arguments)
-        return super().__new__(cls)
+    not_exported = "it weighs classes, for training"
 
-    @override
     def setup(self) -> None:
         super().setup()
         self.weights = torch.tensor(list(value(self.param.loss_param, "class_weighting")))
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shapes = super().reshape(bottom_shapes)
         if len(self.weights) != self.classes:
@@ -171,7 +163,6 @@ class SoftmaxWithLoss(losses.SoftmaxWithLoss):
             raise self.error(message, "loss_param", "class_weighting")
         return shapes
 
-    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss and, where there is a second top, the softmax."""
         _, label = self.scores_and_labels(scores, labels)
@@ -181,9 +172,3 @@ class SoftmaxWithLoss(losses.SoftmaxWithLoss):
     @override
     def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
         return super().sum_up(losses * self._each, valid, exact)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        raise refusal(self, "ONNX", "it weighs classes, for training")
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        raise refusal(self, "PyTorch", "it weighs classes, for training")

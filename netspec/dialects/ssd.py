@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from typing_extensions import override
 
 from netspec.dialects._annotated import AnnotatedData
 from netspec.dialects._detection import DetectionOutput
@@ -262,7 +261,6 @@ class Permute(Reordered):
     Fork: src/caffe/layers/permute_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         given = list(value(self.param, "permute_param").order)
         axes = len(self.bottom_shapes[0])
@@ -282,7 +280,6 @@ class _Normalized(torch.autograd.Function):
     """
 
     @staticmethod
-    @override
     def forward(ctx: Any, x: torch.Tensor, scale: torch.Tensor, axes: tuple[int, ...], eps: float) -> torch.Tensor:
         length = (x.square().sum(axes, keepdim=True) + eps).sqrt()
         ctx.save_for_backward(x, scale, length)
@@ -290,7 +287,6 @@ class _Normalized(torch.autograd.Function):
         return x / length * scale
 
     @staticmethod
-    @override
     def backward(ctx: Any, dy: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, scale, length = ctx.saved_tensors
         share = (x * dy).sum(ctx.axes, keepdim=True) / length.square()
@@ -311,7 +307,6 @@ class Normalize(Layer):
     Fork: src/caffe/layers/normalize_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         param, shape = value(self.param, "norm_param"), self.bottom_shapes[0]
         if len(shape) < 2:
@@ -319,7 +314,6 @@ class Normalize(Layer):
         filler = param.scale_filler if param.HasField("scale_filler") else None
         self.add_blob(() if param.channel_shared else shape[1:2], filler, value=1.0)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape; there must be a scale for each channel."""
         shape = bottom_shapes[0]
@@ -327,7 +321,6 @@ class Normalize(Layer):
             raise self.error(f"bottom of shape {shape} does not have the {self.blob_shapes[0][0]} channels", "bottom")
         return [shape]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         param = value(self.param, "norm_param")
         axes = tuple(range(1, data.dim())) if param.across_spatial else (1,)

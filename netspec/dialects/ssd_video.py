@@ -125,7 +125,6 @@ class VideoData(ReadingLayer):
     group = "data_param"
     in_order = True
 
-    @override
     def construct(self) -> None:
         switch_on(find_file("ssd"))  # its transform_param
         super().construct()

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from typing_extensions import override
 
 from netspec.dialects._ctc import DECODER, LOSS, CTCGreedyDecoder, CTCLoss, CtcLoss, LabelsequenceAccuracy, WarpCTCLoss
 from netspec.layers import Layer, register
@@ -77,7 +76,6 @@ class ContinuationIndicator(Layer):
     bottoms = (0, 1)
     label_bottoms = frozenset({0})
 
-    @override
     def setup(self) -> None:
         param = value(self.param, "continuation_indicator_param")
         for name in ("time_step", "batch_size"):
@@ -85,11 +83,9 @@ class ContinuationIndicator(Layer):
                 raise self.error(f"{name} must be given and be at least 1", "continuation_indicator_param", name)
         self.size = (param.time_step, param.batch_size)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return [self.size]
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         top = torch.ones(self.size, device=self.context.device)
         top[0] = 0
@@ -111,15 +107,12 @@ class Reverse(Layer):
     Fork: senlinuc/caffe_ocr, src/caffe/layers/reverse_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         self.axis = self.canonical_axis(value(self.param, "reverse_param").axis, self.bottom_shapes[0], "reverse_param")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return bottom_shapes
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.flip(self.axis)
 
@@ -144,14 +137,12 @@ class ReverseTime(Layer):
     bottoms = (2, 2)
     label_bottoms = frozenset({1})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, lengths = bottom_shapes
         if lengths != data[1:2]:
             raise self.error(f"found lengths of shape {lengths}, expected {data[1:2]}", "bottom", 1)
         return [data]
 
-    @override
     def forward(self, data: torch.Tensor, lengths: torch.Tensor) -> torch.Tensor:
         steps, length = torch.arange(len(data), device=data.device)[:, None], lengths.long().clamp(0, len(data))
         inside = steps < length
@@ -186,7 +177,6 @@ class Lstm(Layer):
         """Whether it goes on from one pass to the next."""
         return len(self.bottom_shapes) > 1
 
-    @override
     def setup(self) -> None:
         """Make the blobs; the state begins at 0."""
         param, shape = value(self.param, "lstm_param"), self.bottom_shapes[0]
@@ -199,7 +189,6 @@ class Lstm(Layer):
             self.add_blob((4 * self.size, *sizes), getattr(param, name) if has(param, name) else None)
         self.state: tuple[torch.Tensor, ...] = ()
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, *begins = bottom_shapes
         if len(data) != 3 or data[2] != self.blob_shapes[0][1]:
@@ -208,7 +197,6 @@ class Lstm(Layer):
             raise self.error(f"found a bottom of shape {begins[0]}, expected {data[:2]}", "bottom", 1)
         return [(*data[:2], self.size)]
 
-    @override
     def forward(self, data: torch.Tensor, *begins: torch.Tensor) -> torch.Tensor:
         """Return the outputs of all steps."""
         of_input, of_state, bias = (self.blob(i) for i in range(3))

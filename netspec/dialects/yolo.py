@@ -80,7 +80,6 @@ class _YoloOutput(Layer):
     counted_axis = 2
     bottoms = (1, None)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of one detection; the maps must have the channels of their boxes."""
         p = value(self.param, self.group)
@@ -94,7 +93,6 @@ class _YoloOutput(Layer):
                 raise self.error(message, "bottom", i)
         return [(1, 1, 1, 7)]
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         p = value(self.param, self.group)
         rows = []
@@ -165,7 +163,6 @@ class YoloDetectionOutput(_YoloOutput):
 
     group = "yolo_detection_output_param"
 
-    @override
     def setup(self) -> None:
         param = value(self.param, self.group)
         self.anchors = _anchors(param, self, self.group)
@@ -200,7 +197,6 @@ class Yolov3DetectionOutput(_YoloOutput):
 
     group = "yolov3_detection_output_param"
 
-    @override
     def setup(self) -> None:
         param = value(self.param, self.group)
         anchors, maps = _anchors(param, self, self.group), len(self.bottom_shapes)

@@ -32,7 +32,6 @@ class Activation(Layer):
     any_layout = True
     traceable = True
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return bottom_shapes
 
@@ -40,7 +39,6 @@ class Activation(Layer):
 class Rounded(Activation):
     """Base of the activations that torch's functions round otherwise than the C library's, which Caffe calls."""
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
 
@@ -113,12 +111,10 @@ class ReLU(Activation):
     Caffe: src/caffe/layers/relu_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         self.slope: float = self.param.relu_param.negative_slope
         self.gradient_reads = frozenset({"sign" if self.slope >= 0 else "bottom"})  # the top's sign is the bottom's
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
@@ -162,7 +158,6 @@ class PReLU(Activation):
     Caffe: src/caffe/layers/prelu_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         p = self.param.prelu_param
         shape = self.bottom_shapes[0]
@@ -170,7 +165,6 @@ class PReLU(Activation):
             raise self.error(f"bottom has shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
         self.add_blob(() if p.channel_shared else shape[1:2], p.filler if p.HasField("filler") else None, 0.25)
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         slopes = self.blob(0)
         if self.is_exact(x):
@@ -205,7 +199,6 @@ class ELU(Rounded):
     Caffe: src/caffe/layers/elu_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         self.alpha: float = self.param.elu_param.alpha
         self.gradient_reads = frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
@@ -332,11 +325,9 @@ class Threshold(Activation):
     Caffe: src/caffe/layers/threshold_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         self.threshold: float = self.param.threshold_param.threshold
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return (x > self.threshold).to(x.dtype)
 
@@ -358,7 +349,6 @@ class Clip(Activation):
 
     gradient_reads = frozenset({"bottom"})
 
-    @override
     def setup(self) -> None:
         p = self.param.clip_param
         for name in ("min", "max"):
@@ -367,7 +357,6 @@ class Clip(Activation):
         self.low: float = p.min
         self.high: float = p.max
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.clamp(max=self.high).clamp(min=self.low)
 
@@ -393,7 +382,6 @@ class Swish(Rounded):
 
     gradient_reads = frozenset({"top"})
 
-    @override
     def setup(self) -> None:
         self.beta: float = self.param.swish_param.beta
 

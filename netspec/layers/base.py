@@ -97,7 +97,6 @@ class Layer(torch.nn.Module):
         """Return the shapes of the tops for bottoms of these shapes; may keep geometry on ``self``."""
         raise self.error(f"class {type(self).__name__} does not define reshape(bottom_shapes); write it", "type")
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         raise self.error(f"class {type(self).__name__} does not define forward(*bottoms); write it", "type")
 

@@ -34,7 +34,6 @@ class InnerProduct(Layer):
     Caffe: src/caffe/layers/inner_product_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         param = self.param.inner_product_param
         if param.num_output < 1:
@@ -48,7 +47,6 @@ class InnerProduct(Layer):
     def _axis(self, shape: Shape) -> int:
         return self.canonical_axis(self.param.inner_product_param.axis, shape, "inner_product_param", "axis")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the axes before ``axis`` and num_output; refuse vectors of another length than the weights'."""
         shape = bottom_shapes[0]
@@ -59,7 +57,6 @@ class InnerProduct(Layer):
             raise self.error(message, "bottom")
         return [(*shape[: self.axis], self.param.inner_product_param.num_output)]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed = self.param.inner_product_param.transpose
@@ -177,18 +174,15 @@ class Dropout(Layer):
     Caffe: src/caffe/layers/dropout_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         self.ratio: float = self.param.dropout_param.dropout_ratio
         if not 0 <= self.ratio < 1:
             message = f"dropout_ratio must be at least 0 and less than 1, found {self.ratio:g}"
             raise self.error(message, "dropout_param", "dropout_ratio")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return bottom_shapes
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the values that are kept, scaled; in the test phase the bottom itself."""
         if self.phase != TRAIN:
@@ -240,7 +234,6 @@ class Embed(Layer):
 
     label_bottoms = frozenset({0})
 
-    @override
     def setup(self) -> None:
         param = self.param.embed_param
         for name in ("num_output", "input_dim"):
@@ -250,11 +243,9 @@ class Embed(Layer):
         if param.bias_term:
             self.add_blob((param.num_output,), param.bias_filler)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return [(*bottom_shapes[0], self.param.embed_param.num_output)]
 
-    @override
     def forward(self, indices: torch.Tensor) -> torch.Tensor:
         """Return the rows; raise SpecError for an invalid index."""
         rows, index = self.param.embed_param.input_dim, indices.long()

@@ -43,7 +43,6 @@ class BatchNorm(Layer):
     default_param_lr = 0.0
     traceable = True
 
-    @override
     def setup(self) -> None:
         """Add the sums, all zero; refuse a ``param`` that would have them learned."""
         param = self.param.batch_norm_param
@@ -60,11 +59,9 @@ class BatchNorm(Layer):
         for shape in ((self.channels,), (self.channels,), (1,)):
             self.add_blob(shape)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return as_before(self, bottom_shapes, self.channels)
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalized values; in training also add the batch's statistics to the sums."""
         if self.use_global_stats:
@@ -254,7 +251,6 @@ class LRN(Layer):
 
     traceable = True
 
-    @override
     def setup(self) -> None:
         param = self.param.lrn_param
         if param.local_size % 2 == 0 or param.local_size > MOST:
@@ -263,13 +259,11 @@ class LRN(Layer):
         if param.norm_region != ACROSS_CHANNELS:
             self.ignores = frozenset({"lrn_param.k"})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if len(bottom_shapes[0]) != 4:
             raise self.error(f"LRN needs a bottom of 4 axes (N, C, H, W), found shape {bottom_shapes[0]}", "bottom")
         return bottom_shapes
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         param = self.param.lrn_param
         size, reach = param.local_size, param.local_size // 2
@@ -353,14 +347,12 @@ class MVN(Layer):
     Caffe: src/caffe/layers/mvn_layer.cpp
     """
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape = bottom_shapes[0]
         if len(shape) > 4:
             raise self.error(f"MVN takes up to 4 axes (N, C, H, W), found shape {shape}", "bottom")
         return [(*shape, *(1,) * (4 - len(shape)))]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         param, shape = self.param.mvn_param, self.top_shapes[0]
         outer = 1 if param.across_channels else 2

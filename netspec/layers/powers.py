@@ -20,7 +20,6 @@ class AbsVal(Activation):
     Caffe: src/caffe/layers/absval_layer.cpp
     """
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.abs()
 
@@ -45,7 +44,6 @@ class Power(Rounded):
     gradient_reads = frozenset({"bottom", "top"})
     fresh = False
 
-    @override
     def setup(self) -> None:
         p = self.param.power_param
         self.power: float = p.power
@@ -110,7 +108,6 @@ class Exp(Rounded):
 
     gradient_reads = frozenset({"top"})
 
-    @override
     def setup(self) -> None:
         """Read scale, shift and the base, which must be positive or -1."""
         p = self.param.exp_param
@@ -154,7 +151,6 @@ class Log(Rounded):
 
     gradient_reads = frozenset({"bottom"})
 
-    @override
     def setup(self) -> None:
         """Read scale, shift and the base, which must be -1, or positive and not 1."""
         p = self.param.log_param

@@ -85,7 +85,6 @@ class Recurrent(Layer):
     remembers = True
     gates: ClassVar[int] = 1  # how many numbers a hidden unit takes in
 
-    @override
     def setup(self) -> None:
         """Add the blobs that take x, x_static and h in; subclasses append theirs."""
         p = self.param.recurrent_param
@@ -116,7 +115,6 @@ class Recurrent(Layer):
         self.add_blob((rows, self.hidden), p.weight_filler)
         self.state: tuple[torch.Tensor, ...] = ()
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         x, cont = bottom_shapes[:2]
         steps, streams = x[:2]
@@ -133,7 +131,6 @@ class Recurrent(Layer):
                 raise self.error(message, "bottom", i)
         return [(steps, streams, self.hidden), *[state] * (self.num_tops - 1)]
 
-    @override
     def forward(self, x: torch.Tensor, cont: torch.Tensor, *others: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the output of every time step and, where exposed, the last state."""
         steps, streams = x.shape[:2]
@@ -269,7 +266,6 @@ class RNN(Recurrent):
     tops = (1, 2)
     state_names = ("h",)
 
-    @override
     def setup(self) -> None:
         super().setup()
         p = self.param.recurrent_param
@@ -377,7 +373,6 @@ class LSTMUnit(Layer):
     tops = (2, 2)
     label_bottoms = frozenset({2})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         cell, gates, cont = bottom_shapes
         if len(cell) != 3 or cell[0] != 1:
@@ -389,7 +384,6 @@ class LSTMUnit(Layer):
             raise self.error(f"found cont of shape {cont}, expected {(1, streams)}", "bottom", 2)
         return [cell, cell]
 
-    @override
     def forward(self, cell: torch.Tensor, gates: torch.Tensor, cont: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return _lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2), self.is_exact(gates))
 

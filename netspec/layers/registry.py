@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 from netspec.errors import SpecError, Where, did_you_mean
@@ -19,19 +19,22 @@ from netspec.proto.schema import LayerParameter, NetParameter
 
 _LAYERS: dict[str, type[Layer]] = {}
 _OWNERS: dict[str, str] = {}  # layer type -> the dialect that has it; Caffe's own are not here
-_REPLACING: dict[str, dict[str, type[Layer]]] = {}  # layer type of Caffe's -> dialect -> class
+Wants = Callable[[LayerParameter], bool]
+_REPLACING: dict[str, dict[str, tuple[type[Layer], Wants]]] = {}  # layer type of Caffe's -> dialect -> class, for which
 _everywhere: set[str] = set()  # dialects that count for every net of the process: a user asked for them
 _loading = ""  # the dialect whose file is run now
 L = TypeVar("L", bound=type[Layer])
 
 
-def register(type_name: str, *reads: str, replaces: type[Layer] | None = None) -> Callable[[L], L]:
+def register(
+    type_name: str, *reads: str, replaces: type[Layer] | None = None, where: Wants = lambda param: True
+) -> Callable[[L], L]:
     """Class decorator: make a layer known under the type that prototxt files use.
 
     ``reads`` are the fields of LayerParameter that are the layer's own, e.g. ``"pooling_param"``, and what a dialect
     adds to them, e.g. ``"pooling_param.extra"``; a net warns of all others (netspec/net/ignored_fields.py). With
     ``replaces`` a dialect's subclass takes the place of the class that has the type, to honor such an addition, in nets
-    that use the dialect.
+    that use the dialect: of those layers ``where`` their LayerParameter asks for it.
     """
 
     def add(cls: L) -> L:
@@ -42,7 +45,7 @@ def register(type_name: str, *reads: str, replaces: type[Layer] | None = None) -
             _LAYERS[type_name] = cls
             _OWNERS.update({type_name: _loading} if _loading else {})
         else:
-            _REPLACING.setdefault(type_name, {})[_loading or cls.__module__.rpartition(".")[2]] = cls
+            _REPLACING.setdefault(type_name, {})[_loading or cls.__module__.rpartition(".")[2]] = cls, where
         return cls
 
     return add
@@ -61,15 +64,9 @@ def use_everywhere(dialect: str) -> None:
     _everywhere.add(dialect)
 
 
-def layer_class(type_name: str, dialects: Collection[str] = ()) -> type[Layer] | None:
-    """Return the class registered for a type, or None; of ``dialects``, one may have a class in place of Caffe's.
-
-    A type that one known dialect has switches that dialect on.
-    """
+def layer_class(type_name: str) -> type[Layer] | None:
+    """Return the class registered for a type, or None. A type that one known dialect has switches that dialect on."""
     run_dialects()
-    for dialect in dialects:
-        if cls := _REPLACING.get(type_name, {}).get(dialect):
-            return cls
     if type_name not in _LAYERS:
         announce_known()
         dialects = [name for name in dialects_with_type(type_name) if name in known_files()]
@@ -80,13 +77,18 @@ def layer_class(type_name: str, dialects: Collection[str] = ()) -> type[Layer] |
 
 
 def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type[Layer] | None:
-    """Return the class of a layer, or None: that of its type, where ``options.dialects`` have no other.
+    """Return the class of a layer, or None: that of its type, where ``options.dialects`` have no other for it.
 
     A Python layer that a dialect knows by its module and class, ``"rpn.proposal_layer.ProposalLayer"``, is the
     dialect's, unless Python code is allowed to run and its module is there.
     """
+    run_dialects()
+    for dialect in options.dialects if options else ():
+        cls, wants = _REPLACING.get(param.type, {}).get(dialect, (None, bool))
+        if cls and wants(param):
+            return cls
     if param.type != "Python":
-        return layer_class(param.type, options.dialects if options else ())
+        return layer_class(param.type)
     python: Any = layer_class("Python")
     known = layer_class(f"{param.python_param.module}.{param.python_param.layer}")
     return python if known is None or (options and options.allow_python and python.is_there(param)) else known

@@ -92,7 +92,6 @@ class Scale(_Affine):
     Caffe: src/caffe/layers/scale_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         param = self.param.scale_param
         shape = self.bottom_shapes[1] if len(self.bottom_shapes) > 1 else self.learned_shape(param, "scale_param")
@@ -101,12 +100,10 @@ class Scale(_Affine):
         if param.bias_term:
             self.add_blob(shape, param.bias_filler)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.axis = self.locate(bottom_shapes, self.param.scale_param, "scale_param")
         return [bottom_shapes[0]]
 
-    @override
     def forward(self, data: torch.Tensor, factors: torch.Tensor | None = None) -> torch.Tensor:
         scale = self.blob(0) if factors is None else factors
         bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
@@ -195,18 +192,15 @@ class Bias(_Affine):
     Caffe: src/caffe/layers/bias_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         param = self.param.bias_param
         if len(self.bottom_shapes) == 1:
             self.add_blob(self.learned_shape(param, "bias_param"), param.filler)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.axis = self.locate(bottom_shapes, self.param.bias_param, "bias_param")
         return [bottom_shapes[0]]
 
-    @override
     def forward(self, data: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
         operand = self.blob(0) if bias is None else bias
         if self.is_exact(data):

@@ -8,6 +8,7 @@ from netspec.layers import Layer, exporting, folding, gradients, preparing, read
 from paths import ROOT
 
 MOST_METHODS, MOST_ATTRIBUTES = 24, 14
+HOOKS = {"construct", "setup", "reshape", "forward"}  # of Layer, which describes them; no layer marks them
 ROOMS = [exporting, folding, gradients, preparing, reading, training]
 
 
@@ -31,7 +32,7 @@ def undescribed() -> Iterator[str]:
             public = [each for each in classes if not each.name.startswith("_")]
             for method in (method for cls in public for method in cls.body if isinstance(method, ast.FunctionDef)):
                 marks = {ast.unparse(each).rpartition(".")[2] for each in method.decorator_list}
-                known = method.name in OFFERED or marks & {"override", "staticmethod", "setter"}
+                known = method.name in OFFERED | HOOKS or marks & {"override", "staticmethod", "setter"}
                 if not (known or method.name.startswith("_") or ast.get_docstring(method)):
                     yield f"{path.relative_to(ROOT)}:{method.lineno}: {method.name}"
 

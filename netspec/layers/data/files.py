@@ -70,7 +70,6 @@ class ReadingLayer(Layer):
         if not p.source:
             yield self.error("source is missing; set it to the path of the data", self.group, "source")
 
-    @override
     def construct(self) -> None:
         """Look at the settings; faults are gathered, so that all are reported. Files are opened if there are none."""
         self.faults = list(self.wrong_settings())
@@ -86,7 +85,6 @@ class ReadingLayer(Layer):
             self.faults.append(fault)
             return None
 
-    @override
     def setup(self) -> None:
         self.batch_size: int = value(self.param, self.group).batch_size
         self._source: Source | None = None
@@ -125,7 +123,6 @@ class ReadingLayer(Layer):
         fault = self.error(f'the shape of "{blob}" is known only from its data; {advice}', "top")
         return UnknownShape(fault.message, fault.where)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self._shapes
 
@@ -170,7 +167,6 @@ class ReadingLayer(Layer):
         if self._feed:
             self._feed.close()
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         if self._feed is None:
             raise self.error("this net was built without opening its data, so it cannot run")
@@ -247,7 +243,6 @@ class Data(ReadingLayer):
         yield from super().wrong_settings()
         yield from contradictions(self.param.transform_param, self.context.at)
 
-    @override
     def construct(self) -> None:
         super().construct()
         if self.opens_data and self._sound:

@@ -64,7 +64,6 @@ class HDF5Output(Layer):
     tops = (0, 0)
     not_exported = "it writes a file"
 
-    @override
     def setup(self) -> None:
         name = self.param.hdf5_output_param.file_name
         place = ("hdf5_output_param", "file_name")
@@ -78,7 +77,6 @@ class HDF5Output(Layer):
 
             self._sink = Hdf5Sink(name, self.context.at(*place))
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, label = bottom_shapes
         if max(len(data), len(label)) > 4:
@@ -92,7 +90,6 @@ class HDF5Output(Layer):
         if self._sink is not None:
             self._sink.close()
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         if self._sink is not None:
             data, label = (bottom.detach().cpu().numpy() for bottom in bottoms)

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from typing_extensions import override
 
 from netspec.errors import SpecError
 from netspec.layers import fillers
@@ -34,7 +33,6 @@ class Input(Layer):
     tops = (1, None)
     is_input = True
 
-    @override
     def setup(self) -> None:
         shapes: list[Shape] = [tuple(shape.dim) for shape in self.param.input_param.shape]
         given = self.context.options.given_shapes
@@ -45,7 +43,6 @@ class Input(Layer):
         shapes = shapes * self.num_tops if len(shapes) == 1 else shapes
         self.shapes = [given.get(top, shape) for top, shape in zip(self.param.top, shapes, strict=True)]
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self.shapes
 
@@ -54,7 +51,6 @@ class Input(Layer):
         advice = "use a layer that reads data (Data, ImageData, HDF5Data, ...)"
         return self.error(f"nothing fills {blobs} during training; {advice}")
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
 
@@ -78,7 +74,6 @@ class DummyData(Layer):
     not_exported = "its values are random"
     OLD_AXES = ("num", "channels", "height", "width")
 
-    @override
     def setup(self) -> None:
         self.shapes = [self.possible(shape) for shape in self._read_shapes()]
         given = list(self.param.dummy_data_param.data_filler)
@@ -99,11 +94,9 @@ class DummyData(Layer):
     def filled_once(self) -> Sequence[torch.Tensor | None]:
         return self._constants
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self.shapes
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         generator = self.context.random.on("cpu")
         return tuple(self._fill(i, generator) if kept is None else kept for i, kept in enumerate(self._constants))
@@ -155,7 +148,6 @@ class MemoryData(Layer):
     tops = (2, 2)
     reads_data = True
 
-    @override
     def setup(self) -> None:
         p = self.param.memory_data_param
         self.shape: Shape = (p.batch_size, p.channels, p.height, p.width)
@@ -165,7 +157,6 @@ class MemoryData(Layer):
         self._arrays: tuple[torch.Tensor, torch.Tensor] | None = None
         self._next = 0
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self.shape, self.shape[:1]
 
@@ -198,7 +189,6 @@ class MemoryData(Layer):
             raise self.error(f"found row {following} to go on from; no batch starts there")
         self._next = following
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         if fault := self.missing_input():
             raise fault

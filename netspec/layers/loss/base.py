@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from typing_extensions import override
 
 from netspec.exact.sums import SumInOrder
 from netspec.layers.base import Layer, Shape
@@ -26,7 +25,6 @@ class Loss(Layer):
     is_loss = True
     label_bottoms = frozenset({1})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, label = bottom_shapes[:2]
         if data[:1] != label[:1]:
@@ -38,12 +36,10 @@ class Floor(torch.autograd.Function):
     """max(x, floor) whose gradient also passes below the floor, as in Caffe's losses."""
 
     @staticmethod
-    @override
     def forward(ctx: Any, x: torch.Tensor, floor: float) -> torch.Tensor:
         return x.clamp(min=floor)
 
     @staticmethod
-    @override
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
         return grads[0], None
 
@@ -112,7 +108,6 @@ class Classified(Layer):
 class ClassLoss(Loss, Classified):
     """Base of the losses of scores all of whose axes but the first are the classes."""
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shapes = super().reshape(bottom_shapes)
         data, labels = bottom_shapes

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.blas import dots, sum_in_order
@@ -49,7 +48,6 @@ class HingeLoss(ClassLoss):
 
     L2 = 2  # caffe.proto: enum HingeLossParameter.Norm
 
-    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         x, label = self.scores_and_labels(scores, labels)
         self.valid(label, None)
@@ -87,12 +85,10 @@ class SigmoidCrossEntropyLoss(Loss):
     Caffe: src/caffe/layers/sigmoid_cross_entropy_loss_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         self.ignore_label = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, BATCH_SIZE)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shapes = super().reshape(bottom_shapes)
         data, target = bottom_shapes
@@ -100,7 +96,6 @@ class SigmoidCrossEntropyLoss(Loss):
             raise self.error(f"found bottoms of shapes {data} and {target}, expected the same count", "bottom")
         return shapes
 
-    @override
     def forward(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
         targets = targets.detach().reshape(x.shape)
         valid = None if self.ignore_label is None else targets.long() != self.ignore_label
@@ -151,7 +146,6 @@ class EuclideanLoss(Loss):
 
     label_bottoms = frozenset()
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shapes = super().reshape(bottom_shapes)
         a, b = bottom_shapes
@@ -159,7 +153,6 @@ class EuclideanLoss(Loss):
             raise self.error(f"found bottoms of shapes {a} and {b}, expected as many values per item", "bottom")
         return shapes
 
-    @override
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         difference = a - b.reshape(a.shape)
         exact = self.is_exact(difference)
@@ -244,7 +237,6 @@ class ContrastiveLoss(Loss):
     bottoms = (3, 3)
     label_bottoms = frozenset({2})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shapes = super().reshape(bottom_shapes)
         a, b, label = bottom_shapes
@@ -257,7 +249,6 @@ class ContrastiveLoss(Loss):
             raise self.error(f"found labels of shape {label}, expected one per pair: ({a[0]},)", "bottom", 2)
         return shapes
 
-    @override
     def forward(self, a: torch.Tensor, b: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
         p = self.param.contrastive_loss_param
         similar = label.reshape(-1).long() != 0

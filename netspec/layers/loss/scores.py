@@ -10,7 +10,6 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from google.protobuf.message import DecodeError
-from typing_extensions import override
 
 from netspec.data.blobs import to_array
 from netspec.exact import SMALL_ITEM, libm
@@ -66,7 +65,6 @@ class _NegativeLogOfSoftmax(torch.autograd.Function):
     """-log p of the labels' classes, p being the softmax; the logarithm is of no less than FLT_MIN."""
 
     @staticmethod
-    @override
     def forward(ctx: Any, scores: torch.Tensor, label: torch.Tensor, exact: bool) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the losses (outer, inner) and p, for scores (outer, classes, inner) and labels (outer, inner)."""
         p = softmax(scores) if exact else F.softmax(scores, 1)
@@ -76,7 +74,6 @@ class _NegativeLogOfSoftmax(torch.autograd.Function):
         return -(libm.log(chosen) if exact else chosen.log()), p
 
     @staticmethod
-    @override
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
         """Return (p - 1 at the label's class) times the losses' gradient."""
         p, label = ctx.saved_tensors
@@ -99,17 +96,14 @@ class SoftmaxWithLoss(SoftmaxLoss):
     Caffe: src/caffe/layers/softmax_loss_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         """Read the ignored label and the normalization (default VALID)."""
         self.ignore_label = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, VALID)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self.reshape_tops(bottom_shapes, self.param.softmax_param.axis, "softmax_param", "axis")
 
-    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
@@ -188,7 +182,6 @@ class InfogainLoss(SoftmaxLoss):
     not_exported = "PyTorch has no loss with a matrix of weights"
     label_bottoms = frozenset({1, 2})
 
-    @override
     def setup(self) -> None:
         """Read the ignored label, the normalization (default VALID) and, without a third bottom, the matrix."""
         loss_param, source = self.param.loss_param, self.param.infogain_loss_param.source
@@ -215,7 +208,6 @@ class InfogainLoss(SoftmaxLoss):
             raise self.error(message, "infogain_loss_param", "source") from None
         return torch.tensor(values, device=self.context.device)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         axis = self.param.infogain_loss_param.axis
         shapes = self.reshape_tops(bottom_shapes, axis, "infogain_loss_param", "axis")
@@ -230,7 +222,6 @@ class InfogainLoss(SoftmaxLoss):
             message = f"found an infogain matrix of shape {shape}, expected {self.classes} x {self.classes} numbers"
             raise self.error(message, *path)
 
-    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor, *given: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
@@ -277,7 +268,6 @@ class MultinomialLogisticLoss(ClassLoss):
     Caffe: src/caffe/layers/multinomial_logistic_loss_layer.cpp
     """
 
-    @override
     def forward(self, probabilities: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         p, label = self.scores_and_labels(probabilities, labels)
         self.valid(label, None)
@@ -311,12 +301,10 @@ class Accuracy(Classified):
     bottoms = (2, 2)
     tops = (1, 2)
 
-    @override
     def setup(self) -> None:
         self.top_k: int = self.param.accuracy_param.top_k
         self.ignore_label = ignore_label(self.param.accuracy_param)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.reshape_scores(bottom_shapes, self.param.accuracy_param.axis, "accuracy_param", "axis")
         if self.top_k > self.classes:
@@ -326,7 +314,6 @@ class Accuracy(Classified):
         return [(), (self.classes,)][: self.num_tops]
 
     @torch.no_grad()
-    @override
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the accuracy and, where there is a second top, that of each class."""
         x, label = self.scores_and_labels(scores, labels)

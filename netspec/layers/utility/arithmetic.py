@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
@@ -36,7 +35,6 @@ class Eltwise(Layer):
     PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
     bottoms = (2, None)
 
-    @override
     def setup(self) -> None:
         p = self.param.eltwise_param
         self.operation: int = p.operation
@@ -49,7 +47,6 @@ class Eltwise(Layer):
         if self.operation == self.MAX:
             self.ignores = frozenset({"eltwise_param.coeff"})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         for i, shape in enumerate(bottom_shapes):
             if shape != bottom_shapes[0]:
@@ -57,7 +54,6 @@ class Eltwise(Layer):
                 raise self.error(message, "bottom", i)
         return bottom_shapes[:1]
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         exact = self.is_exact(bottoms[0])
         if exact and self.operation == self.PROD:
@@ -124,7 +120,6 @@ class Reduction(Layer):
 
     SUM, ASUM, SUMSQ, MEAN = 1, 2, 3, 4  # caffe.proto: enum ReductionParameter.ReductionOp
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.reduction_param, bottom_shapes[0]
         self.axis = self.canonical_axis(p.axis, shape, "reduction_param", "axis")
@@ -132,7 +127,6 @@ class Reduction(Layer):
         self.coeff: float = p.coeff / count if p.operation == self.MEAN else p.coeff
         return [shape[: self.axis]]
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         operation = self.param.reduction_param.operation
         if self.is_exact(x):
@@ -183,7 +177,6 @@ class ArgMax(Layer):
     Caffe: src/caffe/layers/argmax_layer.cpp
     """
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.argmax_param, bottom_shapes[0]
         self.axis = self.canonical_axis(p.axis, shape, "argmax_param", "axis") if p.HasField("axis") else None
@@ -195,7 +188,6 @@ class ArgMax(Layer):
         return [(shape[0], 1 + p.out_max_val, p.top_k, *(1 for _ in shape[3:]))]
 
     @torch.no_grad()
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         p = self.param.argmax_param
         axis = 1 if self.axis is None else self.axis
@@ -256,12 +248,10 @@ class Softmax(Layer):
     traceable = True
     any_layout = True
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.axis = self.canonical_axis(self.param.softmax_param.axis, bottom_shapes[0], "softmax_param", "axis")
         return bottom_shapes
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         if self.is_exact(x):
             return Pointwise.apply(x, lambda x: softmax(self._by_class(x)).reshape(x.shape), self.caffes_gradient)
@@ -295,11 +285,9 @@ class Silence(Layer):
     bottoms = (1, None)
     tops = (0, 0)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return []
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return ()
 
@@ -322,15 +310,12 @@ class Parameter(Layer):
 
     bottoms = (0, 0)
 
-    @override
     def setup(self) -> None:
         self.add_blob(tuple(self.param.parameter_param.shape.dim))
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self.blob_shapes
 
-    @override
     def forward(self) -> torch.Tensor:
         blob = self.blob(0)
         return blob.view_as(blob)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from typing_extensions import override
 
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
@@ -37,12 +36,10 @@ class Concat(Layer):
     bottoms = (1, None)
     traceable = True
 
-    @override
     def setup(self) -> None:
         if len(self.bottom_shapes) == 1:  # it is not copied
             self.shares = frozenset({"data", "diff"})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         first = bottom_shapes[0]
         self.axis = axis = _axis(self, first, "concat_param", "concat_dim")
@@ -53,7 +50,6 @@ class Concat(Layer):
                 raise self.error(message, "bottom", i)
         return [(*first[:axis], sum(shape[axis] for shape in bottom_shapes), *first[axis + 1 :])]
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
 
@@ -89,12 +85,10 @@ class Slice(Layer):
     tops = (1, None)
     traceable = True
 
-    @override
     def setup(self) -> None:
         if self.num_tops == 1:  # it is not copied
             self.shares = frozenset({"data", "diff"})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape = bottom_shapes[0]
         self.axis = axis = _axis(self, shape, "slice_param", "slice_dim")
@@ -115,7 +109,6 @@ class Slice(Layer):
             self.sizes = [size // self.num_tops] * self.num_tops
         return [(*shape[:axis], part, *shape[axis + 1 :]) for part in self.sizes]
 
-    @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return x.split(self.sizes, self.axis)
 
@@ -158,7 +151,6 @@ class Crop(Layer):
 
     bottoms = (2, 2)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the wanted shape; place the window."""
         data, wanted = bottom_shapes
@@ -180,7 +172,6 @@ class Crop(Layer):
             self.window.append(slice(offset, offset + wanted[i]))
         return [(*data[:axis], *wanted[axis : len(data)])]
 
-    @override
     def forward(self, data: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
         return data[tuple(self.window)]
 
@@ -217,14 +208,12 @@ class BatchReindex(Layer):
     bottoms = (2, 2)
     label_bottoms = frozenset({1})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, indices = bottom_shapes
         if len(indices) != 1:
             raise self.error(f"found indices of shape {indices}, expected one axis", "bottom", 1)
         return [(*indices, *data[1:])]
 
-    @override
     def forward(self, x: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
         chosen = indices.long()
         wrong = chosen[(chosen < 0) | (chosen >= x.shape[0])]
@@ -253,14 +242,12 @@ class Filter(Layer):
     tops = (1, None)
     counted_axis = 0
 
-    @override
     def setup(self) -> None:
         filtered = len(self.bottom_shapes) - 1
         if self.num_tops != filtered:
             message = f"found {self.num_tops} top blob(s), expected {filtered}: one per bottom except the selector"
             raise self.error(message, "top")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         *data, selector = bottom_shapes
         if math.prod(selector[1:]) != 1:
@@ -273,7 +260,6 @@ class Filter(Layer):
                 raise self.error(message, "bottom", i)
         return data
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         *data, selector = bottoms
         kept = selector.reshape(-1).nonzero().squeeze(1)

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from typing_extensions import override
 
 from netspec.errors import SpecError, did_you_mean
 from netspec.layers.base import Layer, Shape
@@ -59,7 +58,6 @@ class Python(Layer):
     takes_shapes = True  # where its code must not run
     promises = False  # as in Caffe, the code may reshape its tops in forward
 
-    @override
     def setup(self) -> None:
         given = self.context.options.given_shapes
         self.code: Any = None
@@ -76,7 +74,6 @@ class Python(Layer):
             self.add_blob(blob.shape)
             self.blobs[-1].data.copy_(torch.from_numpy(blob.data))
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if self.code is None:
             return [self.context.options.given_shapes[name] for name in self.param.top]
@@ -85,7 +82,6 @@ class Python(Layer):
         self._call("reshape", self.bottom, self.top)
         return [blob.shape for blob in self.top]
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Run the code's reshape and forward, as Caffe does at each pass."""
         tensors = (*bottoms, *(self.blob(i) for i in range(len(self.blobs))))

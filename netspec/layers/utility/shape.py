@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import torch
-from typing_extensions import override
 
 from netspec.exact import switch
 from netspec.exact.sums import Copies, Tiles
@@ -22,7 +21,6 @@ class _OtherShape(Layer):
     shares = frozenset({"data", "diff"})
     traceable = True
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])
 
@@ -46,7 +44,6 @@ class Flatten(_OtherShape):
     Caffe: src/caffe/layers/flatten_layer.cpp
     """
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.flatten_param, bottom_shapes[0]
         first = self.canonical_axis(p.axis, shape, "flatten_param", "axis")
@@ -66,14 +63,12 @@ class Reshape(_OtherShape):
     Caffe: src/caffe/layers/reshape_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         self.new_axes = list(self.param.reshape_param.shape.dim)
         if self.new_axes.count(-1) > 1 or min(self.new_axes, default=0) < -1:
             message = f"found shape {self.new_axes}, expected at most one -1 (inferred) and nothing below it"
             raise self.error(message, "reshape_param", "shape")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.reshape_param, bottom_shapes[0]
         start = p.axis if p.axis >= 0 else len(shape) + p.axis + 1
@@ -115,12 +110,10 @@ class Split(Layer):
     traceable = True
     shares = frozenset({"data"})
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the bottom's shape for each top."""
         return [bottom_shapes[0]] * self.num_tops
 
-    @override
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return one tensor per top, so that each has its own gradient."""
         if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
@@ -158,7 +151,6 @@ class Tile(Layer):
     Caffe: src/caffe/layers/tile_layer.cpp
     """
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.tile_param, bottom_shapes[0]
         self.axis = axis = self.canonical_axis(p.axis, shape, "tile_param", "axis")
@@ -167,7 +159,6 @@ class Tile(Layer):
         self.repeats = [p.tiles if i == axis else 1 for i in range(len(shape))]
         return [(*shape[:axis], shape[axis] * p.tiles, *shape[axis + 1 :])]
 
-    @override
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         if self.is_exact(x):
             values = x.reshape(math.prod(x.shape[: self.axis]), -1)

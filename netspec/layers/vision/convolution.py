@@ -56,7 +56,6 @@ class Convolution(SlidingFilter):
         channels = filters.shape.dim[1] if len(filters.shape.dim) > 1 else filters.channels
         return channels * param.convolution_param.group
 
-    @override
     def setup(self) -> None:
         self.read_geometry()
         if self.spatial_axes > 3:
@@ -85,7 +84,6 @@ class Convolution(SlidingFilter):
         """Return the spatial shape of a top for a bottom of ``shape``."""
         return self.slide(shape)
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return one shape for all tops; the bottoms must suit the filters."""
         self.check_axes(bottom_shapes, self.channels)
@@ -93,7 +91,6 @@ class Convolution(SlidingFilter):
         top = (*shape[: self.channel_axis], self.num_output, *self.output_shape(shape))
         return [top] * len(bottom_shapes)
 
-    @override
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the responses to each bottom."""
         weight = self.blob(0)

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from typing_extensions import override
 
 from netspec.exact.switch import is_recorded
 
@@ -35,16 +34,13 @@ class _SideBySide(torch.autograd.Function):
     """Return maps with their channels side by side; their gradient comes map by map, as they did."""
 
     @staticmethod
-    @override
     def forward(maps: torch.Tensor) -> torch.Tensor:
         return maps.contiguous(memory_format=torch.channels_last)
 
     @staticmethod
-    @override
     def setup_context(ctx: Any, inputs: tuple[torch.Tensor], output: torch.Tensor) -> None:
         """Keep nothing."""
 
     @staticmethod
-    @override
     def backward(ctx: Any, *diffs: torch.Tensor) -> torch.Tensor:
         return diffs[0].contiguous()

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from torch.nn import functional as F
-from typing_extensions import override
 
 from netspec.exact.sums import Copies
 from netspec.layers.base import Layer, Shape
@@ -142,7 +141,6 @@ class Pooling(_PoolingBase):
 
     tops = (1, 2)
 
-    @override
     def setup(self) -> None:
         param = self.param.pooling_param
         self.method: int = param.pool
@@ -175,7 +173,6 @@ class Pooling(_PoolingBase):
             )
         return pair
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape, param = bottom_shapes[0], self.param.pooling_param
         if len(shape) != 4:
@@ -194,7 +191,6 @@ class Pooling(_PoolingBase):
         """Whether it draws nothing."""
         return self.method != STOCHASTIC
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
@@ -280,7 +276,6 @@ class SPP(_PoolingBase):
     Caffe: src/caffe/layers/spp_layer.cpp
     """
 
-    @override
     def setup(self) -> None:
         if self.param.spp_param.pyramid_height < 1:
             raise self.error("pyramid_height must be at least 1", "spp_param", "pyramid_height")
@@ -288,7 +283,6 @@ class SPP(_PoolingBase):
             message = f"pyramid_height must be at most {HIGHEST_PYRAMID}: more windows than an int counts"
             raise self.error(message, "spp_param", "pyramid_height")
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the number of features; place each level's windows."""
         shape, param = bottom_shapes[0], self.param.spp_param
@@ -301,7 +295,6 @@ class SPP(_PoolingBase):
             return [(*shape[:2], *self.levels[0].count)]
         return [(shape[0], shape[1] * sum(w.count[0] * w.count[1] for w in self.levels))]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         several = len(self.levels) > 2 and self.is_exact(data)  # Caffe's SPP is a net of its own, with a Split
         copies = Copies.apply(data, len(self.levels)) if several else [data] * len(self.levels)

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import torch
 from torch.nn import functional as F
-from typing_extensions import override
 
 from netspec.exact.products import (
     Columns,
@@ -153,21 +152,18 @@ class Im2col(SlidingFilter):
         f"convolution_param.{name}" for name in ("num_output", "bias_term", "group", "weight_filler", "bias_filler")
     )
 
-    @override
     def setup(self) -> None:
         self.read_geometry()
         if self.spatial_axes < 1:
             raise self.error("the bottom has no spatial axis after its channels", "bottom")
         self.channels = self.bottom_shapes[0][self.channel_axis]
 
-    @override
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape with a channel for each pixel of the filter, and the filter's positions."""
         self.check_axes(bottom_shapes, self.channels)
         shape = bottom_shapes[0]
         return [(*shape[: self.channel_axis], self.channels * math.prod(self.kernel), *self.slide(shape))]
 
-    @override
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         overhang = self.overhang(self.bottom_shapes[0])
         if self.is_exact(data):
