@@ -17,7 +17,7 @@ import numpy as np
 
 from netspec.data.images import list_lines
 from netspec.data.random_words import permutation
-from netspec.data.sources import Arrays, Cursor, Shape
+from netspec.data.sources import ALONE, Arrays, Cursor, Draws, Shape
 from netspec.errors import SpecError, Where
 from netspec.files.hdf5 import new_hdf5, open_hdf5
 from netspec.terminal import log
@@ -38,12 +38,9 @@ class Hdf5Source:
         files: str | Sequence[str],
         tops: Sequence[str],
         batch_size: int,
-        shuffle: bool,
-        seed: int,
-        stream: str,
+        shuffle: bool = False,
+        draws: Draws = ALONE,
         where: Where | None = None,
-        rank: int = 0,
-        ranks: int = 1,
     ) -> None:
         named = _listed(files, where) if isinstance(files, str) else [(name, Where(name)) for name in files]
         self._tops = tuple(tops)
@@ -52,8 +49,8 @@ class Hdf5Source:
         self._row_shapes = _row_shapes(*named[0], self._tops)[1]
         counts = [self._rows_of(name, place) for name, place in named]
         self._starts = np.cumsum([0, *counts])
-        self.cursor = Cursor(int(self._starts[-1]), batch_size, rank=rank, ranks=ranks)
-        self._shuffle, self._seed, self._stream = shuffle, seed, stream
+        self.cursor = Cursor(int(self._starts[-1]), batch_size, draws=draws)
+        self._shuffle, self._draws = shuffle, draws
         self._order = lru_cache(maxsize=2)(self._order_of)
         self._load = lru_cache(maxsize=_FILES_IN_MEMORY)(self._load_file)
         self._lock = threading.Lock()
@@ -91,11 +88,11 @@ class Hdf5Source:
         return np.array([self._order(epoch)[i] for epoch, i in zip(places // count, places % count, strict=True)])
 
     def _order_of(self, epoch: int) -> np.ndarray:
-        stream = f"{self._stream}/shuffle/{epoch}"
+        seed, stream = self._draws.seed, f"{self._draws.stream}/shuffle/{epoch}"
         rows = []
-        for file in permutation(self._seed, stream, len(self._files)):
+        for file in permutation(seed, stream, len(self._files)):
             start, end = self._starts[file : file + 2]
-            rows.append(start + permutation(self._seed, f"{stream}/{file}", int(end - start)))
+            rows.append(start + permutation(seed, f"{stream}/{file}", int(end - start)))
         return np.concatenate(rows)
 
     def _load_file(self, file: int) -> Arrays:

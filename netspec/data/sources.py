@@ -22,28 +22,34 @@ from netspec.errors import SpecError, Where
 Arrays = tuple[np.ndarray, ...]
 
 
+@dataclass(frozen=True)
+class Draws:
+    """What random numbers of a reader follow from, seed and stream; of ``ranks`` parallel readers it is ``rank``.
+
+    All nets that read the same data must have the same seed.
+    """
+
+    seed: int = 0
+    stream: str = ""
+    rank: int = 0
+    ranks: int = 1
+
+
+ALONE = Draws()
+
+
 class Cursor:
     """Which records each iteration reads: batch after batch; after the last record it starts again.
 
     The first ``skip`` records are skipped once, at the start. With ``shuffle`` each epoch has its own order, which
-    depends on ``seed``, ``stream`` and the epoch's number. If ``ranks`` nets read the same data in parallel, net
-    ``rank`` takes every ``ranks``-th record (Caffe: DataLayer::Skip); all must have the same ``seed``.
+    follows from its number. Of several ranks each takes every ``ranks``-th record (Caffe: DataLayer::Skip).
     """
 
-    def __init__(
-        self,
-        count: int,
-        batch_size: int,
-        skip: int = 0,
-        shuffle: bool = False,
-        seed: int = 0,
-        stream: str = "",
-        rank: int = 0,
-        ranks: int = 1,
-    ) -> None:
+    def __init__(self, count: int, batch_size: int, skip: int = 0, shuffle: bool = False, draws: Draws = ALONE) -> None:
         self.count, self.batch_size, self.skip = count, batch_size, skip
-        self._rank, self._ranks = rank, ranks
+        self._rank, self._ranks = draws.rank, draws.ranks
         self._shuffle = shuffle
+        seed, stream = draws.seed, draws.stream
         self._order = lru_cache(maxsize=2)(lambda epoch: permutation(seed, f"{stream}/shuffle/{epoch}", count))
 
     def records(self, iteration: int) -> list[int]:

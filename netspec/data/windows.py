@@ -17,7 +17,7 @@ import numpy as np
 from netspec.data.datum import decode_pixels, planar
 from netspec.data.mean import read_mean
 from netspec.data.random_words import words_at
-from netspec.data.sources import Arrays, Cursor, Shape
+from netspec.data.sources import Arrays, Cursor, Draws, Shape
 from netspec.data.transformer import mean_contradictions
 from netspec.errors import SpecError, Where
 from netspec.files.limits import read_bytes
@@ -113,10 +113,7 @@ class WindowSource:
         file: WindowFile,
         mean: np.ndarray,
         at: Callable[..., Where],
-        seed: int,
-        stream: str,
-        rank: int = 0,
-        ranks: int = 1,
+        draws: Draws,
     ) -> None:
         self._crop: int = transform.crop_size
         self._mirror: bool = transform.mirror
@@ -130,9 +127,9 @@ class WindowSource:
         for kind, name in ((self._file.background, "background"), (self._file.foreground, "foreground")):
             if not kind and any(wanted is kind for wanted in self._kinds):
                 raise SpecError(f'"{param.source}" has no {name} windows, but each batch needs some', where)
-        self._seed, self._stream, self._where = seed, stream, where
+        self._draws, self._where = draws, where
         count = len(self._file.foreground) + len(self._file.background)
-        self.cursor = Cursor(count, param.batch_size, rank=rank, ranks=ranks)
+        self.cursor = Cursor(count, param.batch_size, draws=draws)
         self._bytes = lru_cache(maxsize=None if param.cache_images else 0)(lambda path: Path(path).read_bytes())
 
     @property
@@ -154,7 +151,7 @@ class WindowSource:
         return [f"{self._file.images[w.image]}:{w.x1},{w.y1},{w.x2},{w.y2}" for w, _ in self._draw(iteration)]
 
     def _draw(self, iteration: int) -> list[tuple[Window, bool]]:
-        draws = words_at(self._seed, self._stream, self.cursor.positions(iteration)).tolist()
+        draws = words_at(self._draws.seed, self._draws.stream, self.cursor.positions(iteration)).tolist()
         return [
             (kind[index % len(kind)], self._mirror and mirror % 2 == 1)
             for kind, (index, mirror, *_) in zip(self._kinds, draws, strict=True)

@@ -93,4 +93,4 @@ def _open_database(source: str, transform: str, phase: str, seed: int) -> Opened
 
 def _open_hdf5(source: str, tops: tuple[str, ...]) -> Opened:
     files = [source] if h5py.is_hdf5(source) else source
-    return Opened(Hdf5Source(files, tops, 1, shuffle=False, seed=0, stream="data"), tops)
+    return Opened(Hdf5Source(files, tops, 1), tops)

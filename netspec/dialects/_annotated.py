@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from typing_extensions import override
 
 from netspec.data.database import Reader
 from netspec.data.datum import datum_to_array, times
 from netspec.data.random_words import derived
-from netspec.data.sources import Arrays, Cursor, Source
+from netspec.data.sources import Arrays, Cursor, Draws, Source
 from netspec.dialects._augment import COLUMNS, FIT_SMALL_SIZE, Augmenter, fixed_size, wrong_settings
 from netspec.errors import SpecError, Where
 from netspec.layers.base import Shape
@@ -32,11 +31,10 @@ MOST_BOXES = 300  # of an image, with yolo_data_type: 1
 class AnnotatedSource:
     """The records of a database of AnnotatedDatum, made into batches.
 
-    The variations of a record follow from ``seed``, ``stream`` and the record's position alone. Of several
-    ``augments`` one is drawn for each PERIOD iterations, by the prob of their resize_param. ``typed`` says that records
-    count as having boxes, whatever they say. With ``centered``, each image's boxes are the rows of YOLO instead:
-    class from 0, x, y, width, height; ``difficult`` says whether difficult boxes are among them. Raises SpecError for a
-    record that cannot be read.
+    The variations of a record follow from ``draws`` and the record's position alone. Of several ``augments`` one is
+    drawn for each PERIOD iterations, by the prob of their resize_param. ``settings`` is the annotated_data_param: with
+    anno_type records count as having boxes, whatever they say; with yolo_data_type 1 each image's boxes are the rows of
+    YOLO instead, class from 0, x, y, width, height. Raises SpecError for a record that cannot be read.
     """
 
     def __init__(
@@ -44,19 +42,17 @@ class AnnotatedSource:
         reader: Reader,
         cursor: Cursor,
         augments: Sequence[Augmenter],
-        typed: bool,
-        seed: int,
-        stream: str,
+        settings: Any,
+        draws: Draws,
         where: Where | None,
-        centered: bool = False,
-        difficult: bool = True,
     ) -> None:
         self.cursor, self._reader, self._augments, self._where = cursor, reader, augments, where
-        self._seed, self._stream, self._centered, self._difficult = seed, stream, centered, difficult
+        self._draws, self._difficult = draws, settings.train_diffcult
+        self._centered = centered = settings.yolo_data_type == 1
         self._parse = message("ssd.AnnotatedDatum").FromString
         self._has_boxes = True
         image, first = self._read(cursor.first())
-        self._has_boxes = typed or first.HasField("type")
+        self._has_boxes = centered or has(settings, "anno_type") or first.HasField("type")
         self._shapes = [(image.shape[2], *augment.size(image.shape)) for augment in augments]
         count = sum(len(group.annotation) for group in first.annotation_group)
         batch = cursor.batch_size
@@ -81,7 +77,7 @@ class AnnotatedSource:
         places = zip(self.cursor.records(iteration), self.cursor.positions(iteration), strict=True)
         for item, (record, position) in enumerate(places):
             pixels, datum = self._read(record)
-            draw = Random(derived(self._seed, f"{self._stream}/{position}"))
+            draw = Random(derived(self._draws.seed, f"{self._draws.stream}/{position}"))
             image, boxes = augment(pixels, self._boxes(datum), draw)
             if self.cursor.batch_size > 1 and image.shape != shape:
                 advice = "all must have the same size: give resize_param, or batch_size: 1"
@@ -102,7 +98,7 @@ class AnnotatedSource:
         """Return the number of the augmenter of an iteration."""
         if len(self._augments) == 1:
             return 0
-        draw = Random(derived(self._seed, f"{self._stream}/resize/{iteration // PERIOD}"))
+        draw = Random(derived(self._draws.seed, f"{self._draws.stream}/resize/{iteration // PERIOD}"))
         (chosen,) = draw.choices(range(len(self._augments)), [a.resize.prob for a in self._augments])
         return chosen
 
@@ -161,7 +157,6 @@ class AnnotatedData(Data):
     each: eric612/MobileNet-YOLO
     """
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         p = self.param
         yield from ReadingLayer.wrong_settings(self)
@@ -187,7 +182,6 @@ class AnnotatedData(Data):
         samplers: Sequence[Any] = value(self.param, "annotated_data_param").batch_sampler
         return samplers
 
-    @override
     def open(self) -> Source | None:
         p, context = self.param, self.context
         reader = self._reader
@@ -201,16 +195,11 @@ class AnnotatedData(Data):
         if p.data_param.force_encoded_color:
             for augment in augments:
                 augment.color = True
-        skip = self.skip(p.data_param.rand_skip, len(reader), "data_param", "rand_skip")
-        cursor = self.cursor(len(reader), skip)
-        centered, difficult = settings.yolo_data_type == 1, settings.train_diffcult
-        typed = has(settings, "anno_type") or centered
-        seed, place = context.data_seed, self.place
-        source = AnnotatedSource(reader, cursor, augments, typed, seed, self.stream, place, centered, difficult)
+        cursor = self.cursor(len(reader), p.data_param.rand_skip)
+        source = AnnotatedSource(reader, cursor, augments, settings, self.draws, self.place)
         self.log_size(source, "annotated_data_layer.cpp:62")
         return source
 
-    @override
     def known_shape(self) -> Shape | None:
         """Return the shape where the prototxt says size and channels."""
         p = self.param.transform_param
@@ -218,11 +207,7 @@ class AnnotatedData(Data):
         channels = 3 if p.force_color else 1 if p.force_gray else len(p.mean_value)
         return (self.batch_size, channels, *size) if size and (channels > 1 or p.force_gray) else None
 
-    @override
-    def shapes_without_data(self) -> list[Shape]:
-        """Return the images' shape, and that of a single box, or of an image's boxes as YOLO has them."""
-        data, *_ = super().shapes_without_data()
-        given = self.context.options.given_shapes
+    def shape_beside(self, data: Shape) -> Shape:
+        """Return the shape of a single box, or of an image's boxes as YOLO has them."""
         centered = value(self.param, "annotated_data_param").yolo_data_type == 1
-        boxes = (self.batch_size, 1, MOST_BOXES, 5) if centered else (1, 1, 1, COLUMNS + 1)
-        return [data, *(given.get(top, boxes) for top in self.param.top[1:])]
+        return (self.batch_size, 1, MOST_BOXES, 5) if centered else (1, 1, 1, COLUMNS + 1)

@@ -11,7 +11,6 @@ from typing import ClassVar
 import numpy as np
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
 
 from netspec.data.images import read_image
 from netspec.data.sources import Source
@@ -32,23 +31,20 @@ class EdgeMaps(ImageData):
         """Return the labels of a gray image, 0 to 255."""
         raise NotImplementedError
 
-    @override
     def open(self) -> Source | None:
-        p, context = self.param.image_data_param, self.context
+        p, draws = self.param.image_data_param, self.draws
         pairs = self.attempt(read_pairs, p.source, self.place)
         transformer = self.attempt(self.transformer)
         if pairs is None or transformer is None:
             return None
-        skip = self.skip(p.rand_skip, len(pairs), "image_data_param", "rand_skip")
-        seed, stream = context.data_seed, self.stream
-        cursor = self.cursor(len(pairs), skip, p.shuffle)
+        cursor = self.cursor(len(pairs), p.rand_skip, p.shuffle)
         size = (p.new_height, p.new_width) if p.new_height else None
         root, color = p.root_folder, p.is_color
         bare = type(self.param.transform_param)()
         bare.CopyFrom(self.param.transform_param)
         for name in ("mean_file", "mean_value", "scale"):
             bare.ClearField(name)
-        as_images = Transformer(bare, self.phase, context.at, seed, stream)  # of the same draws
+        as_images = Transformer(bare, self.phase, self.context.at, draws.seed, draws.stream)  # of the same draws
 
         def read(pair: Pair) -> tuple[Array, Array]:
             return read_image(root + pair.image, color, size), read_labels(root + pair.labels, size, nearest=False)
@@ -64,11 +60,8 @@ class EdgeMaps(ImageData):
         self.log_size(source, "image_labelmap_data_layer.cpp:105")
         return source
 
-    @override
-    def shapes_without_data(self) -> list[Shape]:
-        """Return the shapes of images and edges."""
-        data = super().shapes_without_data()[0]
-        return [data, self.context.options.given_shapes.get(self.param.top[1], (data[0], 1, *data[2:]))]
+    def shape_beside(self, data: Shape) -> Shape:
+        return (data[0], 1, *data[2:])
 
 
 class Balanced(SigmoidCrossEntropyLoss):

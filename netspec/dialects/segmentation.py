@@ -63,7 +63,6 @@ class DenseImageData(ReadingLayer):
     group = GROUP
     ignores = frozenset({f"{GROUP}.mean_file"})
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         p, transform = value(self.param, GROUP), self.param.transform_param
         for names in (("new_height", "new_width"), ("crop_height", "crop_width")):
@@ -80,16 +79,13 @@ class DenseImageData(ReadingLayer):
         yield from super().wrong_settings()
         yield from contradictions(transform, self.context.at)
 
-    @override
     def open(self) -> Source | None:
-        p, context = value(self.param, GROUP), self.context
+        p, draws = value(self.param, GROUP), self.draws
         pairs = self.attempt(read_pairs, p.source, self.place)
         transformer = self.attempt(self.transformer)
         if pairs is None or transformer is None:
             return None
-        skip = self.skip(p.rand_skip, len(pairs), GROUP, "rand_skip")
-        seed, stream = context.data_seed, self.stream
-        cursor = self.cursor(len(pairs), skip, p.shuffle)
+        cursor = self.cursor(len(pairs), p.rand_skip, p.shuffle)
         size = (p.new_height, p.new_width) if p.new_height else None
         smaller = None if size is None else (size[0] // p.label_divide_factor, size[1] // p.label_divide_factor)
         crop, mirror, root, color = (p.crop_height, p.crop_width), p.mirror, p.root_folder, p.is_color
@@ -98,7 +94,7 @@ class DenseImageData(ReadingLayer):
             return read_image(root + pair.image, color, size), read_labels(root + pair.labels, smaller, nearest=True)
 
         def cut(image: Array, labels: Array, position: int) -> tuple[Array, Array]:
-            mirrored, down, across, _ = words(seed, f"{stream}/cut", position, 1)[0].tolist()
+            mirrored, down, across, _ = words(draws.seed, f"{draws.stream}/cut", position, 1)[0].tolist()
             if mirror and mirrored % 2:
                 image, labels = image[:, :, ::-1], labels[:, :, ::-1]
             if not crop[0]:
@@ -113,20 +109,15 @@ class DenseImageData(ReadingLayer):
         self.log_size(source, "dense_image_data_layer.cpp:121")
         return source
 
-    @override
     def known_shape(self) -> Shape | None:
         """Return the shape where the prototxt gives height and width."""
         p = value(self.param, GROUP)
         height, width = (p.crop_height, p.crop_width) if p.crop_height else (p.new_height, p.new_width)
         return (self.batch_size, 3 if p.is_color else 1, height, width) if height else None
 
-    @override
-    def shapes_without_data(self) -> list[Shape]:
-        """Return the shapes of images and labels."""
-        data = super().shapes_without_data()[0]
+    def shape_beside(self, data: Shape) -> Shape:
         less = value(self.param, GROUP).label_divide_factor
-        labels = (data[0], 1, *(size // less for size in data[2:]))
-        return [data, self.context.options.given_shapes.get(self.param.top[1], labels)]
+        return (data[0], 1, *(size // less for size in data[2:]))
 
 
 @register(
@@ -164,7 +155,6 @@ class SoftmaxWithLoss(losses.SoftmaxWithLoss):
         return shapes
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the loss and, where there is a second top, the softmax."""
         _, label = self.scores_and_labels(scores, labels)
         self._each = self.weights.to(scores)[label.clamp(0, self.classes - 1)]
         return super().forward(scores, labels)

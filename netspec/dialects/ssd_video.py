@@ -10,10 +10,9 @@ from collections.abc import Iterator, Sequence
 from random import Random
 
 import numpy as np
-from typing_extensions import override
 
 from netspec.data.random_words import derived
-from netspec.data.sources import Arrays, Cursor, Source
+from netspec.data.sources import Arrays, Cursor, Draws, Source
 from netspec.dialects._augment import COLUMNS, Augmenter, fixed_size, wrong_settings
 from netspec.errors import SpecError, Where
 from netspec.files.opencv import cv2
@@ -79,9 +78,9 @@ class Frames:
 class VideoSource:
     """Batches of frames, ``skip`` frames left out before each; random draws follow from a frame's position."""
 
-    def __init__(self, frames: Frames, cursor: Cursor, augment: Augmenter, skip: int, seed: int, stream: str) -> None:
+    def __init__(self, frames: Frames, cursor: Cursor, augment: Augmenter, skip: int, draws: Draws) -> None:
         self.cursor, self._frames, self._augment, self._step = cursor, frames, augment, skip + 1
-        self._seed, self._stream = seed, stream
+        self._draws = draws
         size = augment.size(frames.read(0).shape)
         self.shapes: Sequence[Shape] = [(cursor.batch_size, 3, *size), (cursor.batch_size,)]
 
@@ -96,7 +95,7 @@ class VideoSource:
         """Return frames (N, 3, H, W) and labels (N,), all 0."""
         images = []
         for position, number in zip(self.cursor.positions(iteration), self._numbers(iteration), strict=True):
-            draw = Random(derived(self._seed, f"{self._stream}/{position}"))
+            draw = Random(derived(self._draws.seed, f"{self._draws.stream}/{position}"))
             images.append(self._augment.transformed(self._frames.read(number), NO_BOXES, draw)[0])
         return np.stack(images), np.zeros(len(images), np.float32)
 
@@ -129,7 +128,6 @@ class VideoData(ReadingLayer):
         switch_on(find_file("ssd"))  # its transform_param
         super().construct()
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         transform, p = self.param.transform_param, value(self.param, GROUP)
         if self.param.data_param.batch_size <= 0:
@@ -140,7 +138,6 @@ class VideoData(ReadingLayer):
             yield self.error("expected one resize_param", "transform_param", "resize_param")
         yield from wrong_settings(transform, [], self.context.at)
 
-    @override
     def open(self) -> Source | None:
         p, transform, context = value(self.param, GROUP), self.param.transform_param, self.context
         name, field = (p.video_file, "video_file") if p.video_type == VIDEO else (p.device_id, "device_id")
@@ -152,17 +149,15 @@ class VideoData(ReadingLayer):
         batches = frames.count // (p.skip_frames + 1) // self.batch_size
         if not batches:
             raise self.error(f"{frames.title} has {frames.count} frames, too few for a batch", GROUP, field)
-        cursor = self.cursor(batches * self.batch_size, 0)
-        source = VideoSource(frames, cursor, augment, p.skip_frames, context.data_seed, self.stream)
+        cursor = self.cursor(batches * self.batch_size)
+        source = VideoSource(frames, cursor, augment, p.skip_frames, self.draws)
         self.log_size(source, "video_data_layer.cpp:73")
         return source
 
     @property
-    @override
     def num_records(self) -> int:
         return super().num_records if value(self.param, GROUP).video_type == VIDEO else 0
 
-    @override
     def known_shape(self) -> Shape | None:
         """Return the shape where the prototxt says the size."""
         size = fixed_size(self.param.transform_param)

@@ -139,7 +139,7 @@ def _wrong_transform(layer: files.ReadingLayer) -> Iterator[SpecError]:
 
 
 class LaterShuffled(Cursor):
-    """A Cursor that reads the first epoch in order, and shuffles all others."""
+    """A Cursor that reads the first epoch in order, and where it shuffles only the others."""
 
     @override
     def _record(self, position: int) -> int:
@@ -155,28 +155,20 @@ class Data(files.Data):
     Fork: yjxiong/caffe, src/caffe/layers/data_layer.cpp, src/caffe/data_transformer.cpp
     """
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         yield from super().wrong_settings()
         yield from _wrong_transform(self)
 
     @override
-    def cursor(self, count: int, skip: int, shuffle: bool = False) -> Cursor:
-        kind = LaterShuffled if value(self.param.data_param, "shuffle") else Cursor
-        options = self.context.options
-        draws = (self.context.data_seed, self.stream, options.rank, options.ranks)
-        return kind(count, self.batch_size, skip, kind is LaterShuffled, *draws)
+    def cursor(
+        self, count: int, rand_skip: int = 0, shuffle: bool = False, kind: type[Cursor] = LaterShuffled
+    ) -> Cursor:
+        return super().cursor(count, rand_skip, value(self.param.data_param, "shuffle"), kind)
 
     @override
-    def transformer(self) -> Transformer:
-        if not any(value(self.param.transform_param, name) for name in ("fix_crop", "multi_scale", "is_flow")):
-            return super().transformer()
-        return _windows(self)
-
-
-def _windows(layer: files.ReadingLayer) -> Windows:
-    context = layer.context
-    return Windows(layer.param.transform_param, layer.phase, context.at, context.data_seed, layer.stream)
+    def transformer(self, kind: type[Transformer] = Windows) -> Transformer:
+        of_windows = any(value(self.param.transform_param, name) for name in ("fix_crop", "multi_scale", "is_flow"))
+        return super().transformer(kind if of_windows else Transformer)
 
 
 @dataclass(frozen=True)
@@ -269,7 +261,6 @@ class VideoData(files.ReadingLayer):
 
     group = GROUP
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         p = value(self.param, GROUP)
         if bool(p.new_height) != bool(p.new_width):
@@ -286,22 +277,18 @@ class VideoData(files.ReadingLayer):
         yield from contradictions(self.param.transform_param, self.context.at)
         yield from _wrong_transform(self)
 
-    @override
     def open(self) -> Source | None:
-        p, context = value(self.param, GROUP), self.context
+        p, draws = value(self.param, GROUP), self.draws
         videos = self.attempt(read_videos, p.source, self.place)
-        transformer = self.attempt(_windows, self)
+        transformer = self.attempt(self.transformer, Windows)
         if videos is None or transformer is None:
             return None
-        skip = self.skip(p.rand_skip, len(videos), GROUP, "rand_skip")
-        seed, stream = context.data_seed, self.stream
-        cursor = self.cursor(len(videos), skip, p.shuffle)
-        draws = partial(words, seed, f"{stream}/frames")
-        source = VideoSource(p, videos, cursor, transformer, draws, self.phase)
+        cursor = self.cursor(len(videos), p.rand_skip, p.shuffle)
+        starts = partial(words, draws.seed, f"{draws.stream}/frames")
+        source = VideoSource(p, videos, cursor, transformer, starts, self.phase)
         self.log_size(source, "video_data_layer.cpp:88")
         return source
 
-    @override
     def known_shape(self) -> Shape | None:
         """Return the shape where the prototxt gives height and width."""
         p, crop = value(self.param, GROUP), self.param.transform_param.crop_size
@@ -309,8 +296,5 @@ class VideoData(files.ReadingLayer):
         planes = 2 if p.modality == FLOW else 1 if p.grayscale else 3
         return (self.batch_size, planes * p.new_length * p.num_segments, height, width) if height else None
 
-    @override
-    def shapes_without_data(self) -> list[Shape]:
-        """Return the shapes of frames and labels."""
-        data = super().shapes_without_data()[0]
-        return [data, self.context.options.given_shapes.get(self.param.top[1], (data[0], 1, 1, 1))]
+    def shape_beside(self, data: Shape) -> Shape:
+        return (data[0], 1, 1, 1)

@@ -198,7 +198,7 @@ def all_rows(path: Path) -> None:
     listed = path.with_suffix(".txt")
     listed.write_text(f"{path}\n")
     for tops in (["data", "label"], ["packed"]):
-        source = Hdf5Source(str(listed), tops, 4, False, 0, "h5")
+        source = Hdf5Source(str(listed), tops, 4)
         for i in range(3):
             source.batch(i)
 

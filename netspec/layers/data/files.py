@@ -15,12 +15,11 @@ from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import torch
-from typing_extensions import override
 
 from netspec.data.database import open_reader
 from netspec.data.images import read_image_list
 from netspec.data.prefetch import Feed
-from netspec.data.sources import Cursor, DatabaseSource, ImageListSource, Source, draw_skip
+from netspec.data.sources import Cursor, DatabaseSource, Draws, ImageListSource, Source, draw_skip
 from netspec.data.transformer import Transformer, contradictions
 from netspec.errors import SpecError, UnknownShape, Where
 from netspec.layers.base import Layer, Shape
@@ -115,7 +114,11 @@ class ReadingLayer(Layer):
         data = given.get(self.param.top[0]) or self.known_shape()
         if data is None:
             raise self.shape_wanted(self.param.top[0], f"{self.batch_size},C,H,W")
-        return [data, *(given.get(top) or data[:1] for top in self.param.top[1:])]
+        return [data, *(given.get(top) or self.shape_beside(data) for top in self.param.top[1:])]
+
+    def shape_beside(self, data: Shape) -> Shape:
+        """Return the shape of what goes with the first top, of shape ``data``: a label for each image."""
+        return data[:1]
 
     def shape_wanted(self, blob: str, example: str) -> SpecError:
         """Return the error that asks for the shape of a top."""
@@ -162,7 +165,6 @@ class ReadingLayer(Layer):
             raise self.error(f"found iteration {state['iteration']} to go on from, expected at least 0")
         self.restart(state["iteration"])
 
-    @override
     def close(self) -> None:
         if self._feed:
             self._feed.close()
@@ -182,34 +184,30 @@ class ReadingLayer(Layer):
     # What the subclasses share
 
     @property
-    def stream(self) -> str:
-        """The name of this layer's random draws; a TRAIN and a TEST layer may share their name."""
-        return f"{self.param.name}/{PHASE_NAMES[self.phase]}"
+    def draws(self) -> Draws:
+        """What this layer draws; a TRAIN and a TEST layer may share their name."""
+        options, stream = self.context.options, f"{self.param.name}/{PHASE_NAMES[self.phase]}"
+        return Draws(self.context.data_seed, stream, options.rank, options.ranks)
 
-    def transformer(self) -> Transformer:
+    def transformer(self, kind: type[Transformer] = Transformer) -> Transformer:
         """Return the transformer of this layer's ``transform_param``."""
-        context = self.context
-        return Transformer(self.param.transform_param, self.phase, context.at, context.data_seed, self.stream)
+        draws = self.draws
+        return kind(self.param.transform_param, self.phase, self.context.at, draws.seed, draws.stream)
 
     @property
     def place(self) -> Where:
         """Where the prototxt names the data."""
         return self.context.at(self.group, "source")
 
-    def skip(self, rand_skip: int, count: int, *path: str) -> int:
-        """Draw how many records to pass over at the start."""
-        skip = draw_skip(rand_skip, self.context.data_seed, self.stream)
+    def cursor(self, count: int, rand_skip: int = 0, shuffle: bool = False, kind: type[Cursor] = Cursor) -> Cursor:
+        """Return the order in which ``count`` records are read, without the first few where ``rand_skip`` is given."""
+        draws = self.draws
+        skip = draw_skip(rand_skip, draws.seed, draws.stream)
         if rand_skip:
             log.info("image_data_layer.cpp:70", f"Skipping first {skip} data points.")
         if skip >= count:
-            raise self.error(f"cannot skip {skip} records (rand_skip): there are only {count}", *path)
-        return skip
-
-    def cursor(self, count: int, skip: int, shuffle: bool = False) -> Cursor:
-        """Return the order in which ``count`` records are read, the first ``skip`` of them not."""
-        options = self.context.options
-        draws = (self.context.data_seed, self.stream, options.rank, options.ranks)
-        return Cursor(count, self.batch_size, skip, shuffle, *draws)
+            raise self.error(f"cannot skip {skip} records (rand_skip): there are only {count}", self.group, "rand_skip")
+        return kind(count, self.batch_size, skip, shuffle, draws)
 
     def log_size(self, source: Source, site: str) -> None:
         """Log the shape of a batch."""
@@ -238,7 +236,6 @@ class Data(ReadingLayer):
     group = "data_param"
     ignores = frozenset(f"data_param.{name}" for name in MOVED)
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         yield from super().wrong_settings()
         yield from contradictions(self.param.transform_param, self.context.at)
@@ -249,7 +246,6 @@ class Data(ReadingLayer):
             p = self.param.data_param
             self._reader = self.attempt(open_reader, p.source, BACKENDS[p.backend], self.place)
 
-    @override
     def open(self) -> Source | None:
         p, reader = self.param.data_param, self._reader
         transformer = self.attempt(self.transformer)
@@ -257,12 +253,10 @@ class Data(ReadingLayer):
             return None
         if p.force_encoded_color:
             transformer.color = True
-        skip = self.skip(p.rand_skip, len(reader), "data_param", "rand_skip")
-        source = DatabaseSource(reader, self.cursor(len(reader), skip), transformer, self.place)
+        source = DatabaseSource(reader, self.cursor(len(reader), p.rand_skip), transformer, self.place)
         self.log_size(source, "data_layer.cpp:45")
         return source
 
-    @override
     def known_shape(self) -> Shape | None:
         """Return a shape where crop_size gives height and width, and one mean_value a channel their number."""
         p = self.param.transform_param
@@ -270,7 +264,6 @@ class Data(ReadingLayer):
             return (self.batch_size, len(p.mean_value), p.crop_size, p.crop_size)
         return None
 
-    @override
     def log_restart(self) -> None:
         log.info("data_layer.cpp:73", "Restarting data prefetching from start.")
 
@@ -287,7 +280,6 @@ class ImageData(ReadingLayer):
     group = "image_data_param"
     ignores = frozenset(f"image_data_param.{name}" for name in MOVED)
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         p = self.param.image_data_param
         if bool(p.new_height) != bool(p.new_width):
@@ -295,7 +287,6 @@ class ImageData(ReadingLayer):
         yield from super().wrong_settings()
         yield from contradictions(self.param.transform_param, self.context.at)
 
-    @override
     def open(self) -> Source | None:
         """Read the list; its first image sets the shape."""
         p = self.param.image_data_param
@@ -307,15 +298,13 @@ class ImageData(ReadingLayer):
         if p.shuffle:
             log.info("image_data_layer.cpp:53", "Shuffling data")
         log.info("image_data_layer.cpp:63", f"A total of {len(images)} images.")
-        skip = self.skip(p.rand_skip, len(images), "image_data_param", "rand_skip")
-        cursor = self.cursor(len(images), skip, p.shuffle)
+        cursor = self.cursor(len(images), p.rand_skip, p.shuffle)
         size = (p.new_height, p.new_width) if p.new_height else None
         self.possible((3, *(size or ())))
         source = ImageListSource(images, p.root_folder, p.is_color, size, cursor, transformer)
         self.log_size(source, "image_data_layer.cpp:90")
         return source
 
-    @override
     def known_shape(self) -> Shape | None:
         """Return the shape where crop_size, or new_height and new_width, give height and width."""
         p, crop = self.param.image_data_param, self.param.transform_param.crop_size
@@ -338,7 +327,6 @@ class WindowData(ReadingLayer):
         | {f"transform_param.{name}" for name in ("scale", "force_color", "force_gray")}
     )
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         from netspec.data.windows import wrong_means
 
@@ -354,7 +342,6 @@ class WindowData(ReadingLayer):
             yield self.error(message, self.group, "context_pad")
         yield from wrong_means(self.param.transform_param, self.context.at)
 
-    @override
     def open(self) -> Source | None:
         from netspec.data.windows import WindowSource, read_window_file, window_mean
 
@@ -363,10 +350,8 @@ class WindowData(ReadingLayer):
         mean = self.attempt(window_mean, transform, context.at)
         if file is None or mean is None:
             return None
-        seed, rank, ranks = context.data_seed, context.options.rank, context.options.ranks
-        return WindowSource(p, transform, file, mean, context.at, seed, self.stream, rank, ranks)
+        return WindowSource(p, transform, file, mean, context.at, self.draws)
 
-    @override
     def known_shape(self) -> Shape:
         """Return the shape; the prototxt says all of it."""
         crop: int = self.param.transform_param.crop_size

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import torch
-from typing_extensions import override
 
 from netspec.data.sources import Source
 from netspec.errors import SpecError
@@ -26,23 +25,18 @@ class HDF5Data(ReadingLayer):
     tops = (1, None)
     group = "hdf5_data_param"
 
-    @override
     def wrong_settings(self) -> Iterator[SpecError]:
         """Yield what is wrong with hdf5_data_param; there is no transform_param."""
         yield from super().wrong_settings()
         if self.param.HasField("transform_param"):
             yield self.error("HDF5Data does not transform data; remove transform_param", "transform_param")
 
-    @override
     def open(self) -> Source | None:
         from netspec.data.hdf5 import Hdf5Source
 
-        p, context = self.param.hdf5_data_param, self.context
-        seed, rank, ranks = context.data_seed, context.options.rank, context.options.ranks
-        tops = self.param.top
-        return Hdf5Source(p.source, tops, p.batch_size, p.shuffle, seed, self.stream, self.place, rank, ranks)
+        p = self.param.hdf5_data_param
+        return Hdf5Source(p.source, self.param.top, p.batch_size, p.shuffle, self.draws, self.place)
 
-    @override
     def shapes_without_data(self) -> list[Shape]:
         """Return the shapes given by the caller; the prototxt says nothing of them."""
         for top in self.param.top:
@@ -85,7 +79,6 @@ class HDF5Output(Layer):
             raise self.error(f"data has {data[:1]} rows and label {label[:1]}; expected the same number", "bottom")
         return ()
 
-    @override
     def close(self) -> None:
         if self._sink is not None:
             self._sink.close()

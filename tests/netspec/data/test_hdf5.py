@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from netspec.data.hdf5 import Hdf5Sink, Hdf5Source
+from netspec.data.sources import Draws
 from netspec.errors import SpecError, Where
 
 PLACE = Where("net.prototxt", 4, 2)
@@ -32,7 +33,7 @@ def listed(tmp_path: Path) -> str:
 
 
 def test_batches_straddle_files_and_wrap(listed: str) -> None:
-    source = Hdf5Source(listed, ["data", "label"], 7, False, 0, "x", PLACE)
+    source = Hdf5Source(listed, ["data", "label"], 7, where=PLACE)
     assert list(source.shapes) == [(7, 2, 3), (7,)]
     labels = [source.batch(i)[1].tolist() for i in range(2)]
     assert labels == [[0, 1, 2, 3, 4, 5, 6], [7, 8, 9, 10, 11, 0, 1]]
@@ -43,20 +44,22 @@ def test_batches_straddle_files_and_wrap(listed: str) -> None:
 
 
 def test_shuffling_keeps_files_together_and_changes_with_the_epoch(listed: str) -> None:
-    source = Hdf5Source(listed, ["label"], 4, True, 3, "x", PLACE)
+    source = Hdf5Source(listed, ["label"], 4, True, Draws(3, "x"), PLACE)
     epochs = [np.concatenate([source.batch(i)[0] for i in range(3 * e, 3 * e + 3)]).tolist() for e in range(4)]
     assert all(sorted(epoch) == list(range(12)) for epoch in epochs)
     assert len({tuple(epoch) for epoch in epochs}) == 4
     files = [0] * 5 + [1] * 3 + [2] * 4
     runs = [1 + sum(files[int(a)] != files[int(b)] for a, b in pairwise(epoch)) for epoch in epochs]
     assert runs == [3] * 4  # all rows of a file, then all of another
-    assert Hdf5Source(listed, ["label"], 4, True, 3, "x", PLACE).batch(7)[0].tolist() == source.batch(7)[0].tolist()
+    assert (
+        Hdf5Source(listed, ["label"], 4, True, Draws(3, "x"), PLACE).batch(7)[0].tolist() == source.batch(7)[0].tolist()
+    )
 
 
 def refuse(tmp_path: Path, names: str, message: str) -> None:
     (tmp_path / "bad.txt").write_text(names)
     with pytest.raises(SpecError, match=message):
-        Hdf5Source(str(tmp_path / "bad.txt"), ["data", "label"], 2, False, 0, "x", PLACE)
+        Hdf5Source(str(tmp_path / "bad.txt"), ["data", "label"], 2, where=PLACE)
 
 
 def test_bad_files_are_named_with_their_line(tmp_path: Path, listed: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from netspec.data.database import Writer, open_reader
 from netspec.data.datum import array_to_datum
-from netspec.data.sources import Cursor, DatabaseSource, draw_skip
+from netspec.data.sources import Cursor, DatabaseSource, Draws, draw_skip
 from netspec.data.transformer import Transformer
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import TransformationParameter
@@ -43,11 +43,11 @@ def test_records_are_skipped_at_the_very_start_only() -> None:
 
 
 def test_each_epoch_has_an_order_of_its_own() -> None:
-    cursor = Cursor(count=50, batch_size=10, shuffle=True, seed=1, stream="x")
+    cursor = Cursor(count=50, batch_size=10, shuffle=True, draws=Draws(1, "x"))
     epochs = [[record for i in range(5 * e, 5 * e + 5) for record in cursor.records(i)] for e in range(3)]
     assert all(sorted(epoch) == list(range(50)) for epoch in epochs)
     assert epochs[0] != epochs[1] != epochs[2] != list(range(50))
-    again = Cursor(count=50, batch_size=10, shuffle=True, seed=1, stream="x")
+    again = Cursor(count=50, batch_size=10, shuffle=True, draws=Draws(1, "x"))
     assert again.records(12) == cursor.records(12)
 
 

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from netspec.data.sources import Draws
 from netspec.data.windows import WindowSource, read_window_file, window_mean, wrong_means
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import TransformationParameter, message
@@ -48,7 +49,7 @@ def source(folder: Path, transform: dict | None = None, **fields: object) -> Win
     for fault in wrong_means(transform_param, at):
         raise fault
     file, mean = read_window_file(param, at()), window_mean(transform_param, at)
-    return WindowSource(param, transform_param, file, mean, at, 1, "data/TRAIN")
+    return WindowSource(param, transform_param, file, mean, at, Draws(1, "data/TRAIN"))
 
 
 def warped(x1: int, y1: int, x2: int, y2: int) -> np.ndarray:

@@ -64,7 +64,7 @@ def test_the_rows_of_a_pointer(tmp_path: Path):
     (tmp_path / "rows.h5").write_bytes(POINTER)
     (tmp_path / "list.txt").write_text(f"{tmp_path}/rows.h5\n")
     with pytest.raises(SpecError, match=SAID):
-        Hdf5Source(str(tmp_path / "list.txt"), ["data"], 1, shuffle=False, seed=0, stream="")
+        Hdf5Source(str(tmp_path / "list.txt"), ["data"], 1)
 
 
 def test_other_texts_are_no_pointers():

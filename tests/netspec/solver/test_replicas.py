@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.data.sources import Cursor
+from netspec.data.sources import Cursor, Draws
 from netspec.solver.solver import load_solver
 from paths import GOLDEN
 
@@ -15,7 +15,7 @@ CPU = torch.device("cpu")
 
 def test_ranks_share_the_records_between_them() -> None:
     alone = Cursor(10, 6)
-    ranks = [Cursor(10, 3, rank=rank, ranks=2) for rank in (0, 1)]
+    ranks = [Cursor(10, 3, draws=Draws(rank=rank, ranks=2)) for rank in (0, 1)]
     for iteration in range(5):
         together = [record for pair in zip(*(r.records(iteration) for r in ranks), strict=True) for record in pair]
         assert together == alone.records(iteration)
