@@ -335,36 +335,28 @@ def suits(window: Array, boxes: Array, constraint: Any) -> bool:
 
 def distorted(image: Array, param: Any, draw: Random) -> Array:
     """Return an image with other colors, as a DistortionParameter says."""
-    steps = [_brightness, _contrast, _saturation, _hue] if draw.random() > 0.5 else []
-    for step in steps or [_brightness, _saturation, _hue, _contrast]:
-        image = step(image, param, draw)
+    order = ("brightness", "contrast", "saturation", "hue")
+    if draw.random() <= 0.5:
+        order = ("brightness", "saturation", "hue", "contrast")
+    for name in order:
+        if draw.random() < getattr(param, f"{name}_prob"):
+            if name in ("brightness", "hue"):
+                delta = getattr(param, f"{name}_delta")
+                ends = -delta, delta
+            else:
+                ends = getattr(param, f"{name}_lower"), getattr(param, f"{name}_upper")
+            image = _COLORS[name](image, draw.uniform(*ends))
     if draw.random() < param.random_order_prob:
         image = image[:, :, draw.sample(range(image.shape[2]), image.shape[2])]
     return image
 
 
-def _brightness(image: Array, param: Any, draw: Random) -> Array:
-    if draw.random() >= param.brightness_prob:
-        return image
-    return _linear(image, 1, draw.uniform(-param.brightness_delta, param.brightness_delta))
-
-
-def _contrast(image: Array, param: Any, draw: Random) -> Array:
-    if draw.random() >= param.contrast_prob:
-        return image
-    return _linear(image, draw.uniform(param.contrast_lower, param.contrast_upper), 0)
-
-
-def _saturation(image: Array, param: Any, draw: Random) -> Array:
-    if draw.random() >= param.saturation_prob:
-        return image
-    return _in_hsv(image, 1, draw.uniform(param.saturation_lower, param.saturation_upper), 0)
-
-
-def _hue(image: Array, param: Any, draw: Random) -> Array:
-    if draw.random() >= param.hue_prob:
-        return image
-    return _in_hsv(image, 0, 1, draw.uniform(-param.hue_delta, param.hue_delta))
+_COLORS: dict[str, Callable[[Array, float], Array]] = {
+    "brightness": lambda image, by: _linear(image, 1, by),
+    "contrast": lambda image, by: _linear(image, by, 0),
+    "saturation": lambda image, by: _in_hsv(image, 1, by, 0),
+    "hue": lambda image, by: _in_hsv(image, 0, 1, by),
+}
 
 
 def _in_hsv(image: Array, channel: int, factor: float, shift: float) -> Array:

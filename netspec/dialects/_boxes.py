@@ -99,8 +99,7 @@ def decode(codes: Array, priors: Array, variances: Array | None, code: int) -> A
         codes = codes * variances
     first, second = _corners(codes)
     if code == CENTER_SIZE:
-        box_center, half = first * extent + center, np.exp(second) * extent / np.float32(2)
-        return np.concatenate([box_center - half, box_center + half], axis=1)
+        return around(first * extent + center, np.exp(second) * extent)
     scale = extent if code == CORNER_SIZE else np.float32(1)
     return np.concatenate([low + first * scale, high + second * scale], axis=1)
 
@@ -112,6 +111,17 @@ def _corners(boxes: Array) -> tuple[Array, Array]:
 def _centers(boxes: Array) -> tuple[Array, Array]:
     low, high = _corners(boxes)
     return high - low, (low + high) / np.float32(2)
+
+
+def around(centers: Array, extents: Array) -> Array:
+    """Return the boxes (..., 4) of these sizes (..., 2) around these points (..., 2)."""
+    half = extents / np.float32(2)
+    return np.concatenate([centers - half, centers + half], axis=-1)
+
+
+def sigmoid(x: Array) -> Array:
+    """Return 1 / (1 + exp(-x))."""
+    return 1 / (1 + np.exp(-x))
 
 
 def outside(boxes: Array) -> Array:
@@ -219,6 +229,15 @@ def suppress_all(boxes: Array, scores: Array, threshold: float, top_k: int) -> A
     order = order[: top_k if top_k > -1 else None]
     order = order[sizes(boxes[order]) >= LEAST_SIZE]
     return order[suppress(boxes[order], threshold)]
+
+
+def detections(rows: Sequence[Array], like: torch.Tensor) -> torch.Tensor:
+    """Return the detections (d, 7) of all images as a top (1, 1, D, 7); of none at all a row (image, -1, ...) each."""
+    found = np.concatenate(rows)
+    if not len(found):
+        found = np.full((len(rows), 7), -1, np.float32)
+        found[:, 0] = np.arange(len(rows))
+    return torch.from_numpy(found[None, None]).to(like)
 
 
 def onnx_decode(graph: OnnxGraph, codes: str, priors: str, variances: str | None, code: int) -> str:

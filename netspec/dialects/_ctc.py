@@ -197,7 +197,6 @@ class CTCLoss(_CtcLoss):
         return [()]
 
     def forward(self, scores: torch.Tensor, *others: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
         count, items, classes = scores.shape[:3]
         blank = self.blank if self.blank >= 0 else classes - 1
         rows = [other.detach().reshape(other.shape[0], -1).cpu() for other in others]

@@ -15,6 +15,7 @@ from netspec.dialects._boxes import (
     as_array,
     check_predictions,
     decode,
+    detections,
     highest,
     onnx_decode,
     suppress,
@@ -87,11 +88,7 @@ class DetectionOutput(Layer):
         for i in range(len(codes)):
             boxes = [decode(codes[i, :, kind], refined[i], scale, param.code_type) for kind in range(self.kinds)]
             rows.append(self._detect(i, boxes, scores[i]))
-        found = np.concatenate(rows)
-        if not len(found):
-            found = np.full((len(codes), 7), -1, np.float32)
-            found[:, 0] = np.arange(len(codes))
-        return torch.from_numpy(found[None, None]).to(loc)
+        return detections(rows, loc)
 
     def _detect(self, image: int, boxes: list[Array], scores: Array) -> Array:
         """Return the detections of one image, by label, the most confident first: (d, 7)."""
@@ -240,6 +237,9 @@ class DetectionOutput(Layer):
         given = ", ".join(f"{name}={{{name}}}" for name in options)
         template = f"{code.function(detection_output)}({', '.join(bottoms[:3])}, {given})"
         return code.call(template, **options)
+
+
+# Functions that are copied into exported source, where each setting is written only if it is not the usual one.
 
 
 def decode_boxes(codes, priors, variances):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec.dialects._boxes import Array, as_array, overlaps
+from netspec.dialects._boxes import Array, around, as_array, overlaps, sigmoid
 from netspec.layers.base import Shape
 from netspec.layers.loss.base import Loss
 from netspec.proto.schema import value
@@ -70,28 +70,28 @@ class RegionLoss(Loss):
         p, side = self.settings, np.float32(cells.shape[2])
         shares = np.exp(cells[:, CLASSES:] - cells[:, CLASSES:].max(axis=1, keepdims=True))
         shares /= shares.sum(axis=1, keepdims=True)
-        objects = _sigmoid(cells[:, OBJECT])
+        objects = sigmoid(cells[:, OBJECT])
         moves = np.zeros_like(cells)
         moves[:, OBJECT] = np.float32(p.noobject_scale) * objects * objects * (1 - objects)
         y, x = np.mgrid[: cells.shape[2], : cells.shape[3]].astype(np.float32)
-        centers = np.stack([x + _sigmoid(cells[:, 0]), y + _sigmoid(cells[:, 1])], axis=-1) / side
+        centers = np.stack([x + sigmoid(cells[:, 0]), y + sigmoid(cells[:, 1])], axis=-1) / side
         extents = np.exp(cells[:, 2:4].transpose(0, 2, 3, 1)) * self.anchors[:, None, None] / side
-        found = _corners(centers, extents)
+        found = around(centers, extents)
         known = truth[: int(np.argmin(np.append(truth[:, 1] != 0, False)))]
         if len(known):
-            best = overlaps(found[..., None, :], _corners(known[:, 1:3], known[:, 3:5])).max(axis=-1)
+            best = overlaps(found[..., None, :], around(known[:, 1:3], known[:, 3:5])).max(axis=-1)
             moves[:, OBJECT][best > np.float32(p.thresh)] = 0
         for label, *place in truth[: int(np.argmin(np.append(truth[:, 3] != 0, False)))]:
             center, extent = np.array(place[:2], np.float32), np.array(place[2:], np.float32)
             column, row = (center * side).astype(int)
             like = self.anchors / side if p.bias_match else extents[:, row, column]
             zero = np.zeros_like(like)
-            n = int(overlaps(_corners(zero, like), _corners(zero[:1], extent[None])).argmax())
+            n = int(overlaps(around(zero, like), around(zero[:1], extent[None])).argmax())
             at = (n, slice(None), row, column)
             number, move = cells[at], moves[at]
-            overlap = overlaps(found[n, row, column], _corners(center, extent))
+            overlap = overlaps(found[n, row, column], around(center, extent))
             scale = np.float32(p.coord_scale * (1 if p.rescore else 2 - extent.prod()))
-            inside = _sigmoid(number[:2])
+            inside = sigmoid(number[:2])
             move[:2] = -scale * (center * side - [column, row] - inside) * inside * (1 - inside)
             move[2:4] = -scale * (np.log(extent * side / self.anchors[n]) - number[2:4])
             goal, o = overlap if p.rescore else 1, objects[n, row, column]
@@ -112,11 +112,3 @@ class _Moved(torch.autograd.Function):
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
         (moves,) = ctx.saved_tensors
         return moves * (grads[0] / len(moves)), None
-
-
-def _sigmoid(x: Array) -> Array:
-    return 1 / (1 + np.exp(-x))
-
-
-def _corners(centers: Array, extents: Array) -> Array:
-    return np.concatenate([centers - extents / 2, centers + extents / 2], axis=-1)

@@ -70,6 +70,9 @@ class Convolution(convolution.Convolution):
     Fork: DeepLab (hole); foss-for-synopsys-dwc-arc-processors/synopsys-caffe, src/caffe/layers/base_conv_layer.cpp
     """
 
+    fresh = True
+    any_layout = True
+
     @override
     def read_geometry(self) -> None:
         super().read_geometry()
@@ -111,8 +114,6 @@ class Convolution(convolution.Convolution):
 
     absorbs = convolution.Convolution.absorbs
     absorb = convolution.Convolution.absorb
-    fresh = True
-    any_layout = True
 
     def prepare(self, how: Preparation) -> Kernel | None:
         return None if any(self.sides) else super().prepare(how)

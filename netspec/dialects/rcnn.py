@@ -201,7 +201,6 @@ class Proposal(Layer):
         return [(most, 5), (most,)][: self.num_tops]
 
     def forward(self, scores: torch.Tensor, deltas: torch.Tensor, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the regions and their scores."""
         param = self.settings
         count, (height, width) = len(self.anchors), scores.shape[2:]
         sizes = as_array(image).reshape(-1)

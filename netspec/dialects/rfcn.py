@@ -132,7 +132,6 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
         return [*super().reshape(bottom_shapes), _four(bottom_shapes[1])][: self.num_tops]
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the loss, the softmax, and the losses."""
         tops = super().forward(scores, labels)
         return (*tops, self._losses.reshape(_four(tuple(labels.shape))))[: self.num_tops]
 
@@ -176,7 +175,6 @@ class SmoothL1LossOHEM(Loss):
     def forward(
         self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Return the loss and the regions' losses."""
         difference = (predictions - targets.reshape_as(predictions)).reshape(_four(tuple(predictions.shape)))
         for weight in weights:
             difference = difference * weight.detach().reshape_as(difference)
@@ -221,7 +219,6 @@ class BoxAnnotatorOHEM(Layer):
     def forward(
         self, regions: torch.Tensor, losses: torch.Tensor, labels: torch.Tensor, weights: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Return the labels and weights that count."""
         image = regions.reshape(len(regions), 5)[:, 0].long()
         order = torch.from_numpy(highest(as_array(losses).reshape(-1), len(regions))).to(image.device)
         chosen = torch.zeros(len(regions), 1, dtype=torch.bool, device=image.device)

@@ -198,7 +198,6 @@ class Lstm(Layer):
         return [(*data[:2], self.size)]
 
     def forward(self, data: torch.Tensor, *begins: torch.Tensor) -> torch.Tensor:
-        """Return the outputs of all steps."""
         of_input, of_state, bias = (self.blob(i) for i in range(3))
         gates = data @ of_input.T + bias
         zeros = data.new_zeros(2, data.shape[1], self.size)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from netspec.dialects._boxes import Array, as_array, overlaps
+from netspec.dialects._boxes import Array, around, as_array, detections, overlaps, sigmoid
 from netspec.dialects._region_loss import RegionLoss
 from netspec.layers import Layer, register
 from netspec.layers.base import Shape
@@ -99,12 +99,9 @@ class _YoloOutput(Layer):
         for image in range(len(bottoms[0])):
             found = [self._detected(i, self._cells(bottom[image])) for i, bottom in enumerate(bottoms)]
             rows.append(self._kept(image, np.concatenate(found), p.nms_threshold))
-        top = np.concatenate(rows)
-        if not len(top):
-            top = np.full((len(rows), 7), -1, np.float32)
-            top[:, 0] = np.arange(len(rows))
-        self.top_shapes = [(1, 1, len(top), 7)]
-        return torch.from_numpy(top[None, None]).to(bottoms[0])
+        top = detections(rows, bottoms[0])
+        self.top_shapes = [tuple(top.shape)]
+        return top
 
     def _cells(self, maps: torch.Tensor) -> Array:
         """Return the maps of an image as (H, W, boxes, 5 + classes)."""
@@ -126,8 +123,7 @@ class _YoloOutput(Layer):
     def _kept(image: int, found: Array, threshold: float) -> Array:
         """Return the rows of SSD's DetectionOutput (k, 7), the most confident first."""
         found = found[np.argsort(-found[:, 1], kind="stable")]
-        half = found[:, 4:6] / np.float32(2)
-        corners = np.concatenate([found[:, 2:4] - half, found[:, 2:4] + half], axis=1)
+        corners = around(found[:, 2:4], found[:, 4:6])
         kept: list[int] = []
         gone = np.zeros(len(found), bool)
         for i in range(len(found)):
@@ -136,11 +132,6 @@ class _YoloOutput(Layer):
                 gone |= overlaps(corners[i], corners) >= np.float32(threshold)
         numbers = np.full((len(kept), 1), image)
         return np.concatenate([numbers, found[kept, :2] + [1, 0], corners[kept]], axis=1, dtype=np.float32)
-
-
-def sigmoid(x: Array) -> Array:
-    """Return 1 / (1 + exp(-x))."""
-    return 1 / (1 + np.exp(-x))
 
 
 def _anchors(param: Any, layer: Layer, group: str) -> Array:

@@ -1,4 +1,4 @@
-"""Products with learned weights at fixed shapes: what netspec/exact/products.py computes, call by call.
+"""Products with learned weights at fixed shapes: what products.py and vectors.py compute, call by call.
 
 The arguments of BLAS' calls are made once: they are views of memory that stays where it is. So what a function here
 returns is good until its next call. Everything here expects that BLAS uses one thread.
@@ -68,7 +68,7 @@ def at_rest(weight: torch.Tensor, bias: torch.Tensor | None = None) -> Weights:
 
 
 class BoundVectors:
-    """:class:`netspec.exact.products.VectorProducts` of vectors of one shape, and of one matrix.
+    """:class:`netspec.exact.vectors.VectorProducts` of vectors of one shape, and of one matrix.
 
     ``shape`` is the bottom's, any that has rows of K numbers; the top is ``top_shape``. ``wanted`` says whether the
     bottom's gradient is computed. ``nbytes`` of memory are kept between forward passes.

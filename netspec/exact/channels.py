@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
-from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.accumulate import ParameterSums
@@ -30,7 +29,6 @@ class ChannelProducts(ParameterSums):
     """
 
     @staticmethod
-    @override
     def forward(
         ctx: Any, values: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, in_place: bool
     ) -> torch.Tensor:
@@ -41,9 +39,7 @@ class ChannelProducts(ParameterSums):
     @staticmethod
     @once_differentiable
     @one_thread()
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradients of values, factors and bias, where they are asked for."""
         values, factors, _ = ctx.saved_tensors
         factors_sums, bias_sums = sums = ParameterSums.sums(ctx)
         diff = diff.contiguous()
@@ -101,16 +97,13 @@ class Slopes(ParameterSums):
     """
 
     @staticmethod
-    @override
     def forward(ctx: Any, values: torch.Tensor, slopes: torch.Tensor, in_place: bool) -> torch.Tensor:
         ParameterSums.keep(ctx, values, (slopes,), in_place)
         return torch.where(values > 0, values, values * slopes.view(-1, 1))
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradients of values and slopes, where they are asked for."""
         values, slopes = ctx.saved_tensors
         (slopes_sums,) = sums = ParameterSums.sums(ctx)
         if slopes_sums is not None:
@@ -134,7 +127,6 @@ class BatchNormalization(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
-    @override
     def forward(ctx: Any, values: torch.Tensor, eps: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         count = values.numel() // values.shape[1]
         mean = _channel_sums(values, 1 / count)
@@ -149,7 +141,6 @@ class BatchNormalization(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     @one_thread()
-    @override
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
         """Return the gradient of the values: (d - mean(d) - mean(d y) y) / deviation, for the gradient d of y."""
         tops, deviation = ctx.saved_tensors
@@ -170,7 +161,6 @@ class RowNormalization(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
-    @override
     def forward(ctx: Any, rows: torch.Tensor, eps: float | None) -> torch.Tensor:
         centered = rows - _row_means(rows)
         if eps is None:
@@ -184,7 +174,6 @@ class RowNormalization(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     @one_thread()
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         diff = diff.contiguous()
         if not ctx.saved_tensors:

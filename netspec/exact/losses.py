@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
-from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.blas import add_sums, dots, gemv_routine, one_thread, sum_in_order
+from netspec.exact.pointwise import Pointwise
 
 
 @one_thread()
@@ -49,21 +49,9 @@ def softmax_gradient(p: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
     return (diff - dots(diff, p).unsqueeze(1)) * p
 
 
-class Logarithm(torch.autograd.Function):
+def logarithm(values: torch.Tensor) -> torch.Tensor:
     """Return natural logarithms."""
-
-    @staticmethod
-    @override
-    def forward(ctx: Any, values: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(values)
-        return libm.log(values)
-
-    @staticmethod
-    @once_differentiable
-    @override
-    def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
-        (values,) = ctx.saved_tensors
-        return diff / values
+    return Pointwise.apply(values, libm.log, lambda values, logarithms, diff: diff / values)
 
 
 class SigmoidCrossEntropy(torch.autograd.Function):
@@ -73,7 +61,6 @@ class SigmoidCrossEntropy(torch.autograd.Function):
     """
 
     @staticmethod
-    @override
     def forward(ctx: Any, x: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(x, target)
         positive = (x >= 0).to(x.dtype)
@@ -81,7 +68,6 @@ class SigmoidCrossEntropy(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Return sigmoid(x) - target times the losses' gradient."""
         x, target = ctx.saved_tensors
@@ -99,7 +85,6 @@ class Infogain(torch.autograd.Function):
     """
 
     @staticmethod
-    @override
     def forward(ctx: Any, scores: torch.Tensor, gain: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
         p = softmax(scores)
         ctx.save_for_backward(p, gain)
@@ -108,7 +93,6 @@ class Infogain(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
         """Return the scores' gradient, for losses that go into one sum; it takes no notice of ``least``."""
         p, gain = ctx.saved_tensors

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
-from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.pointwise import Pointwise
@@ -46,7 +45,6 @@ class AcrossChannels(torch.autograd.Function):
     """
 
     @staticmethod
-    @override
     def forward(ctx: Any, maps: torch.Tensor, size: int, alpha: float, beta: float, k: float) -> torch.Tensor:
         base = _forward_sums(maps * maps, size, alpha / size, k)
         ctx.save_for_backward(maps, base)
@@ -55,7 +53,6 @@ class AcrossChannels(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
         maps, base = ctx.saved_tensors
         size, alpha, beta = ctx.settings

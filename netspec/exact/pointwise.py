@@ -1,4 +1,4 @@
-"""Functions of one number, rounded as Caffe's loops round them, and the unit of an LSTM."""
+"""Functions of one tensor with Caffe's gradient, most of them number by number, and the unit of an LSTM."""
 
 # pyright: reportPrivateImportUsage=false
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
-from typing_extensions import override
 
 from netspec.exact import libm
 
@@ -20,7 +19,6 @@ class Pointwise(torch.autograd.Function):
     """Apply ``compute(bottom)``; its gradient is ``gradient(bottom, top, diff)``, as Caffe computes it."""
 
     @staticmethod
-    @override
     def forward(
         ctx: Any, bottom: torch.Tensor, compute: Callable[[torch.Tensor], torch.Tensor], gradient: Gradient
     ) -> torch.Tensor:
@@ -31,7 +29,6 @@ class Pointwise(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         return ctx.gradient(*ctx.saved_tensors, diff), None, None
 
@@ -53,7 +50,6 @@ class CellUpdate(torch.autograd.Function):
     """
 
     @staticmethod
-    @override
     def forward(
         ctx: Any, cell: torch.Tensor, gates: torch.Tensor, keep: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -66,7 +62,6 @@ class CellUpdate(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, cell_diff: torch.Tensor, hidden_diff: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         cell, i, f, o, g, squashed = ctx.saved_tensors
         total = cell_diff + hidden_diff * o * (1 - squashed * squashed)

@@ -1,4 +1,4 @@
-"""Matrix products with learned weights: Convolution, Deconvolution, InnerProduct, Embed."""
+"""Matrix products with learned filters: Convolution, Deconvolution."""
 
 # pyright: reportPrivateImportUsage=false
 
@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -14,13 +14,11 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
-from typing_extensions import override
 
 from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import add_sums, gemm, one_thread
 
 Axes = tuple[int, ...]
-FEW = 64  # vectors; a product of fewer takes less time than to round the weights to another precision
 COLUMNS = 2**20  # numbers, 4 MB: the columns of some images, which stay in a CPU's cache
 
 
@@ -94,7 +92,6 @@ class ColumnProducts(ParameterSums):
     """
 
     @staticmethod
-    @override
     def forward(
         ctx: Any,
         maps: torch.Tensor,
@@ -118,9 +115,7 @@ class ColumnProducts(ParameterSums):
     @staticmethod
     @once_differentiable
     @one_thread()
-    @override
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, _ = ctx.saved_tensors
         weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
         filters, diffs = weight.contiguous().flatten(1), tops_diff.contiguous().flatten(2)
@@ -153,7 +148,6 @@ class SpreadProducts(ParameterSums):
     """
 
     @staticmethod
-    @override
     def forward(
         ctx: Any,
         maps: torch.Tensor,
@@ -181,9 +175,7 @@ class SpreadProducts(ParameterSums):
     @staticmethod
     @once_differentiable
     @one_thread()
-    @override
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, _ = ctx.saved_tensors
         weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
         filters, values = weight.contiguous().flatten(1), maps.flatten(2)
@@ -239,7 +231,6 @@ class SummedConvolutions(ParameterSums):
     """
 
     @staticmethod
-    @override
     def forward(
         ctx: Any,
         maps: torch.Tensor,
@@ -260,9 +251,7 @@ class SummedConvolutions(ParameterSums):
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradients of maps, weight and bias, where they are asked for."""
         maps, weight, bias = ctx.saved_tensors
         sums = ParameterSums.sums(ctx)
         sliding, group, transposed = ctx.geometry
@@ -316,152 +305,15 @@ class Columns(torch.autograd.Function):
     """
 
     @staticmethod
-    @override
     def forward(ctx: Any, maps: torch.Tensor, sliding: Filter) -> torch.Tensor:
         ctx.sliding, ctx.size = sliding, maps.shape[2:]
         return sliding.columns(maps)
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         return ctx.sliding.spread(diff.contiguous(), ctx.size), None
 
 
 def _by_channel(bias: torch.Tensor, tops: torch.Tensor) -> torch.Tensor:
     return bias.view(-1, *(1,) * (tops.dim() - 2))
-
-
-class VectorProducts(ParameterSums):
-    """Multiply vectors by a matrix.
-
-    vectors  (M, K)
-    weight   (num_output, K), or (K, num_output) where ``transposed``
-    bias     (num_output,) or None
-    returns  (M, num_output)
-
-    Caffe: src/caffe/layers/inner_product_layer.cpp
-    """
-
-    @staticmethod
-    @override
-    def forward(
-        ctx: Any,
-        vectors: torch.Tensor,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        transposed: bool,
-        in_place: bool,
-    ) -> torch.Tensor:
-        vectors = vectors.contiguous()
-        ParameterSums.keep(ctx, vectors, (weight, bias), in_place)
-        ctx.transposed = transposed
-        tops = vectors.new_empty(len(vectors), weight.shape[1 if transposed else 0])
-        with one_thread():
-            gemm(vectors, weight.contiguous(), tops, b_t=not transposed)
-        return tops if bias is None else tops.add_(bias)
-
-    @staticmethod
-    @once_differentiable
-    @one_thread()
-    @override
-    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradients of vectors, weight and bias, where they are asked for."""
-        vectors, weight, _ = ctx.saved_tensors
-        weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
-        tops_diff = tops_diff.contiguous()
-        if weight_sums is not None:
-            factors = (vectors, tops_diff) if ctx.transposed else (tops_diff, vectors)
-            gemm(*factors, weight_sums, a_t=True, add=True)
-        if bias_sums is not None:
-            add_sums(tops_diff, bias_sums, axis=0)
-        vectors_diff = None
-        if ctx.needs_input_grad[0]:
-            vectors_diff = torch.empty_like(vectors)
-            gemm(tops_diff, weight.contiguous(), vectors_diff, b_t=ctx.transposed)
-        return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
-
-
-class SummedProducts(ParameterSums):
-    """What :class:`VectorProducts` computes, by torch's kernels, on any device.
-
-    Unlike torch's own function it adds the weights' gradient to the sum at once: in fully connected layers it is the
-    largest of all tensors, and fresh memory for it takes longer to get than the product itself.
-    """
-
-    @staticmethod
-    @override
-    def forward(
-        ctx: Any,
-        vectors: torch.Tensor,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        transposed: bool,
-        in_place: bool,
-    ) -> torch.Tensor:
-        """Return the product; of few vectors in the weights' precision, whatever autocast asks for."""
-        few, ctx.kind = len(vectors) < FEW, vectors.dtype
-        vectors = vectors.to(weight.dtype) if few else vectors
-        ParameterSums.keep(ctx, vectors, (weight, bias), in_place)
-        ctx.transposed = transposed
-        kind = weight.device.type
-        autocast = few and kind in ("cpu", "cuda") and torch.is_autocast_enabled(kind)
-        with torch.autocast(kind, enabled=False) if autocast else nullcontext():
-            return F.linear(vectors, weight.t() if transposed else weight, bias)
-
-    @staticmethod
-    @once_differentiable
-    @override
-    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradients of vectors, weight and bias, where they are asked for."""
-        vectors, weight, _ = ctx.saved_tensors
-        weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
-        kind = tops_diff.dtype  # of the product, which autocast may have chosen
-        vectors = vectors.to(kind)
-        if weight_sums is not None:
-            factors = (vectors.t(), tops_diff) if ctx.transposed else (tops_diff.t(), vectors)
-            if weight_sums.dtype == kind:
-                weight_sums.addmm_(*factors)
-            else:
-                weight_sums += factors[0] @ factors[1]
-        if bias_sums is not None:
-            bias_sums += tops_diff.sum(0)
-        vectors_diff = None
-        if ctx.needs_input_grad[0]:
-            vectors_diff = (tops_diff @ (weight.t() if ctx.transposed else weight).to(kind)).to(ctx.kind)
-        return vectors_diff, *ParameterSums.for_autograd(ctx, sums), None, None
-
-
-class ChosenRows(ParameterSums):
-    """Look up rows.
-
-    index    (M,), whole numbers
-    rows     (input_dim, num_output)
-    bias     (num_output,) or None
-    returns  (M, num_output)
-
-    Caffe: src/caffe/layers/embed_layer.cpp
-    """
-
-    @staticmethod
-    @override
-    def forward(
-        ctx: Any, index: torch.Tensor, rows: torch.Tensor, bias: torch.Tensor | None, in_place: bool
-    ) -> torch.Tensor:
-        ParameterSums.keep(ctx, index, (rows, bias), in_place)
-        tops = rows[index]
-        return tops if bias is None else tops.add_(bias)
-
-    @staticmethod
-    @once_differentiable
-    @one_thread()
-    @override
-    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        """Return the gradients of rows and bias, where they are asked for."""
-        rows_sums, bias_sums = sums = ParameterSums.sums(ctx)
-        tops_diff = tops_diff.contiguous()
-        if rows_sums is not None:
-            rows_sums.index_add_(0, ctx.saved_tensors[0], tops_diff)  # one after the other
-        if bias_sums is not None:
-            add_sums(tops_diff, bias_sums, axis=0)
-        return None, *ParameterSums.for_autograd(ctx, sums), None

@@ -8,22 +8,20 @@ from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
-from typing_extensions import override
 
 from netspec.exact.blas import dots, one_thread, sum_in_order, sum_of_magnitudes
+from netspec.exact.pointwise import Pointwise
 
 
 class SumInOrder(torch.autograd.Function):
     """Sum up along an axis, one value after the other (a plain loop of Caffe's)."""
 
     @staticmethod
-    @override
     def forward(ctx: Any, values: torch.Tensor, axis: int) -> torch.Tensor:
         ctx.shape, ctx.axis = values.shape, axis
         return sum_in_order(values, axis)
 
     @staticmethod
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Return each sum's gradient for each of its terms."""
         return diff.unsqueeze(ctx.axis).expand(ctx.shape), None
@@ -34,52 +32,34 @@ class RowSums(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
-    @override
     def forward(ctx: Any, rows: torch.Tensor, factor: float) -> torch.Tensor:
         ctx.shape, ctx.factor = rows.shape, factor
         return dots(rows.unsqueeze(2), torch.full_like(rows, factor).unsqueeze(2)).squeeze(1)
 
     @staticmethod
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Return each sum's gradient, times the factor, for each of its terms."""
         return (diff * ctx.factor).unsqueeze(1).expand(ctx.shape), None
 
 
-class RowSquares(torch.autograd.Function):
+@one_thread()
+def _row_squares(rows: torch.Tensor) -> torch.Tensor:
+    return dots(rows.unsqueeze(2), rows.unsqueeze(2)).squeeze(1)
+
+
+def row_squares(rows: torch.Tensor) -> torch.Tensor:
     """Sum up the squares of each row (caffe_cpu_dot of it with itself): (M, K) to (M,)."""
-
-    @staticmethod
-    @one_thread()
-    @override
-    def forward(ctx: Any, rows: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(rows)
-        return dots(rows.unsqueeze(2), rows.unsqueeze(2)).squeeze(1)
-
-    @staticmethod
-    @once_differentiable
-    @override
-    def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
-        (rows,) = ctx.saved_tensors
-        return rows * (2 * diff).unsqueeze(1)
+    return Pointwise.apply(rows, _row_squares, lambda rows, sums, diff: rows * (2 * diff).unsqueeze(1))
 
 
-class RowMagnitudes(torch.autograd.Function):
+@one_thread()
+def _row_magnitudes(rows: torch.Tensor) -> torch.Tensor:
+    return torch.stack([sum_of_magnitudes(row) for row in rows])
+
+
+def row_magnitudes(rows: torch.Tensor) -> torch.Tensor:
     """Sum up the absolute values of each row (caffe_cpu_asum): (M, K) to (M,)."""
-
-    @staticmethod
-    @one_thread()
-    @override
-    def forward(ctx: Any, rows: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(rows)
-        return torch.stack([sum_of_magnitudes(row) for row in rows])
-
-    @staticmethod
-    @once_differentiable
-    @override
-    def backward(ctx: Any, diff: torch.Tensor) -> torch.Tensor:
-        (rows,) = ctx.saved_tensors
-        return rows.sign() * diff.unsqueeze(1)
+    return Pointwise.apply(rows, _row_magnitudes, lambda rows, sums, diff: rows.sign() * diff.unsqueeze(1))
 
 
 class Copies(torch.autograd.Function):
@@ -89,35 +69,25 @@ class Copies(torch.autograd.Function):
     """
 
     @staticmethod
-    @override
     def forward(ctx: Any, values: torch.Tensor, count: int) -> tuple[torch.Tensor, ...]:
         """Return the tensors; they share their memory."""
         ctx.set_materialize_grads(False)
         return tuple(values.view_as(values) for _ in range(count))
 
     @staticmethod
-    @override
     def backward(ctx: Any, *diffs: torch.Tensor | None) -> tuple[torch.Tensor | None, None]:
         found = [diff for diff in diffs if diff is not None]
         return sum(found[1:], found[0]) if found else None, None
 
 
-class Tiles(torch.autograd.Function):
+def tiles(values: torch.Tensor, count: int) -> torch.Tensor:
     """Repeat a tensor along a new axis: (outer, inner) to (outer, count, inner).
 
     Caffe: src/caffe/layers/tile_layer.cpp
     """
-
-    @staticmethod
-    @override
-    def forward(ctx: Any, values: torch.Tensor, count: int) -> torch.Tensor:
-        return values.unsqueeze(1).repeat(1, count, 1)
-
-    @staticmethod
-    @once_differentiable
-    @override
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return sum_in_order(diff, 1), None
+    return Pointwise.apply(
+        values, lambda values: values.unsqueeze(1).repeat(1, count, 1), lambda values, top, diff: sum_in_order(diff, 1)
+    )
 
 
 class Product(torch.autograd.Function):
@@ -129,7 +99,6 @@ class Product(torch.autograd.Function):
     """
 
     @staticmethod
-    @override
     def forward(ctx: Any, stable: bool, *bottoms: torch.Tensor) -> torch.Tensor:
         ctx.stable = stable
         top = _product(bottoms)
@@ -138,7 +107,6 @@ class Product(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @override
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         top, *bottoms = ctx.saved_tensors
         found: list[torch.Tensor | None] = []

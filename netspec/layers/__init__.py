@@ -1,6 +1,6 @@
 """Caffe's layers; importing this package registers them all."""
 
-from netspec.layers import activation, common, normalization, powers, recurrent, scale  # noqa: F401
+from netspec.layers import activation, common, contrast, normalization, powers, recurrent, scale  # noqa: F401
 from netspec.layers.base import Layer
 from netspec.layers.context import Context, Random
 from netspec.layers.data import files, hdf5, memory  # noqa: F401

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -32,8 +32,17 @@ class Activation(Layer):
     any_layout = True
     traceable = True
 
+    onnx_op: ClassVar[str]  # of a layer without settings, and its expression in torch
+    torch_call: ClassVar[str]
+
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return bottom_shapes
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.node(self.onnx_op, *bottoms)
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call(self.torch_call, x=bottoms[0])
 
 
 class Rounded(Activation):
@@ -77,10 +86,14 @@ class Rounded(Activation):
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom by torch's functions, whose gradients autograd knows."""
-        raise NotImplementedError
+        return self.compute(x, torch)
 
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom, each step rounded as Caffe's."""
+        return self.compute(x, libm)
+
+    def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
+        """Return the activated bottom by the ``functions`` of a module: torch, or netspec.exact.libm."""
         raise NotImplementedError
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
@@ -204,13 +217,9 @@ class ELU(Rounded):
         self.gradient_reads = frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
 
     @override
-    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
+    def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
         # exp(x) - 1 as Caffe computes it, not the more exact expm1.
-        return torch.where(x > 0, x, self.alpha * (torch.exp(x.clamp(max=0)) - 1))
-
-    @override
-    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.where(x > 0, x, self.alpha * (libm.exp(x.clamp(max=0)) - 1))
+        return torch.where(x > 0, x, self.alpha * (functions.exp(x.clamp(max=0)) - 1))
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
@@ -236,23 +245,14 @@ class Sigmoid(Rounded):
     gradient_reads = frozenset({"top"})
     in_place = Finish("sigmoid", torch.sigmoid_)
     kernels = torch.sigmoid, torch.ops.aten.sigmoid_backward.grad_input
+    onnx_op, torch_call = "Sigmoid", "torch.sigmoid({x})"
 
     @override
-    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.sigmoid(x)
-
-    @override
-    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        return libm.sigmoid(x)
+    def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
+        return functions.sigmoid(x)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return (diff * top * (1 - top.double())).to(diff.dtype)  # 1. is a double to C, and so are its results
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Sigmoid", *bottoms)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("torch.sigmoid({x})", x=bottoms[0])
 
 
 @register("TanH", "tanh_param")
@@ -267,23 +267,14 @@ class TanH(Rounded):
     gradient_reads = frozenset({"top"})
     in_place = Finish("tanh", torch.tanh_)
     kernels = torch.tanh, torch.ops.aten.tanh_backward.grad_input
+    onnx_op, torch_call = "Tanh", "torch.tanh({x})"
 
     @override
-    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(x)
-
-    @override
-    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        return libm.tanh(x)
+    def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
+        return functions.tanh(x)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return tanh_gradient(bottom, top, diff)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Tanh", *bottoms)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("torch.tanh({x})", x=bottoms[0])
 
 
 @register("BNLL")
@@ -296,6 +287,7 @@ class BNLL(Rounded):
     """
 
     gradient_reads = frozenset({"bottom"})
+    onnx_op, torch_call = "Softplus", "F.softplus({x})"
 
     @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
@@ -308,12 +300,6 @@ class BNLL(Rounded):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         growth = libm.exp(bottom.clamp(max=50))
         return (diff * growth / (growth.double() + 1)).to(diff.dtype)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Softplus", *bottoms)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("F.softplus({x})", x=bottoms[0])
 
 
 @register("Threshold", "threshold_param")
@@ -386,12 +372,8 @@ class Swish(Rounded):
         self.beta: float = self.param.swish_param.beta
 
     @override
-    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        return x * torch.sigmoid(self.beta * x)
-
-    @override
-    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        return x * libm.sigmoid(self.beta * x)
+    def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
+        return x * functions.sigmoid(self.beta * x)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         inner, gate = self.beta * top, libm.sigmoid(self.beta * bottom)

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import torch
 from torch.nn import functional as F
-from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
 from netspec.exact.bound import BoundVectors, Weights, at_rest
-from netspec.exact.products import ChosenRows, SummedProducts, VectorProducts
+from netspec.exact.vectors import ChosenRows, SummedProducts, VectorProducts
 from netspec.layers import fused
 from netspec.layers.base import Layer, Shape
 from netspec.layers.exporting import refusal
@@ -33,6 +32,9 @@ class InnerProduct(Layer):
     blobs[1]   bias    (num_output,)                                   unless bias_term: false
     Caffe: src/caffe/layers/inner_product_layer.cpp
     """
+
+    fresh = True
+    any_layout = True
 
     def setup(self) -> None:
         param = self.param.inner_product_param
@@ -67,12 +69,8 @@ class InnerProduct(Layer):
         return F.linear(data.flatten(self.axis), weight.t() if transposed else weight, bias)
 
     @property
-    @override
     def small(self) -> bool:
         return math.prod(self.blob_shapes[0]) <= SMALL_PRODUCT
-
-    fresh = True
-    any_layout = True
 
     def prepare(self, how: Preparation) -> Kernel:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
@@ -128,7 +126,6 @@ class InnerProduct(Layer):
 
         return forward, backward
 
-    @override
     def multiply_adds(self) -> int:
         return math.prod(self.top_shapes[0]) * self.inputs
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -29,7 +29,7 @@ def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
 
 def draw(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
     """Return what :func:`fill` does, for a filler and a shape that were checked."""
-    return _FILLERS[filler.type](filler, shape, generator)
+    return _FILLERS[filler.type].draw(filler, shape, generator)
 
 
 def check(filler: Any, shape: Shape) -> None:
@@ -45,10 +45,7 @@ def check(filler: Any, shape: Shape) -> None:
         raise ValueError(
             f'filler "{filler.type}" does not support sparse (found {filler.sparse}); only "gaussian" does'
         )
-    if filler.type in _NEED_AN_AXIS and not shape:
-        raise ValueError(f'filler "{filler.type}" needs a blob of at least one axis, found a scalar')
-    if filler.type in _CHECKS:
-        _CHECKS[filler.type](filler, shape)
+    _FILLERS[filler.type].check(filler, shape)
 
 
 def _check_uniform(filler: Any, shape: Shape) -> None:
@@ -72,16 +69,9 @@ def _check_bilinear(filler: Any, shape: Shape) -> None:
         raise ValueError(f'filler "bilinear" needs a 4-D blob with square filters, found shape {shape}')
 
 
-_CHECKS: dict[str, Callable[[Any, Shape], None]] = {
-    "uniform": _check_uniform,
-    "gaussian": _check_gaussian,
-    "bilinear": _check_bilinear,
-}
-_NEED_AN_AXIS = ("positive_unitball", "xavier", "msra")
-
-
-def _constant(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    return constant(shape, filler.value)
+def _check_axis(filler: Any, shape: Shape) -> None:
+    if not shape:
+        raise ValueError(f'filler "{filler.type}" needs a blob of at least one axis, found a scalar')
 
 
 def constant(shape: Shape, value: float, device: torch.device | str = "cpu") -> torch.Tensor:
@@ -89,10 +79,6 @@ def constant(shape: Shape, value: float, device: torch.device | str = "cpu") -> 
     if value == 0:
         return torch.zeros(shape, dtype=torch.float32, device=device)
     return torch.full(shape, value, dtype=torch.float32, device=device)
-
-
-def _uniform(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    return _draw_uniform(shape, filler.min, filler.max, generator)
 
 
 def _gaussian(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
@@ -113,37 +99,12 @@ def _xavier(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tens
     return _draw_uniform(shape, -bound, bound, generator)
 
 
-def _msra(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    return _draw_normal(shape, 0.0, math.sqrt(2.0 / _fan(filler, shape)), generator)
-
-
 def _bilinear(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
     width = shape[3]
     factor = (width + 1) // 2
     center = (width - 1) / (2.0 * factor)
     ramp = 1 - (torch.arange(width, dtype=torch.float64) / factor - center).abs()
     return torch.outer(ramp, ramp).float().expand(shape).contiguous()
-
-
-_FILLERS: dict[str, Callable[[Any, Shape, torch.Generator], torch.Tensor]] = {
-    "constant": _constant,
-    "uniform": _uniform,
-    "gaussian": _gaussian,
-    "positive_unitball": _positive_unitball,
-    "xavier": _xavier,
-    "msra": _msra,
-    "bilinear": _bilinear,
-}
-#: The fields of FillerParameter, besides ``type``, that mean something to each filler.
-READS: dict[str, tuple[str, ...]] = {
-    "constant": ("value",),
-    "uniform": ("min", "max"),
-    "gaussian": ("mean", "std", "sparse"),
-    "positive_unitball": (),
-    "xavier": ("variance_norm",),
-    "msra": ("variance_norm",),
-    "bilinear": (),
-}
 
 
 def _fan(filler: Any, shape: Shape) -> float:
@@ -163,3 +124,28 @@ def _draw_uniform(shape: Shape, low: float, high: float, generator: torch.Genera
 
 def _draw_normal(shape: Shape, mean: float, std: float, generator: torch.Generator) -> torch.Tensor:
     return torch.empty(shape, dtype=torch.float32).normal_(mean, std, generator=generator)
+
+
+class _Filler(NamedTuple):
+    """What makes the values; the fields of FillerParameter, besides ``type``, that it reads; what it refuses."""
+
+    draw: Callable[[Any, Shape, torch.Generator], torch.Tensor]
+    reads: tuple[str, ...] = ()
+    check: Callable[[Any, Shape], None] = lambda filler, shape: None
+
+
+_FILLERS = {
+    "constant": _Filler(lambda f, shape, _: constant(shape, f.value), ("value",)),
+    "uniform": _Filler(lambda f, shape, draw: _draw_uniform(shape, f.min, f.max, draw), ("min", "max"), _check_uniform),
+    "gaussian": _Filler(_gaussian, ("mean", "std", "sparse"), _check_gaussian),
+    "positive_unitball": _Filler(_positive_unitball, (), _check_axis),
+    "xavier": _Filler(_xavier, ("variance_norm",), _check_axis),
+    "msra": _Filler(
+        lambda f, shape, draws: _draw_normal(shape, 0.0, math.sqrt(2.0 / _fan(f, shape)), draws),
+        ("variance_norm",),
+        _check_axis,
+    ),
+    "bilinear": _Filler(_bilinear, (), _check_bilinear),
+}
+#: The fields that mean something to each filler.
+READS = {name: filler.reads for name, filler in _FILLERS.items()}

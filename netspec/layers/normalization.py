@@ -1,26 +1,21 @@
-"""Layers that normalize values: BatchNorm, LRN, MVN."""
+"""BatchNorm, and what it shares with the layers of forks that normalize a batch."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
-from torch.nn import functional as F
-from typing_extensions import override
 
-from netspec.exact import ALL, SMALL_ITEM, libm
-from netspec.exact.channels import BatchNormalization, RowNormalization
-from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.base import MOST, Layer, Shape
+from netspec.exact import SMALL_ITEM, libm
+from netspec.exact.channels import BatchNormalization
+from netspec.layers.base import Layer, Shape
 from netspec.layers.folding import Affine, blob_in_double
 from netspec.layers.preparing import RELU, Kernel, Preparation, channel_factors, finished, finishing
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST
 
-ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
 MAX_OFFSET = 8  # means, in standard deviations, up to which torch's CPU kernel is exact to 1e-6
 
 
@@ -42,6 +37,8 @@ class BatchNorm(Layer):
 
     default_param_lr = 0.0
     traceable = True
+    fresh = True
+    any_layout = True
 
     def setup(self) -> None:
         """Add the sums, all zero; refuse a ``param`` that would have them learned."""
@@ -120,12 +117,8 @@ class BatchNorm(Layer):
         return top
 
     @property
-    @override
     def small(self) -> bool:
         return math.prod(self.bottom_shapes[0][1:]) <= SMALL_ITEM
-
-    fresh = True
-    any_layout = True
 
     def prepare(self, how: Preparation) -> Kernel | None:
         if not self.use_global_stats:
@@ -181,23 +174,6 @@ def torch_batch_norm(
     return code.module(template, state, **numbers)
 
 
-def spatial_response_norm(x, size, alpha, beta):
-    """Divide by a power of 1 + alpha times the mean square of size x size pixels."""
-    mean = F.avg_pool2d(x * x, size, stride=1, padding=size // 2)
-    return x / (1 + alpha * mean).pow(beta)
-
-
-def center(x, axes):
-    """Subtract the mean over some axes."""
-    return x - x.mean(axes, keepdim=True)
-
-
-def standardize(x, axes, eps):
-    """Subtract the mean over some axes and divide by the standard deviation plus eps."""
-    variance, mean = torch.var_mean(x, axes, correction=0, keepdim=True)
-    return (x - mean) / (variance.sqrt() + eps)
-
-
 def onnx_normalized(graph: OnnxGraph, data: str, axes: int, eps: float) -> str:
     """Write a batch of so many axes less the mean of each channel, divided by its deviation."""
     centered = graph.node("Sub", data, _onnx_channel_means(graph, data, axes))
@@ -235,178 +211,3 @@ def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bo
         and not torch.compiler.is_compiling()
         and bool((mean.square() > MAX_OFFSET**2 * (variance + eps)).any())
     )
-
-
-@register("LRN", "lrn_param")
-class LRN(Layer):
-    """Divide each value by a power of the squares around it: (k + alpha times their mean) ** beta.
-
-    The n = ``local_size`` neighbors are channels (ACROSS_CHANNELS), or n x n pixels (WITHIN_CHANNEL, where k is
-    ignored: it is 1); those outside count as zeros.
-
-    bottom[0]  (N, C, H, W)
-    top[0]     the same shape
-    Caffe: src/caffe/layers/lrn_layer.cpp
-    """
-
-    traceable = True
-
-    def setup(self) -> None:
-        param = self.param.lrn_param
-        if param.local_size % 2 == 0 or param.local_size > MOST:
-            expected = "odd" if param.local_size % 2 == 0 else f"at most {MOST}"
-            raise self.error(f"local_size must be {expected}, found {param.local_size}", "lrn_param", "local_size")
-        if param.norm_region != ACROSS_CHANNELS:
-            self.ignores = frozenset({"lrn_param.k"})
-
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        if len(bottom_shapes[0]) != 4:
-            raise self.error(f"LRN needs a bottom of 4 axes (N, C, H, W), found shape {bottom_shapes[0]}", "bottom")
-        return bottom_shapes
-
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        param = self.param.lrn_param
-        size, reach = param.local_size, param.local_size // 2
-        if self.is_exact(data):
-            if param.norm_region == ACROSS_CHANNELS:
-                return AcrossChannels.apply(data, size, param.alpha, param.beta, param.k)
-            return within_channel(data, size, param.alpha, param.beta)
-        squares = data * data
-        if param.norm_region == ACROSS_CHANNELS:
-            framed, channels = F.pad(squares, (0, 0, 0, 0, reach, reach)), data.shape[1]
-            total = framed[:, :channels]
-            for shift in range(1, size):
-                total = total + framed[:, shift : shift + channels]
-            base = param.k + param.alpha / size * total
-        else:
-            base = 1 + param.alpha * F.avg_pool2d(squares, size, stride=1, padding=reach)
-        return data * base.pow(-param.beta)
-
-    fresh = True
-    any_layout = True
-
-    def prepare(self, how: Preparation) -> Kernel | None:
-        param, shape = self.param.lrn_param, self.bottom_shapes[0]
-        if param.norm_region != ACROSS_CHANNELS or self.context.options.exact == ALL:
-            return None
-        size, channels, reach = param.local_size, shape[1], param.local_size // 2
-        frames: dict[bool, torch.Tensor] = {}
-
-        def kernel(data: torch.Tensor) -> torch.Tensor:
-            side_by_side = not data.is_contiguous()
-            if side_by_side not in frames:
-                layout = torch.channels_last if side_by_side else torch.contiguous_format
-                with torch.inference_mode(False):
-                    frame = data.new_zeros(shape[0], channels + 2 * reach, *shape[2:])
-                    frames[side_by_side] = frame.contiguous(memory_format=layout)
-            frame = frames[side_by_side]
-            torch.mul(data, data, out=frame[:, reach : reach + channels])
-            total = frame[:, :channels] + frame[:, 1 : 1 + channels] if size > 1 else frame.clone()
-            for shift in range(2, size):
-                total += frame[:, shift : shift + channels]
-            base = total.mul_(param.alpha / size).add_(param.k)
-            if param.beta == 0.75:
-                root = base.rsqrt_()  # x ** -0.75 = r sqrt(r), for r = 1 / sqrt(x), five times as fast as a power
-                return root.mul_(root.sqrt()).mul_(data)
-            return base.pow_(-param.beta).mul_(data)
-
-        return finished(kernel, how.finish)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        param = self.param.lrn_param
-        size, reach = param.local_size, param.local_size // 2
-        if param.norm_region == ACROSS_CHANNELS:
-            return graph.node("LRN", *bottoms, size=size, alpha=param.alpha, beta=param.beta, bias=param.k)
-        squares = graph.node("Mul", *bottoms, *bottoms)
-        window = {"kernel_shape": [size] * 2, "pads": [reach] * 4, "count_include_pad": 1}
-        mean = graph.node("Mul", graph.node("AveragePool", squares, **window), graph.constant(param.alpha))
-        base = graph.node("Add", mean, graph.constant(1.0))
-        return graph.node("Mul", *bottoms, graph.node("Pow", base, graph.constant(-param.beta)))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, (x,) = self.param.lrn_param, bottoms
-        alpha, beta = rounded(param.alpha), rounded(param.beta)
-        if param.norm_region == ACROSS_CHANNELS:
-            usual = {"alpha": 1e-4, "beta": 0.75, "k": 1.0}
-            given = {"alpha": alpha, "beta": beta, "k": rounded(param.k)}
-            given = {name: number for name, number in given.items() if number != usual[name]}
-            options = "".join(f", {name}={{{name}}}" for name in given)
-            return code.call(f"F.local_response_norm({{x}}, {{size}}{options})", x=x, size=param.local_size, **given)
-        template = f"{code.function(spatial_response_norm)}({{x}}, {{size}}, {{alpha}}, {{beta}})"
-        return code.call(template, x=x, size=param.local_size, alpha=alpha, beta=beta)
-
-
-@register("MVN", "mvn_param")
-class MVN(Layer):
-    """Subtract the mean of each map and divide by its standard deviation plus ``eps``.
-
-    A map is one channel of one image, or with ``across_channels`` all of an image.
-
-    bottom[0]  (N, C, H, W); up to four axes
-    top[0]     (N, C, H, W); always four axes, missing ones are 1
-    Caffe: src/caffe/layers/mvn_layer.cpp
-    """
-
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        shape = bottom_shapes[0]
-        if len(shape) > 4:
-            raise self.error(f"MVN takes up to 4 axes (N, C, H, W), found shape {shape}", "bottom")
-        return [(*shape, *(1,) * (4 - len(shape)))]
-
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        param, shape = self.param.mvn_param, self.top_shapes[0]
-        outer = 1 if param.across_channels else 2
-        maps = data.reshape(math.prod(shape[:outer]), math.prod(shape[outer:]))
-        if self.is_exact(data):
-            top: torch.Tensor = RowNormalization.apply(maps, param.eps if param.normalize_variance else None)
-        elif param.normalize_variance:
-            top = _Standardize.apply(maps, param.eps)
-        else:
-            top = maps - maps.mean(dim=1, keepdim=True)
-        return top.reshape(shape)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        param, (data,) = self.param.mvn_param, bottoms
-        missing = list(range(len(self.bottom_shapes[0]), 4))
-        if missing:
-            data = graph.node("Unsqueeze", data, graph.constant(missing))
-        axes = graph.constant(list(range(1 if param.across_channels else 2, 4)))
-        top = graph.node("Sub", data, graph.node("ReduceMean", data, axes, keepdims=1))
-        if not param.normalize_variance:
-            return top
-        variance = graph.node("ReduceMean", graph.node("Mul", top, top), axes, keepdims=1)
-        return graph.node("Div", top, graph.node("Add", graph.node("Sqrt", variance), graph.constant(param.eps)))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, x = self.param.mvn_param, bottoms[0]
-        missing = 4 - len(self.bottom_shapes[0])
-        if missing:
-            x = code.call(f"{{x}}[..., {', '.join(['None'] * missing)}]", x=x)
-        function = code.function(standardize if param.normalize_variance else center)
-        axes = (1, 2, 3) if param.across_channels else (2, 3)
-        if not param.normalize_variance:
-            return code.call(f"{function}({{x}}, {{axes}})", x=x, axes=axes)
-        return code.call(f"{function}({{x}}, {{axes}}, eps={{eps}})", x=x, axes=axes, eps=rounded(param.eps))
-
-
-class _Standardize(torch.autograd.Function):
-    """Rows to mean 0 and deviation 1, with Caffe's gradient.
-
-    Caffe differentiates as if ``eps`` were not there, then divides by the deviation plus eps: a constant row has a
-    finite gradient, where autograd's is not a number.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, rows: torch.Tensor, eps: float) -> torch.Tensor:
-        centered = rows - rows.mean(dim=1, keepdim=True)
-        deviation = centered.square().mean(dim=1, keepdim=True).sqrt() + eps
-        top = centered / deviation
-        ctx.save_for_backward(top, deviation)
-        return top
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        (grad,) = grads
-        top, deviation = ctx.saved_tensors
-        along = (grad * top).mean(dim=1, keepdim=True)
-        return (grad - grad.mean(dim=1, keepdim=True) - along * top) / deviation, None

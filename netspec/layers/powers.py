@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from typing_extensions import override
 
@@ -20,14 +22,10 @@ class AbsVal(Activation):
     Caffe: src/caffe/layers/absval_layer.cpp
     """
 
+    onnx_op, torch_call = "Abs", "torch.abs({x})"
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.abs()
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Abs", *bottoms)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("torch.abs({x})", x=bottoms[0])
 
 
 @register("Power", "power_param")
@@ -165,12 +163,8 @@ class Log(Rounded):
         self.shift: float = p.shift
 
     @override
-    def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.log(x * self.scale + self.shift) * self.base_scale
-
-    @override
-    def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        return libm.log(x * self.scale + self.shift) * self.base_scale
+    def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
+        return functions.log(x * self.scale + self.shift) * self.base_scale
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * (libm.power(bottom * self.scale + self.shift, -1) * self.slope)

@@ -15,11 +15,13 @@ from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.pointwise import CellUpdate, Pointwise, tanh_gradient
-from netspec.exact.products import VectorProducts
 from netspec.exact.sums import Copies
+from netspec.exact.vectors import VectorProducts
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
+
+# Functions that are copied into exported source; they take a net's blobs and states one by one.
 
 
 def rnn(x, cont, w_x, bias, w_h, w_o, bias_o, x_static, w_static, h):
@@ -162,7 +164,6 @@ class Recurrent(Layer):
             raise self.error(f"found states of shapes {[tuple(s.shape) for s in found]}, expected {shape}")
         self.state = found
 
-    @override
     def multiply_adds(self) -> int:
         """Return the weights of every matrix, times the time steps (x_static's: once) and the streams."""
         steps, streams = self.bottom_shapes[0][:2]
@@ -265,6 +266,8 @@ class RNN(Recurrent):
     bottoms = (2, 4)
     tops = (1, 2)
     state_names = ("h",)
+    torch_function = staticmethod(rnn)
+    blob_names = ("w_x", "bias", "w_static", "w_h", "w_o", "bias_o")
 
     def setup(self) -> None:
         super().setup()
@@ -292,19 +295,12 @@ class RNN(Recurrent):
         output = graph.node("Add", self.onnx_product(graph, h, hidden + 1), graph.blob(hidden + 2))
         return graph.node("Tanh", output), [h]
 
-    torch_function = staticmethod(rnn)
-    blob_names = ("w_x", "bias", "w_static", "w_h", "w_o", "bias_o")
-
 
 def _lstm_unit(
     cell: torch.Tensor, gate_input: torch.Tensor, keep: torch.Tensor, exact: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the next cell and hidden state; the gates come as input, forget, output, then the candidate."""
-    if exact:
-        return CellUpdate.apply(cell, gate_input, keep)
-    i, f, o, g = gate_input.chunk(4, -1)
-    cell = keep * torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)
-    return cell, torch.sigmoid(o) * torch.tanh(cell)
+    return CellUpdate.apply(cell, gate_input, keep) if exact else lstm_unit(cell, gate_input, keep)
 
 
 def _onnx_unit(graph: OnnxGraph, cell: str, gate_input: str, keep: str, units: int) -> tuple[str, str]:
@@ -336,6 +332,8 @@ class LSTM(Recurrent):
 
     state_names = ("h", "c")
     gates = 4
+    torch_function = staticmethod(lstm)
+    blob_names = ("w_x", "bias", "w_static", "w_h")
 
     @override
     def step(
@@ -352,9 +350,6 @@ class LSTM(Recurrent):
         recurrent = self.onnx_product(graph, graph.node("Mul", keep, h), 2 + self.has_static)
         c, h = _onnx_unit(graph, c, graph.node("Add", inputs, recurrent), keep, self.hidden)
         return h, [h, c]
-
-    torch_function = staticmethod(lstm)
-    blob_names = ("w_x", "bias", "w_static", "w_h")
 
 
 @register("LSTMUnit")

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from typing_extensions import override
 
 from netspec.data.blobs import Shape
 from netspec.exact import SMALL_ITEM
@@ -92,6 +91,9 @@ class Scale(_Affine):
     Caffe: src/caffe/layers/scale_layer.cpp
     """
 
+    fresh = True
+    any_layout = True
+
     def setup(self) -> None:
         param = self.param.scale_param
         shape = self.bottom_shapes[1] if len(self.bottom_shapes) > 1 else self.learned_shape(param, "scale_param")
@@ -122,13 +124,9 @@ class Scale(_Affine):
         return graph.node("Add", top, self.onnx_operand(graph, bottoms[:1], len(self.blobs) - 1, self.axis))
 
     @property
-    @override
     def small(self) -> bool:
         shape, axes = self.bottom_shapes[0], len((*self.bottom_shapes[1:], *self.blob_shapes)[0])
         return self.axis == 1 and axes == 1 and math.prod(shape[1:]) <= SMALL_ITEM
-
-    fresh = True
-    any_layout = True
 
     def prepare(self, how: Preparation) -> Kernel | None:
         if not self.by_channel:

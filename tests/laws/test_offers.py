@@ -5,10 +5,10 @@ import inspect
 from collections.abc import Iterator
 
 from netspec.layers import Layer, exporting, folding, gradients, preparing, reading, training
+from netspec.layers.data.files import ReadingLayer
 from paths import ROOT
 
 MOST_METHODS, MOST_ATTRIBUTES = 24, 14
-HOOKS = {"construct", "setup", "reshape", "forward"}  # of Layer, which describes them; no layer marks them
 ROOMS = [exporting, folding, gradients, preparing, reading, training]
 
 
@@ -23,6 +23,7 @@ OFFERED = {
     if inspect.isclass(cls) and getattr(cls, "_is_protocol", False) and cls.__module__ == room.__name__
     for name in members(cls)
 }
+HOOKS = members(Layer) | members(ReadingLayer)  # described there; what overrides them is not marked
 
 
 def undescribed() -> Iterator[str]:

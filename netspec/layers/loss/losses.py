@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from netspec.exact import libm
 from netspec.exact.blas import dots, sum_in_order
 from netspec.exact.losses import SigmoidCrossEntropy
-from netspec.exact.sums import RowMagnitudes, RowSquares
+from netspec.exact.sums import row_magnitudes, row_squares
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
 from netspec.layers.loss.base import (
@@ -55,7 +55,7 @@ class HingeLoss(ClassLoss):
         margins = F.relu(1 + sign * x)
         squared = self.param.hinge_loss_param.norm == self.L2
         if self.is_exact(margins):
-            return (RowSquares if squared else RowMagnitudes).apply(margins.reshape(1, -1))[0] / self.outer
+            return (row_squares if squared else row_magnitudes)(margins.reshape(1, -1))[0] / self.outer
         return (margins.square() if squared else margins).sum() / self.outer
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
@@ -156,7 +156,7 @@ class EuclideanLoss(Loss):
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         difference = a - b.reshape(a.shape)
         exact = self.is_exact(difference)
-        squares = RowSquares.apply(difference.reshape(1, -1))[0] if exact else difference.square().sum()
+        squares = row_squares(difference.reshape(1, -1))[0] if exact else difference.square().sum()
         return squares / (2 * a.shape[0])
 
     def prepare_training(self, learning: Learning) -> Kernels:
@@ -168,7 +168,7 @@ class EuclideanLoss(Loss):
 
         def forward(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
             torch.sub(a, b.reshape(shape), out=difference)
-            return (RowSquares.apply(row)[0] if exact else torch.square(difference, out=squares).sum()) / divisor
+            return (row_squares(row)[0] if exact else torch.square(difference, out=squares).sum()) / divisor
 
         def backward(diff: torch.Tensor) -> Sequence[torch.Tensor | None]:
             factor = diff / count  # twice diff / divisor, to the last bit

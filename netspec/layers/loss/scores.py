@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 from netspec.data.blobs import to_array
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.blas import sum_in_order
-from netspec.exact.losses import Infogain, Logarithm, bound_softmax, softmax
+from netspec.exact.losses import Infogain, bound_softmax, logarithm, softmax
 from netspec.files.limits import read_bytes
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
@@ -105,7 +105,6 @@ class SoftmaxWithLoss(SoftmaxLoss):
         return self.reshape_tops(bottom_shapes, self.param.softmax_param.axis, "softmax_param", "axis")
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
         valid = self.valid(label, self.ignore_label)
         exact = self.is_exact(x, small=math.prod(x.shape[1:]) <= SMALL_ITEM)
@@ -223,7 +222,6 @@ class InfogainLoss(SoftmaxLoss):
             raise self.error(message, *path)
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor, *given: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the loss and, where there is a second top, the softmax."""
         x, label = self.scores_and_labels(scores, labels)
         valid = self.valid(label, self.ignore_label)
         matrix = given[0] if given else self.matrix
@@ -273,7 +271,7 @@ class MultinomialLogisticLoss(ClassLoss):
         self.valid(label, None)
         chosen = Floor.apply(p.gather(1, label.unsqueeze(1)), LOG_THRESHOLD)
         exact = self.is_exact(chosen)
-        return -total(Logarithm.apply(chosen) if exact else chosen.log(), exact) / self.outer
+        return -total(logarithm(chosen) if exact else chosen.log(), exact) / self.outer
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p, labels = self.onnx_scores_and_labels(graph, *bottoms)
@@ -315,7 +313,6 @@ class Accuracy(Classified):
 
     @torch.no_grad()
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the accuracy and, where there is a second top, that of each class."""
         x, label = self.scores_and_labels(scores, labels)
         valid = self.valid(label, self.ignore_label)
         if valid is None:

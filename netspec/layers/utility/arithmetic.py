@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
-from netspec.exact.sums import Product, RowMagnitudes, RowSquares, RowSums
+from netspec.exact.sums import Product, RowSums, row_magnitudes, row_squares
 from netspec.layers.base import Layer, Shape
 from netspec.layers.preparing import Kernel, Preparation, finished
 from netspec.layers.registry import register
@@ -34,6 +34,8 @@ class Eltwise(Layer):
 
     PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
     bottoms = (2, None)
+    fresh = True
+    any_layout = True
 
     def setup(self) -> None:
         p = self.param.eltwise_param
@@ -74,9 +76,6 @@ class Eltwise(Layer):
         for x in others:
             top = top + x if self.operation == self.SUM else top * x
         return top
-
-    fresh = True
-    any_layout = True
 
     def prepare(self, how: Preparation) -> Kernel | None:
         if self.operation != self.SUM or self.coeff != [1.0, 1.0]:
@@ -139,9 +138,9 @@ class Reduction(Layer):
 
     def _reduce_exactly(self, rows: torch.Tensor, operation: int) -> torch.Tensor:
         if operation == self.ASUM:
-            sums = RowMagnitudes.apply(rows)
+            sums = row_magnitudes(rows)
         else:
-            sums = RowSquares.apply(rows) if operation == self.SUMSQ else RowSums.apply(rows, 1.0)
+            sums = row_squares(rows) if operation == self.SUMSQ else RowSums.apply(rows, 1.0)
         return sums.reshape(self.top_shapes[0])
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:

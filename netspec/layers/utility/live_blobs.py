@@ -19,7 +19,6 @@ import torch
 from typing_extensions import override
 
 Shape = tuple[int, ...]
-_CPU = torch.device("cpu")
 
 
 def _nobody() -> np.ndarray | None:
@@ -33,9 +32,9 @@ class Memory:
     GPU a view shows what was there when ``view`` was called, and what is written to it then takes effect, as in Caffe.
     """
 
-    def __init__(self, device: torch.device = _CPU) -> None:
+    def __init__(self) -> None:
         self.capacity = 0
-        self.device = device
+        self.device = torch.device("cpu")
         self.dtype = torch.float32
         self._fresh: torch.Tensor | None = None  # what a layer has put here since a view was last asked for
         self._flat: torch.Tensor | None = None  # what views show, one axis, in main memory
@@ -184,12 +183,7 @@ class Blob:
     ``data_memory`` and ``diff_memory`` may be another blob's too (Caffe: ShareData, ShareDiff).
     """
 
-    def __init__(
-        self,
-        shape: Shape = (),
-        data: Memory | None = None,
-        diff: Memory | None = None,
-    ) -> None:
+    def __init__(self, shape: Shape = (), data: Memory | None = None, diff: Memory | None = None) -> None:
         """Make a blob, of zeros unless it is given memory."""
         self.data_memory = data or Memory()
         self.diff_memory = diff or Memory()
@@ -218,23 +212,12 @@ class Blob:
 
     @property
     def num(self) -> int:
-        """Axis 0, 1 where there is none."""
+        """Axis 0, 1 where there is none; ``channels``, ``height`` and ``width`` likewise axes 1, 2 and 3."""
         return self._legacy_axis(0)
 
-    @property
-    def channels(self) -> int:
-        """Axis 1, 1 where there is none."""
-        return self._legacy_axis(1)
-
-    @property
-    def height(self) -> int:
-        """Axis 2, 1 where there is none."""
-        return self._legacy_axis(2)
-
-    @property
-    def width(self) -> int:
-        """Axis 3, 1 where there is none."""
-        return self._legacy_axis(3)
+    channels = property(lambda self: self._legacy_axis(1))
+    height = property(lambda self: self._legacy_axis(2))
+    width = property(lambda self: self._legacy_axis(3))
 
     def reshape(self, *shape: int) -> None:
         """Take another shape, at once; the values stay where they are, those of memory that has to grow are 0."""

@@ -35,6 +35,7 @@ class Concat(Layer):
 
     bottoms = (1, None)
     traceable = True
+    any_layout = True
 
     def setup(self) -> None:
         if len(self.bottom_shapes) == 1:  # it is not copied
@@ -56,8 +57,6 @@ class Concat(Layer):
     def prepare_training(self, learning: Learning) -> Kernels:
         axis, sizes = self.axis, [shape[self.axis] for shape in self.bottom_shapes]
         return lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis)
-
-    any_layout = True
 
     @property
     def fresh(self) -> bool:
@@ -84,6 +83,7 @@ class Slice(Layer):
 
     tops = (1, None)
     traceable = True
+    any_layout = True
 
     def setup(self) -> None:
         if self.num_tops == 1:  # it is not copied
@@ -111,8 +111,6 @@ class Slice(Layer):
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return x.split(self.sizes, self.axis)
-
-    any_layout = True
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         if self.num_tops == 1:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from netspec.exact import switch
-from netspec.exact.sums import Copies, Tiles
+from netspec.exact.sums import Copies, tiles
 from netspec.layers.base import Layer, Shape
 from netspec.layers.registry import register
 from netspec.layers.targets import OnnxGraph, TorchCode
@@ -111,7 +111,6 @@ class Split(Layer):
     shares = frozenset({"data"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape for each top."""
         return [bottom_shapes[0]] * self.num_tops
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -162,7 +161,7 @@ class Tile(Layer):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         if self.is_exact(x):
             values = x.reshape(math.prod(x.shape[: self.axis]), -1)
-            return Tiles.apply(values, self.repeats[self.axis]).reshape(self.top_shapes[0])
+            return tiles(values, self.repeats[self.axis]).reshape(self.top_shapes[0])
         return x.repeat(self.repeats)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:

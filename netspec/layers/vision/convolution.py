@@ -48,6 +48,8 @@ class Convolution(SlidingFilter):
     tops = (1, None)
     same_tops = True
     traceable = True
+    fresh = True
+    any_layout = True
 
     @staticmethod
     def channels_read(param: Any) -> int:
@@ -92,7 +94,6 @@ class Convolution(SlidingFilter):
         return [top] * len(bottom_shapes)
 
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the responses to each bottom."""
         weight = self.blob(0)
         bias = self.blob(1) if len(self.blobs) > 1 else None
         if not self.kernel:  # a map without spatial axes is one of a single pixel
@@ -137,7 +138,6 @@ class Convolution(SlidingFilter):
         return convolution(lay_out(maps), weight, bias, sliding, self.group, transposed)
 
     @property
-    @override
     def small(self) -> bool:
         return self.spatial_axes == 2 and self.group == 1 and self._work <= SMALL_PRODUCT
 
@@ -145,9 +145,6 @@ class Convolution(SlidingFilter):
     def _work(self) -> int:
         """The multiply-adds for one image, bias aside."""
         return math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * math.prod(self.blob_shapes[0])
-
-    fresh = True
-    any_layout = True
 
     def prepare(self, how: Preparation) -> Kernel | None:
         usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(self.bottom_shapes[0]))
@@ -209,7 +206,6 @@ class Convolution(SlidingFilter):
 
         return forward, backward
 
-    @override
     def multiply_adds(self) -> int:
         pixels = math.prod(self.top_shapes[0]) // self.num_output
         return len(self.top_shapes) * pixels * math.prod(self.blob_shapes[0])
@@ -286,6 +282,9 @@ class Deconvolution(Convolution):
     Caffe: src/caffe/layers/base_conv_layer.cpp, deconv_layer.cpp
     """
 
+    onnx_op = "ConvTranspose"
+    torch_module = "ConvTranspose"
+
     @override
     def filter_shape(self) -> Shape:
         """Return the shape of blobs[0]: a convolution's with its ends exchanged."""
@@ -313,13 +312,11 @@ class Deconvolution(Convolution):
             return convolution(maps, weight, bias, sliding, self.group, transposed=True)
         return self.convolved(maps, weight, bias, sliding, lambda maps: maps, transposed=True)
 
-    @override
     def multiply_adds(self) -> int:
         pixels = math.prod(self.bottom_shapes[0]) // self.channels
         return len(self.bottom_shapes) * pixels * math.prod(self.blob_shapes[0])
 
     @property
-    @override
     def small(self) -> bool:
         return False
 
@@ -339,8 +336,6 @@ class Deconvolution(Convolution):
                 return fused.spread_by_channel(shape, weight, bias, sliding, how)
         return None
 
-    onnx_op = "ConvTranspose"
-
     @override
     def overhang(self, shape: Shape) -> list[int]:
         """Return zeros: any filter fits."""
@@ -352,5 +347,3 @@ class Deconvolution(Convolution):
         grouped = filters.reshape(self.group, -1, *filters.shape[1:])
         factors = scale.reshape(self.group, 1, -1, *(1,) * self.spatial_axes)
         return (grouped * factors).reshape(filters.shape)
-
-    torch_module = "ConvTranspose"

@@ -140,6 +140,8 @@ class Pooling(_PoolingBase):
     """
 
     tops = (1, 2)
+    fresh = True
+    any_layout = True
 
     def setup(self) -> None:
         param = self.param.pooling_param
@@ -194,9 +196,6 @@ class Pooling(_PoolingBase):
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
-
-    fresh = True
-    any_layout = True
 
     def prepare(self, how: Preparation) -> Kernel | None:
         windows, empty = self.windows, math.prod(self.top_shapes[0]) == 0
