@@ -34,27 +34,13 @@ __all__ = [
     "shrinkCaffeModel",
 ]
 
-#: OpenCV 4's constants, some of which OpenCV 5 left out.
-DNN_BACKEND_DEFAULT = 0
-DNN_BACKEND_HALIDE = 1
-DNN_BACKEND_INFERENCE_ENGINE = 2
-DNN_BACKEND_OPENCV = 3
-DNN_BACKEND_VKCOM = 4
-DNN_BACKEND_CUDA = 5
-DNN_BACKEND_WEBNN = 6
-DNN_BACKEND_TIMVX = 7
-DNN_BACKEND_CANN = 8
-DNN_TARGET_CPU = 0
-DNN_TARGET_OPENCL = 1
-DNN_TARGET_OPENCL_FP16 = 2
-DNN_TARGET_MYRIAD = 3
-DNN_TARGET_VULKAN = 4
-DNN_TARGET_FPGA = 5
-DNN_TARGET_CUDA = 6
-DNN_TARGET_CUDA_FP16 = 7
-DNN_TARGET_HDDL = 8
-DNN_TARGET_NPU = 9
-DNN_TARGET_CPU_FP16 = 10
+#: OpenCV 4's constants, some of which OpenCV 5 left out: each list from 0 on.
+_CONSTANTS = {
+    "DNN_BACKEND": "DEFAULT HALIDE INFERENCE_ENGINE OPENCV VKCOM CUDA WEBNN TIMVX CANN",
+    "DNN_TARGET": "CPU OPENCL OPENCL_FP16 MYRIAD VULKAN FPGA CUDA CUDA_FP16 HDDL NPU CPU_FP16",
+}
+for _kind, _names in _CONSTANTS.items():
+    globals().update({f"{_kind}_{name}": number for number, name in enumerate(_names.split())})
 
 
 def __getattr__(name: str) -> Any:

@@ -5,7 +5,6 @@ OpenCV: modules/dnn/src/net_impl.cpp (4.12)
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
@@ -15,19 +14,14 @@ import numpy as np
 import torch
 
 from netspec.dnn.caffe_files import CaffeFiles
-from netspec.dnn.costs import operations
-from netspec.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, DnnError, as_dnn_error
-from netspec.dnn.table import INPUT, Entry, graph_of, make_table, nodes_of, unconnected
-from netspec.errors import Where, did_you_mean
+from netspec.dnn.described import Described
+from netspec.dnn.errors import BAD_ARGUMENT, NOT_FOUND, DnnError, as_dnn_error
+from netspec.dnn.table import INPUT, Entry
 from netspec.files.opencv import cv2
-from netspec.files.whole_file import whole_file
-from netspec.layers.base import Layer as CaffeLayer
-from netspec.layers.base import Shape
 from netspec.net.net import Net as CaffeNet
 from netspec.run.walk import Step, walk
 
 Array = np.ndarray
-Shapes = list[Shape]
 
 
 class Layer:
@@ -45,7 +39,7 @@ class Layer:
         return self._tops.index(outputName) if outputName in self._tops else -1
 
 
-class Net:
+class Net(Described):
     """A net that was read from Caffe's files; without files, an empty one.
 
     Names and numbers of layers are OpenCV's (netspec/dnn/table.py), arrays are float32 in Caffe's axes. Faults raise
@@ -53,31 +47,10 @@ class Net:
     """
 
     def __init__(self, files: CaffeFiles | None = None) -> None:
-        self._files = files
-        self._table: list[Entry] = make_table(files.net) if files else []
-        self._numbers = {entry.name: number for number, entry in enumerate(self._table)}
-        self._declared: dict[str, Shape | None] = files.inputs if files else {}
-        self._shown = {blob: blob for blob in self._declared}  # names of inputs, as setInputsNames may change them
-        self._values: dict[str, Array] = {}
+        super().__init__(files)
         self._runnable = files is None or files.weights is not None or not any(_learns(files))
-        self._of_shapes: tuple[dict[str, Shape], CaffeNet] | None = None
-        if files is not None and None not in self._declared.values():
-            with as_dnn_error("readNetFromCaffe"):
-                _ = self._net
 
-    # What it has
-
-    def empty(self) -> bool:
-        """Return whether it has no layers."""
-        return len(self._table) < 2
-
-    def getLayerNames(self) -> tuple[str, ...]:
-        """Return the names of all layers but the input layer."""
-        return tuple(entry.name for entry in self._table[1:])
-
-    def getLayerId(self, layer: str) -> int:
-        """Return the number of a layer, -1 where there is none of that name."""
-        return self._numbers.get(layer, -1)
+    # Its parameters
 
     def getLayer(self, layerId: int | str) -> Layer:
         """Return a layer, by number or name."""
@@ -86,24 +59,6 @@ class Net:
             return Layer(INPUT, "", (), list(self._shown.values()))
         count = len(self._layer(self._net, entry).blobs)
         return Layer(entry.name, entry.type, [self._parameter(entry, j) for j in range(count)], ())
-
-    def getLayerTypes(self) -> tuple[str, ...]:
-        """Return the types of its layers, each once, in alphabetical order."""
-        return tuple(sorted({entry.type or "__NetInputLayer__" for entry in self._table}))
-
-    def getLayersCount(self, layerType: str) -> int:
-        """Return how many layers are of a type."""
-        return sum((entry.type or "__NetInputLayer__") == layerType for entry in self._table)
-
-    def getUnconnectedOutLayers(self) -> Array:
-        """Return the numbers of the layers whose tops no layer reads: (n,) int32."""
-        return np.array(unconnected(self._files.net, self._table) if self._files else [], np.int32)
-
-    def getUnconnectedOutLayersNames(self) -> tuple[str, ...]:
-        """Return the names of the layers whose tops no layer reads."""
-        return tuple(self._table[number].name for number in self.getUnconnectedOutLayers())
-
-    # Parameters
 
     def getParam(self, layer: int | str, numParam: int = 0) -> Array:
         """Return a copy of a learnable blob of a layer."""
@@ -135,21 +90,6 @@ class Net:
         return blobs[index]
 
     # Settings
-
-    def setPreferableBackend(self, backendId: int) -> None:
-        """Accept a backend; there is one, torch."""
-
-    def setPreferableTarget(self, targetId: int) -> None:
-        """Accept a target; nets run on the CPU."""
-
-    def enableFusion(self, fusion: bool) -> None:
-        """Accept the switch; it changes no result."""
-
-    def enableWinograd(self, useWinograd: bool) -> None:
-        """Accept the switch; it changes no result."""
-
-    def setHalideScheduler(self, scheduler: str) -> None:
-        """Accept a schedule; it changes no result."""
 
     def setInputsNames(self, inputBlobNames: Sequence[str]) -> None:
         """Give the inputs other names, in their order."""
@@ -214,146 +154,6 @@ class Net:
                 ticks[number] = seconds[self._nodes[entry.layer]] * cv2.getTickFrequency()
         return int(ticks.sum()), ticks
 
-    def forwardAsync(self, outputName: str = "") -> Any:
-        """Refuse, as OpenCV does without Intel's Inference Engine."""
-        message = "forwardAsync needs a backend that is not here; use forward"
-        raise DnnError(message, code=NOT_IMPLEMENTED, func="forwardAsync")
-
-    # Other nets than the prototxt's
-
-    def addLayer(self, name: str, type: str, *settings: Any) -> int:
-        """Refuse: a net is what its prototxt says."""
-        raise self._as_written("addLayer")
-
-    def addLayerToPrev(self, name: str, type: str, *settings: Any) -> int:
-        """Refuse: a net is what its prototxt says."""
-        raise self._as_written("addLayerToPrev")
-
-    def connect(self, outPin: str, inpPin: str) -> None:
-        """Refuse: a net is what its prototxt says."""
-        raise self._as_written("connect")
-
-    def registerOutput(self, outputName: str, layerId: int, outputPort: int) -> int:
-        """Refuse: a net is what its prototxt says."""
-        raise self._as_written("registerOutput")
-
-    def _as_written(self, func: str) -> DnnError:
-        message = f"{func} cannot change a net of Caffe's files; write the layer into the prototxt"
-        return DnnError(message, self._file(), NOT_IMPLEMENTED, func)
-
-    def quantize(self, calibData: Any, inputsDtype: int, outputsDtype: int, perChannel: bool = True) -> Any:
-        """Refuse: nets compute in float32."""
-        message = (
-            "nets of Caffe's files are not quantized here; export the net to ONNX (netspec export) and quantize that"
-        )
-        raise DnnError(message, self._file(), NOT_IMPLEMENTED, "quantize")
-
-    def getInputDetails(self) -> Any:
-        """Refuse, as OpenCV does for a net that is not quantized."""
-        raise DnnError("the net is not quantized", self._file(), func="getInputDetails")
-
-    def getOutputDetails(self) -> Any:
-        """Refuse, as OpenCV does for a net that is not quantized."""
-        raise DnnError("the net is not quantized", self._file(), func="getOutputDetails")
-
-    # As a graph
-
-    def dump(self) -> str:
-        """Return the layers, with the shapes of their tops, and what they read, in Graphviz's language."""
-        self._check_not_empty("dump")
-        assert self._files is not None
-        given = {key: value.shape for key, value in self._values.items()}
-        with as_dnn_error("dump"):
-            net = self._files.build(given, "meta")
-        return graph_of(self._files.net, self._table, [self._shapes(net, entry)[1] for entry in self._table])
-
-    def dumpToFile(self, path: str) -> None:
-        """Write :meth:`dump` to a file."""
-        with as_dnn_error("dumpToFile"), whole_file(path) as unfinished:
-            unfinished.write_text(self.dump())
-
-    # Shapes and costs
-
-    def getLayersShapes(self, netInputShapes: Any) -> tuple[Array, tuple[Any, ...], tuple[Any, ...]]:
-        """Return the numbers of all layers and the shapes of their bottoms and tops, for inputs of these shapes."""
-        net = self._shaped(netInputShapes, "getLayersShapes")
-        shapes = [self._shapes(net, entry) for entry in self._table]
-        ids = np.arange(len(self._table), dtype=np.int32)
-        return ids, tuple(_arrays(ins) for ins, _ in shapes), tuple(_arrays(outs) for _, outs in shapes)
-
-    def getLayerShapes(self, netInputShape: Any, layerId: int | str) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        """Return the shapes of the bottoms and of the tops of one layer."""
-        net = self._shaped(netInputShape, "getLayerShapes")
-        bottoms, tops = self._shapes(net, self._entry(layerId, "getLayerShapes"))
-        return _arrays(bottoms), _arrays(tops)
-
-    def getFLOPS(self, *arguments: Any, **named: Any) -> int:
-        """Return the operations of a pass: ``getFLOPS(shapes)``, or of one layer: ``getFLOPS(number, shapes)``."""
-        net, entries = self._asked("getFLOPS", arguments, named)
-        return sum(self._operations(net, entry) for entry in entries)
-
-    def getMemoryConsumption(self, *arguments: Any, **named: Any) -> tuple[int, int]:
-        """Return bytes of weights and of tops, of all layers or of one; arguments as :meth:`getFLOPS`."""
-        net, entries = self._asked("getMemoryConsumption", arguments, named)
-        weights = sum(blob.numel() for entry in entries for blob in self._own_blobs(net, entry))
-        return 4 * weights, 4 * sum(math.prod(shape) for entry in entries for shape in self._shapes(net, entry)[1])
-
-    def _asked(self, func: str, arguments: Sequence[Any], named: Mapping[str, Any]) -> tuple[CaffeNet, list[Entry]]:
-        shapes = named.get("netInputShapes", named.get("netInputShape", arguments[-1] if arguments else None))
-        layer = named.get("layerId", arguments[0] if len(arguments) > 1 else None)
-        return self._shaped(shapes, func), self._table if layer is None else [self._entry(layer, func)]
-
-    def _shaped(self, given: Any, func: str) -> CaffeNet:
-        """Return the net built without values for inputs of these shapes: one shape, or one for each input."""
-        self._check_not_empty(func)
-        assert self._files is not None
-        rows = [given] if len(given) and np.isscalar(given[0]) else given
-        if len(rows) > len(self._declared):
-            message = f"found {len(rows)} shapes, expected {len(self._declared)}: {', '.join(self._shown.values())}"
-            raise DnnError(message, code=BAD_ARGUMENT, func=func)
-        shapes = {key: tuple(int(n) for n in row) for key, row in zip(self._declared, rows, strict=False)}
-        if self._of_shapes is None or self._of_shapes[0] != shapes:
-            with as_dnn_error(func):
-                self._of_shapes = shapes, self._files.build(shapes, "meta")
-        return self._of_shapes[1]
-
-    def _shapes(self, net: CaffeNet, entry: Entry) -> tuple[Shapes, Shapes]:
-        if entry.name == INPUT:
-            inputs = [shape for layer in net.layers if layer.is_input for shape in layer.top_shapes]
-            return inputs, inputs
-        layer = self._layer(net, entry)
-        if layer.type == "Axpy":
-            a, x, y = layer.bottom_shapes
-            return ([x, a] if entry.top < 0 else [x, y]), [x]
-        if entry.type == "Convolution":
-            return [layer.bottom_shapes[entry.top]], [layer.top_shapes[entry.top]]
-        return layer.bottom_shapes, layer.top_shapes
-
-    def _operations(self, net: CaffeNet, entry: Entry) -> int:
-        if entry.name == INPUT or entry.top > 0:
-            return 0
-        layer = self._layer(net, entry)
-        if layer.type == "Axpy":
-            return (2 if entry.top < 0 else 1) * sum(math.prod(shape) for shape in self._shapes(net, entry)[0])
-        return operations(layer)
-
-    def _own_blobs(self, net: CaffeNet, entry: Entry) -> Iterable[torch.Tensor]:
-        return () if entry.name == INPUT or entry.top > 0 else self._layer(net, entry).blobs
-
-    # The net that runs
-
-    @cached_property
-    def _net(self) -> CaffeNet:
-        """The net, built when it is first needed: inputs without a shape in the prototxt get theirs from setInput."""
-        assert self._files is not None
-        given = {key: value.shape for key, value in self._values.items() if self._declared[key] is None}
-        return self._files.build(given)
-
-    @cached_property
-    def _nodes(self) -> list[int]:
-        assert self._files is not None
-        return nodes_of(self._net.plan, self._files.net)
-
     @cached_property
     def _makers(self) -> dict[int, int]:
         """The node that makes each value."""
@@ -366,12 +166,6 @@ class Net:
 
     def _tops(self, net: CaffeNet, entry: Entry) -> int:
         return len(self._declared) if entry.name == INPUT else len(self._node(net, entry).tops)
-
-    def _node(self, net: CaffeNet, entry: Entry) -> Any:
-        return net.plan.nodes[self._nodes[entry.layer]]
-
-    def _layer(self, net: CaffeNet, entry: Entry) -> CaffeLayer:
-        return net.layers[self._nodes[entry.layer]]
 
     def _last(self) -> str:
         self._check_not_empty("forward")
@@ -430,19 +224,6 @@ class Net:
 
     # What can be wrong
 
-    def _entry(self, layer: int | str, func: str) -> Entry:
-        number = self._numbers.get(layer, -1) if isinstance(layer, str) else int(layer)
-        if 0 <= number < len(self._table):
-            return self._table[number]
-        if isinstance(layer, str):
-            names = list(self._numbers)
-            message = (
-                f'no layer "{layer}" in this net{did_you_mean(layer, names) or ";"} it has: {", ".join(names[1:])}'
-            )
-        else:
-            message = f"no layer of number {layer} in this net; it has 0 to {len(self._table) - 1}"
-        raise DnnError(message, self._file(), NOT_FOUND, func)
-
     def _input(self, name: str, func: str) -> str:
         """Return the blob of an input that is called ``name``; "" is the first."""
         for blob, shown in self._shown.items():
@@ -451,10 +232,6 @@ class Net:
         found = f'no input "{name}" in this net' if name else "this net takes no input"
         known = ", ".join(self._shown.values()) or "none"
         raise DnnError(f"{found}; its inputs: {known}", self._file(), NOT_FOUND, func)
-
-    def _check_not_empty(self, func: str) -> None:
-        if self.empty():
-            raise DnnError("the net is empty", code=BAD_ARGUMENT, func=func)
 
     def _check_inputs(self, func: str) -> None:
         self._check_not_empty(func)
@@ -477,9 +254,6 @@ class Net:
         ]
         message = "; ".join([getattr(fault, "message", str(fault)), *changed])
         return DnnError(message, getattr(fault, "where", None), BAD_ARGUMENT, func)
-
-    def _file(self) -> Where | None:
-        return Where(self._files.source.file) if self._files else None
 
 
 def _learns(files: CaffeFiles) -> Iterable[bool]:
@@ -504,7 +278,3 @@ def _array(values: torch.Tensor) -> Array:
     """Return a copy as OpenCV gives arrays: at least two axes, (n, 1) for a vector."""
     array = np.array(values.detach().numpy(), np.float32, order="C")
     return array if array.ndim > 1 else array.reshape(-1, 1)
-
-
-def _arrays(shapes: Iterable[Shape]) -> tuple[Array, ...]:
-    return tuple(np.array(shape, np.int32) for shape in shapes)

@@ -25,6 +25,7 @@ from typing import IO, Any, BinaryIO, TypeVar, cast
 import numpy as np
 
 from netspec.errors import InputError
+from netspec.files.limits import ALWAYS, MOST_PACKED
 
 T = TypeVar("T")
 _FAULTS = (
@@ -32,8 +33,6 @@ _FAULTS = (
     *(EOFError, NotImplementedError, RuntimeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
     *(struct.error, pickle.UnpicklingError, SystemError),
 )
-_ALWAYS = 1 << 28  # bytes that any file may ask for
-_MOST_PACKED = 100  # times a file's size: real data is packed 2 to 20 times, a file made to fill the memory 1000 times
 
 
 @contextmanager
@@ -81,9 +80,7 @@ def read_lists(path: str | Path) -> list[Any] | None:
     nothing else. Raises InputError for other files.
     """
     with _opened(Path(path), "an array of numbers, or of lists of integers") as stream:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
+        shape, _, dtype = _described(stream)
         if not dtype.hasobject:
             return None
         found = _Lists(stream).load()
@@ -166,7 +163,7 @@ def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(packed) as archive:
         entries = archive.infolist()
         size = sum(entry.file_size for entry in entries)
-        if size > _ALWAYS and size > _MOST_PACKED * stored:
+        if size > ALWAYS and size > MOST_PACKED * stored:
             raise ValueError(f"its arrays would take {size / 2**20:.0f} MiB of memory, in a file of {stored} bytes")
         arrays: dict[str, np.ndarray] = {}
         for entry in entries:
@@ -175,13 +172,17 @@ def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
         return arrays
 
 
-def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, order by columns, and dtype of an array in the format .npy, of ``size`` bytes in a stream."""
+def _described(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return what the header of an array in the format .npy says."""
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"an array of format {version}")
-    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, by_columns, dtype = read_header(stream)
+    return (np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0)(stream)
+
+
+def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, order by columns, and dtype of an array in the format .npy, of ``size`` bytes in a stream."""
+    shape, by_columns, dtype = _described(stream)
     if dtype.hasobject:
         raise ValueError("an array of Python objects")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > size:

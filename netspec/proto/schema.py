@@ -101,21 +101,9 @@ if TYPE_CHECKING:
 else:
     CaffeMessage = Message
     PhaseValue = int
-    BlobShape = message("BlobShape")
-    BlobProto = message("BlobProto")
-    BlobProtoVector = message("BlobProtoVector")
-    Datum = message("Datum")
-    FillerParameter = message("FillerParameter")
-    NetParameter = message("NetParameter")
-    SolverParameter = message("SolverParameter")
-    SolverState = message("SolverState")
-    NetState = message("NetState")
-    NetStateRule = message("NetStateRule")
-    ParamSpec = message("ParamSpec")
-    LayerParameter = message("LayerParameter")
-    V0LayerParameter = message("V0LayerParameter")
-    V1LayerParameter = message("V1LayerParameter")
-    TransformationParameter = message("TransformationParameter")
+    _NAMES = """BlobProto BlobProtoVector BlobShape Datum FillerParameter LayerParameter NetParameter NetState
+        NetStateRule ParamSpec SolverParameter SolverState TransformationParameter V0LayerParameter V1LayerParameter"""
+    globals().update({name: message(name) for name in _NAMES.split()})
 
 TRAIN, TEST = PhaseValue(0), PhaseValue(1)  # enum Phase
 PHASES = {"TRAIN": TRAIN, "TEST": TEST}

@@ -41,6 +41,15 @@ class Layer(pycaffe_shim.Layer):
         self.blobs = blobs
 
 
+def _adding(which: str) -> Callable[[Net, Callable[[int], object]], None]:
+    """Return a method that adds a function, to be called with each layer's number before or after it ran."""
+
+    def add(self: Net, hook: Callable[[int], object]) -> None:
+        self.passes.hooks[which].append(hook)
+
+    return add
+
+
 class Net:
     """A net and its blobs in memory.
 
@@ -275,24 +284,8 @@ class Net:
         """Set the gradients of the learnable blobs to 0; :meth:`backward` adds to them."""
         self.passes.clear_param_diffs()
 
-    def before_forward(self, hook: Callable[[int], object]) -> None:
-        """Call ``hook`` with each layer's number before it runs forward."""
-        self._add_hook("before_forward", hook)
-
-    def after_forward(self, hook: Callable[[int], object]) -> None:
-        """Call ``hook`` with each layer's number after it ran forward."""
-        self._add_hook("after_forward", hook)
-
-    def before_backward(self, hook: Callable[[int], object]) -> None:
-        """Call ``hook`` with each layer's number before it runs backward."""
-        self._add_hook("before_backward", hook)
-
-    def after_backward(self, hook: Any) -> None:
-        """Call ``hook`` with each layer's number after it ran backward."""
-        self._add_hook("after_backward", hook)
-
-    def _add_hook(self, which: str, hook: Callable[[int], object]) -> None:
-        self.passes.hooks[which].append(hook)
+    before_forward, after_forward = _adding("before_forward"), _adding("after_forward")
+    before_backward, after_backward = _adding("before_backward"), _adding("after_backward")
 
     # Data and weights
 
@@ -336,17 +329,9 @@ class Net:
     def set_phase_test(self) -> None:
         """Do nothing: a net is built for a phase."""
 
-    def set_mode_cpu(self) -> None:
-        """Set the mode for nets to come."""
-        mode.set_mode_cpu()
-
-    def set_mode_gpu(self) -> None:
-        """Set the mode for nets to come."""
-        mode.set_mode_gpu()
-
-    def set_device(self, device_id: int) -> None:
-        """Set the GPU for nets to come."""
-        mode.set_device(device_id)
+    set_mode_cpu = staticmethod(mode.set_mode_cpu)
+    set_mode_gpu = staticmethod(mode.set_mode_gpu)
+    set_device = staticmethod(mode.set_device)
 
 
 def file_of(path: FilePath) -> str:

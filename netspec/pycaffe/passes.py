@@ -11,11 +11,9 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 
@@ -24,38 +22,27 @@ from netspec.layers.base import Layer
 from netspec.layers.gradients import gradient_from_memory, gradient_reads
 from netspec.layers.offers import offered
 from netspec.layers.reading import Constant
-from netspec.layers.training import Kernels, Learning, has_kernels, kernels
-from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
+from netspec.layers.training import Learning, has_kernels, kernels
+from netspec.layers.utility.live_blobs import Blob, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
 from netspec.net.net import Net
+from netspec.pycaffe.tapes import (
+    Bound,
+    Tape,
+    apart,
+    by_autograd,
+    gradient_of,
+    overwrites_shared,
+    parameters,
+    places_of,
+    storages,
+)
 from netspec.run.walk import Step, walk
 from netspec.terminal import log
 
 AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
 Hook = Callable[[int], object]
-
-
-@dataclass(frozen=True)
-class _Tape:
-    """One run of a layer: what it read, the tensors that held it, what it returned, and its gradients from the tops'.
-
-    Autograd has watched it, and read copies; or it was run by kernels, which read the tensors themselves.
-    """
-
-    leaves: list[torch.Tensor]
-    holders: list[torch.Tensor]
-    made: Sequence[torch.Tensor]
-    backward: Callable[..., Any]
-
-
-@dataclass(frozen=True)
-class _Bound:
-    """The kernels of a layer for bottoms of these shapes, and where its learnable blobs were when they were made."""
-
-    shapes: list[tuple[int, ...]]
-    places: list[Any]
-    kernels: Kernels
 
 
 class Passes:
@@ -78,9 +65,9 @@ class Passes:
         self._last: threading.Thread | None = None  # the one that ran a forward pass last
         self._overtaken = weakref.WeakSet[threading.Thread]()  # those that did before
         self._layers: list[Layer] = list(net.layers)
-        self.params = [_parameters(layer) for layer in self._layers]
-        self._tapes: list[_Tape | None] = [None] * len(self._layers)
-        self._bound: list[_Bound | None] = [None] * len(self._layers)
+        self.params = [parameters(layer) for layer in self._layers]
+        self._tapes: list[Tape | None] = [None] * len(self._layers)
+        self._bound: list[Bound | None] = [None] * len(self._layers)
         for i in range(len(self._layers)):
             self._wire(i)
         self.bottoms = [[self.blobs[b] for b in ids] for ids in self.bottom_ids]
@@ -207,7 +194,8 @@ class Passes:
     def forward(self, start: int, end: int) -> torch.Tensor:
         """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses, a scalar."""
         self.upload()
-        if self._prepares and (start, end) == (0, len(self._layers) - 1) and not self._has_hooks():
+        hooked = self.hooks["before_forward"] or self.hooks["after_forward"]
+        if self._prepares and (start, end) == (0, len(self._layers) - 1) and not hooked:
             return self._forward_prepared()
         with one_thread() if any(self._has_kernels) else nullcontext():
             loss = walk(self._steps("forward", range(start, end + 1)), {}, self.net.options.exact)
@@ -224,9 +212,6 @@ class Passes:
             for hook in self.hooks[f"after_{which}"]:
                 yield Step(i, partial(hook, i), (), ())
 
-    def _has_hooks(self) -> bool:
-        return bool(self.hooks["before_forward"] or self.hooks["after_forward"])
-
     def _can_prepare(self) -> bool:
         """Return whether a whole pass may run as netspec's own: only its results matter, blob by blob."""
         return (
@@ -236,19 +221,8 @@ class Passes:
             and not any(self._kept)
             and not any(isinstance(layer, Python) for layer in self._layers)
             and AUTOMATIC not in self.names
-            and not self._overwrites_shared()
+            and not overwrites_shared(self.net.plan.nodes, self.tops)
         )
-
-    def _overwrites_shared(self) -> bool:
-        """Return whether a layer works in place on memory that is already another blob's too."""
-        sharing: dict[int, set[int]] = {}
-        for node, tops in zip(self.net.plan.nodes, self.tops, strict=True):
-            for top, in_place in zip(tops, node.in_place, strict=False):
-                blobs = sharing.setdefault(id(top.data_memory), set())
-                blobs.add(id(top))
-                if in_place and len(blobs) > 1:
-                    return True
-        return False
 
     def _forward_prepared(self) -> torch.Tensor:
         """Run the whole net as netspec does (netspec/run/prepared.py), and put what it computes where views look."""
@@ -257,16 +231,16 @@ class Passes:
         found = self.net.prepared.run(given, self._final_values)
         assert found is not None, "a pass of pycaffe records no gradients"
         loss, values = found
-        taken = _storages(list(given.values())) if self._hand_on else set[int]()
+        taken = storages(list(given.values())) if self._hand_on else set[int]()
         for v, blob, shares, fresh in self._results:
             tensor = values[v]
             if shares:
                 if tensor.shape != blob.shape:
                     blob.reshape(*tensor.shape)
                 continue
-            blob.put_data(tensor if fresh else _apart(tensor, taken))
+            blob.put_data(tensor if fresh else apart(tensor, taken))
             if not fresh:
-                taken |= _storages([tensor])
+                taken |= storages([tensor])
         return self._no_loss if loss is None else loss
 
     @torch.no_grad()
@@ -353,19 +327,19 @@ class Passes:
             values = [blob.data_memory.tensor(blob.shape) for blob in bottoms]
             made = layer.run(*values)
         kept = self._kept[i] or [None] * len(made)
-        taken = _storages(values or list(layer.blobs))
+        taken = storages(values or list(layer.blobs))
         for top, tensor, constant in zip(tops, made, kept, strict=True):
             if constant is None:
-                top.put_data(_apart(tensor.detach(), taken))
+                top.put_data(apart(tensor.detach(), taken))
 
-    def _record(self, i: int) -> _Tape:
+    def _record(self, i: int) -> Tape:
         """Run layer ``i`` by its kernels, or watched by autograd."""
         if bound := self._kernels(i):
             forward, backward = bound.kernels
             values = [blob.data_memory.tensor(blob.shape) for blob in self.bottoms[i]]
             holders = [blob.data_memory.holder(blob.count) for blob in self.bottoms[i]]
             made = forward(*values)
-            return _Tape(values, holders, (made,) if isinstance(made, torch.Tensor) else made, backward)
+            return Tape(values, holders, (made,) if isinstance(made, torch.Tensor) else made, backward)
         leaves, holders = [], []
         for blob, wanted in zip(self.bottoms[i], self.net.backward_plan.bottoms[i], strict=True):
             memory = blob.data_memory
@@ -375,22 +349,22 @@ class Passes:
             holders.append(memory.holder(blob.count))
         with torch.enable_grad():
             made = self._layers[i].run(*leaves)
-        return _Tape(leaves, holders, made, partial(_by_autograd, leaves, made))
+        return Tape(leaves, holders, made, partial(by_autograd, leaves, made))
 
-    def _kernels(self, i: int) -> _Bound | None:
+    def _kernels(self, i: int) -> Bound | None:
         """Return the kernels of layer ``i`` at its present shapes, None where autograd is to watch it."""
         layer, bound = self._layers[i], self._bound[i]
         if not self._has_kernels[i]:
             return None
         shapes = [blob.shape for blob in self.bottoms[i]]
-        if bound is None or bound.shapes != shapes or bound.places != _places(layer):
+        if bound is None or bound.shapes != shapes or bound.places != places_of(layer):
             layer.fit(shapes)
-            sums = tuple(_gradient(blob) if blob.requires_grad else None for blob in layer.blobs)
+            sums = tuple(gradient_of(blob) if blob.requires_grad else None for blob in layer.blobs)
             learning = Learning(tuple(self.net.backward_plan.bottoms[i]), sums, steady=False)
-            bound = self._bound[i] = _Bound(shapes, _places(layer), kernels(layer, learning))
+            bound = self._bound[i] = Bound(shapes, places_of(layer), kernels(layer, learning))
         return bound
 
-    def _tape(self, i: int) -> _Tape:
+    def _tape(self, i: int) -> Tape:
         """Return the record of the last forward pass of layer ``i``, its bottoms' values as they are now in memory.
 
         A layer that has not run, or on other shapes, runs for it.
@@ -429,54 +403,8 @@ class Passes:
         found = tape.backward(*diffs)
         if not any(wanted):
             return
-        taken = _storages(diffs)
+        taken = storages(diffs)
         found = (found,) if isinstance(found, torch.Tensor) else found
         for blob, leaf, diff, asked in zip(bottoms, tape.leaves, found, wanted, strict=True):
             if asked:
-                blob.diff_memory.put(_apart(torch.zeros_like(leaf) if diff is None else diff, taken))
-
-
-def _by_autograd(
-    leaves: Sequence[torch.Tensor], made: Sequence[torch.Tensor], *diffs: torch.Tensor
-) -> list[torch.Tensor | None]:
-    """Return the gradients of what autograd saw a layer read, from those of what it returned."""
-    ends = [(top, diff) for top, diff in zip(made, diffs, strict=True) if top.requires_grad]
-    if ends:
-        torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends], retain_graph=True)
-    found = [leaf.grad for leaf in leaves]
-    for leaf in leaves:
-        leaf.grad = None
-    return found
-
-
-def _places(layer: Layer) -> list[Any]:
-    """Return where a layer's learnable blobs and their gradients are."""
-    return [place for blob in layer.blobs for place in (blob.data_ptr(), id(blob.grad), blob.requires_grad)]
-
-
-def _storages(tensors: Sequence[torch.Tensor]) -> set[int]:
-    """Return where tensors lie in main memory. (What views show of a GPU's tensors is a copy.)"""
-    return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.device.type == "cpu"}
-
-
-def _apart(tensor: torch.Tensor, taken: set[int]) -> torch.Tensor:
-    """Return a tensor, or a copy of one that lies where others do."""
-    aliased = tensor.device.type == "cpu" and tensor.untyped_storage().data_ptr() in taken
-    return tensor.clone() if aliased else tensor
-
-
-def _parameters(layer: Layer) -> BlobVec:
-    """Return a layer's learnable blobs, as views of its parameters and of their gradients."""
-    made = BlobVec()
-    for j, shape in enumerate(layer.blob_shapes):
-        count = layer.blobs[j].numel()
-        data = BorrowedMemory(lambda j=j: layer.blobs[j], count)
-        made.append(Blob(shape, data, BorrowedMemory(lambda j=j: _gradient(layer.blobs[j]), count)))
-    return made
-
-
-def _gradient(parameter: torch.Tensor) -> torch.Tensor:
-    """Return where a parameter's gradient is summed up; passes add to it and never replace it."""
-    if parameter.grad is None:
-        parameter.grad = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
-    return parameter.grad
+                blob.diff_memory.put(apart(torch.zeros_like(leaf) if diff is None else diff, taken))

@@ -113,6 +113,9 @@ class Solver:
 
     type_name: ClassVar[str] = ""
 
+    def __init_subclass__(cls, type_name: str = "") -> None:
+        cls.type_name = type_name or cls.type_name
+
     def __init__(self, solver_file: FilePath) -> None:
         solver_file = os.fsdecode(solver_file)
         param, node = parse_solver(solver_file)
@@ -198,40 +201,28 @@ class Solver:
             pair[which]()
 
 
-class SGDSolver(Solver):
+class SGDSolver(Solver, type_name="SGD"):
     """Stochastic gradient descent with momentum."""
 
-    type_name = "SGD"
 
-
-class NesterovSolver(Solver):
+class NesterovSolver(Solver, type_name="Nesterov"):
     """Nesterov's accelerated gradient."""
 
-    type_name = "Nesterov"
 
-
-class AdaGradSolver(Solver):
+class AdaGradSolver(Solver, type_name="AdaGrad"):
     """AdaGrad."""
 
-    type_name = "AdaGrad"
 
-
-class RMSPropSolver(Solver):
+class RMSPropSolver(Solver, type_name="RMSProp"):
     """RMSProp."""
 
-    type_name = "RMSProp"
 
-
-class AdaDeltaSolver(Solver):
+class AdaDeltaSolver(Solver, type_name="AdaDelta"):
     """AdaDelta."""
 
-    type_name = "AdaDelta"
 
-
-class AdamSolver(Solver):
+class AdamSolver(Solver, type_name="Adam"):
     """Adam."""
-
-    type_name = "Adam"
 
 
 _SOLVERS = (SGDSolver, NesterovSolver, AdaGradSolver, RMSPropSolver, AdaDeltaSolver, AdamSolver)

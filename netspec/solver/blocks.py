@@ -12,33 +12,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import is_
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
 from netspec.layers.learned import values_of
+from netspec.net.assembly import Learnable
 from netspec.solver import update
 
 LINE = 16  # numbers, 64 bytes: where each blob begins
-
-
-class Learnable(Protocol):
-    """A parameter with its multipliers, as in netspec/net/net.py."""
-
-    @property
-    def parameter(self) -> torch.nn.Parameter:
-        """What is learned."""
-        ...
-
-    @property
-    def lr_mult(self) -> float:
-        """The rate's multiplier."""
-        ...
-
-    @property
-    def decay_mult(self) -> float:
-        """The decay's multiplier."""
-        ...
 
 
 @dataclass(frozen=True)

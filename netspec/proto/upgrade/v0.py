@@ -13,46 +13,11 @@ from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.upgrade.rewrite import Draft, copy_without
 from netspec.terminal import log
 
-_TYPES = {
-    "accuracy": "ACCURACY",
-    "bnll": "BNLL",
-    "concat": "CONCAT",
-    "conv": "CONVOLUTION",
-    "data": "DATA",
-    "dropout": "DROPOUT",
-    "euclidean_loss": "EUCLIDEAN_LOSS",
-    "flatten": "FLATTEN",
-    "hdf5_data": "HDF5_DATA",
-    "hdf5_output": "HDF5_OUTPUT",
-    "im2col": "IM2COL",
-    "images": "IMAGE_DATA",
-    "infogain_loss": "INFOGAIN_LOSS",
-    "innerproduct": "INNER_PRODUCT",
-    "lrn": "LRN",
-    "multinomial_logistic_loss": "MULTINOMIAL_LOGISTIC_LOSS",
-    "pool": "POOLING",
-    "relu": "RELU",
-    "sigmoid": "SIGMOID",
-    "softmax": "SOFTMAX",
-    "softmax_loss": "SOFTMAX_LOSS",
-    "split": "SPLIT",
-    "tanh": "TANH",
-    "window_data": "WINDOW_DATA",
-}
-
-_PARAMETERS = {
-    "concat": "concat_param",
-    "conv": "convolution_param",
-    "data": "data_param",
-    "dropout": "dropout_param",
-    "hdf5_data": "hdf5_data_param",
-    "images": "image_data_param",
-    "infogain_loss": "infogain_loss_param",
-    "innerproduct": "inner_product_param",
-    "lrn": "lrn_param",
-    "pool": "pooling_param",
-    "window_data": "window_data_param",
-}
+# V0's names of types are mostly those of V1 in small letters; a type's own parameters are named after V1's.
+_SAME = """accuracy bnll concat data dropout euclidean_loss flatten hdf5_data hdf5_output im2col infogain_loss lrn
+    multinomial_logistic_loss relu sigmoid softmax softmax_loss split tanh window_data"""
+_RENAMED = {"conv": "CONVOLUTION", "images": "IMAGE_DATA", "innerproduct": "INNER_PRODUCT", "pool": "POOLING"}
+_TYPES = _RENAMED | {name: name.upper() for name in _SAME.split()}
 
 # V0 field -> its name in the parameters of the layer types that took it.
 _FIELDS = {
@@ -170,7 +135,7 @@ def _upgrade_layer(old: V0LayerParameter, place: Place, draft: Draft) -> None:
         if name in _TRANSFORMS:
             draft.inner("transform_param", place.where).put(_TRANSFORMS[name], value, places)
         elif old.type in types:
-            draft.inner(_PARAMETERS[old.type], place.where).put(new_name, value, places)
+            draft.inner(f"{_TYPES[old.type].lower()}_param", place.where).put(new_name, value, places)
         elif name == "hdf5_output_param" and old.type == "hdf5_output":
             draft.put(name, value, places)
         else:
