@@ -236,6 +236,7 @@ def test_what_cannot_be_converted_is_refused(
     check_refused(tmp_path, capsys, convert_pairs_lmdb, arguments, message.format(root=root))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_images_that_cannot_be_read_are_left_out_as_in_caffe(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str

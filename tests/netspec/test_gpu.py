@@ -32,6 +32,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
         yield found
 
 
+@pytest.mark.slow
 @needs_fake
 @pytest.mark.usefixtures("_gpu")
 def test_a_fake_gpu_refuses_what_a_gpu_refuses() -> None:
@@ -74,6 +75,7 @@ def test_training_testing_snapshots_and_resuming(
     solver.close()
 
 
+@pytest.mark.slow
 @needs_fake
 @pytest.mark.usefixtures("_gpu")
 def test_two_devices_learn_what_one_does_from_batches_of_twice_the_size(work_in: Callable[..., Path]) -> None:

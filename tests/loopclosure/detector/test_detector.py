@@ -149,6 +149,7 @@ def test_files_that_are_no_detector(tmp_path):
         LoopDetector().save(tmp_path / "no" / "folder.npz")
 
 
+@pytest.mark.slow
 def test_memory_grows_by_doubling():
     detector = LoopDetector(exclude_recent=0)
     arrays = set()

@@ -210,6 +210,7 @@ def test_place_pairs(tmp_path):
         load_place_pairs(tmp_path)
 
 
+@pytest.mark.slow
 def test_new_college_mask():
     from loopclosure.places.masks import read_truth_matrix
 

@@ -201,6 +201,7 @@ def test_naive_example_b() -> None:
     assert location.loglik_new == pytest.approx(-4.481134511, abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("naive", [False, True])
 @pytest.mark.parametrize("motion", [False, True])
 def test_version_2_is_version_1_that_samples_every_training_image_once(naive: bool, motion: bool) -> None:
@@ -216,6 +217,7 @@ def test_version_2_is_version_1_that_samples_every_training_image_once(naive: bo
         np.testing.assert_allclose(np.ptp(one.loglik - two.loglik) if len(one.loglik) else 0.0, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [

@@ -76,6 +76,7 @@ def test_words_are_counted() -> None:
     assert len(vocabulary) == 5
 
 
+@pytest.mark.slow
 def test_kmeans_finds_clusters_and_follows_the_seed() -> None:
     heaps = unit_vectors(10, 16, seed=4)
     points = np.repeat(heaps, 200, axis=0) + np.random.default_rng(0).normal(0, 0.01, (2000, 16)).astype(np.float32)
@@ -100,6 +101,7 @@ def founders_one_by_one(descriptors: np.ndarray, radius: float) -> list[int]:
     return chosen
 
 
+@pytest.mark.slow
 def test_founders_are_those_of_the_plain_loop() -> None:
     descriptors = unit_vectors(600)
     np.testing.assert_array_equal(founders(descriptors, 0.6), founders_one_by_one(descriptors, 0.6))

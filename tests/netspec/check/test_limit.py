@@ -255,6 +255,7 @@ def test_a_container_has_less_memory(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert limits.memory() >= machine
 
 
+@pytest.mark.slow
 def test_a_training_that_fits_goes_on() -> None:
     Path("net.prototxt").write_text(DUMMY)
     assert load_solver("solver.prototxt", limit=600 * MIB).net.need.tops == 4 * 64_000_000 + 4

@@ -65,6 +65,7 @@ def test_every_net_is_built_as_exact_as_asked_for(
 # train
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [

@@ -86,6 +86,7 @@ def test_safetensors(net: Net, run: Run) -> None:
     np.testing.assert_array_equal(found["conv.0"], net.params["conv"][0].detach().numpy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["onnx", "torch", "safetensors"])
 def test_the_same_bytes_are_written_twice(form: str, net: Net, run: Run) -> None:
     """Twelve hash tables have the order of their metadata by chance only; a file that is read back has all of it."""

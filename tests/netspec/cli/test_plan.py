@@ -20,6 +20,7 @@ def test_the_plan_names_what_runs_together(run: Callable[..., Any]) -> None:
     assert any("passes: fold, fuse, skip, pack; bfloat16 on this CPU:" in line for line in lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("passes", "steps"), [("skip", 127), ("none", None)])
 def test_passes_are_switched(run: Callable[..., Any], passes: str, steps: int | None) -> None:
     out = run("check", DEPLOY, "--plan", "--passes", passes).out

@@ -226,6 +226,7 @@ CONSTRAINTS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("limits", "meets"), CONSTRAINTS)
 def test_windows_meet_their_constraint(tmp_path: Path, limits: str, meets: Callable[..., bool]) -> None:
     """The image shows its own coordinates, so that the window can be read from it."""

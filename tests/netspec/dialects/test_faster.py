@@ -133,6 +133,7 @@ def test_regions_that_show_an_object_are_moved_onto_it(build: Build) -> None:
         assert (outer[k] == weights).all()
 
 
+@pytest.mark.slow
 def test_proposals_of_the_python_layer_are_the_dialects(build: Build) -> None:
     text = PYTHON.format("rpn.proposal_layer", "ProposalLayer", "'feat_stride': 16")
     torch.manual_seed(1)

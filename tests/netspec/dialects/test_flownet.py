@@ -53,6 +53,7 @@ def weight(kind: str, x: float) -> float:
     return near if x <= 1 else far if x < 2 else 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["LINEAR", "CUBIC", "NEAREST"])
 @pytest.mark.parametrize(("height", "width", "antialias"), [(13, 17, True), (3, 4, True), (3, 4, False), (4, 15, True)])
 def test_maps_are_resampled(build: Build, kind: str, height: int, width: int, antialias: bool) -> None:

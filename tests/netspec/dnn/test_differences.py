@@ -107,6 +107,7 @@ def test_an_input_is_scaled_once() -> None:
     np.testing.assert_array_equal(net.forward("conv2"), first)
 
 
+@pytest.mark.slow
 def test_detections_without_keep_top_k() -> None:
     text = (HERE / "detect.prototxt").read_text()
     net = dnn.readNetFromCaffe(text.replace("keep_top_k: 40", "").encode(), HERE / "detect.caffemodel")

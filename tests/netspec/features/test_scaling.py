@@ -78,6 +78,7 @@ def colors(run: Callable[..., Any]) -> Path:
     return Path("images")
 
 
+@pytest.mark.slow
 def test_extract_and_the_describer_take_the_steps(run: Callable[..., Any], colors: Path):
     words = ["extract", "--model", "net.prototxt", "--blob", "p", "--out", "f.npz"]
     steps = ["--mean", "1,2,3", "--scale", "0.5", "--raw-scale", "2", "--swap"]

@@ -59,6 +59,7 @@ def geometry_text(kernel: tuple, stride: tuple, pad: tuple, dilation: tuple) -> 
     return " ".join(map(repeated, names, (kernel, stride, pad, dilation)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
 @pytest.mark.parametrize("axes", [1, 2, 3])
 def test_filters_agree_with_plain_loops_at_random_settings(build, kind: str, axes: int) -> None:
@@ -216,6 +217,7 @@ def test_another_batch_or_map_size_is_taken_as_it_comes(build) -> None:
         layer.run(torch.randn(2, 4, 6, 6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [1, 2, 3, 4])
 def test_im2col_agrees_with_plain_loops_at_random_settings(build, axes: int) -> None:
     random = np.random.default_rng(axes)

@@ -17,7 +17,7 @@ TOLERANCE = 1e-5  # of the largest element
 REAL_GPU = 1e-4  # likewise: its libraries choose among algorithms that round differently
 
 
-@pytest.mark.parametrize("device", ["cpu", *GPUS])
+@pytest.mark.parametrize("device", ["cpu", *(pytest.param(name, marks=pytest.mark.slow) for name in GPUS)])
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
 def test_layer_computes_what_caffe_computed(
     folder: Path, device: str, record_property: Callable[[str, object], None]
@@ -47,6 +47,7 @@ def assert_close(
     return most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
 def test_a_run_without_gradients_computes_the_same(folder: Path) -> None:
     case = LayerCase(folder)

@@ -95,6 +95,7 @@ def test_pooling_agrees_with_plain_loops_at_random_settings(build, method: str) 
     assert empty_windows > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [np.nan, -np.inf, np.inf])
 def test_nan_and_minus_infinity_never_win_a_maximum(build, value: float) -> None:
     random = np.random.default_rng(3)

@@ -148,6 +148,7 @@ def test_each_segment_is_compiled_once(net_of: Callable[..., Net], monkeypatch: 
     assert len(made) == len(net.eager.segments)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("traced_only")
 def test_batches_of_other_shapes_run_layer_by_layer(net_of: Callable[..., Net]) -> None:
     compiled, plain = (net_of(POOLED, compiled=compiled, **TRAINED) for compiled in (True, False))

@@ -17,6 +17,7 @@ def net(net_of: Callable[..., caffe.Net]) -> caffe.Net:
     return net
 
 
+@pytest.mark.slow
 def test_memory_outlives_the_net(net: caffe.Net) -> None:
     net.forward()
     net.backward()
