@@ -51,14 +51,6 @@ def test_activation_gradient_is_the_derivative(build, gradcheck, text: str) -> N
     gradcheck(build(text, (3, 2)), torch.tensor([[-3.0, -0.4], [0.2, 1.0], [2.5, 4.0]]))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("text", ORACLES)
-def test_activation_takes_batches_of_other_sizes(build, text: str) -> None:
-    layer = build(text, (2, 4))
-    assert layer.run(X.reshape(4, 2))[0].shape == (4, 2)
-    assert layer.top_shapes == [(4, 2)]
-
-
 def gradient_at(layer, x: float) -> float:
     bottom = torch.tensor([[x]], requires_grad=True)
     layer.run(bottom)[0].sum().backward()

@@ -1,4 +1,4 @@
-"""One net, several threads: each gets its own numbers."""
+"""One net, several threads: each gets its own numbers, by pycaffe too."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import netspec.pycaffe as caffe
 from netspec.net.net import Net
 
 TEXT = """
@@ -44,3 +45,29 @@ def test_threads_that_share_a_net_get_their_own_numbers(net_of: Callable[..., Ne
                 torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-5)
 
     in_threads(run)
+
+
+def test_threads_that_share_a_net_of_pycaffe_get_their_own_numbers(tmp_path) -> None:
+    (tmp_path / "net.prototxt").write_text(TEXT)
+    net = caffe.Net(str(tmp_path / "net.prototxt"), caffe.TEST)
+    images = [inputs(3 * k + 1) for k in range(COUNT)]
+    expected = [net.forward(data=image)["feat"].copy() for image in images]
+
+    def run(k: int) -> None:
+        found = net.forward(data=images[k])["feat"]
+        for _ in range(3):
+            np.testing.assert_array_equal(found, expected[k])
+
+    in_threads(run)
+
+
+def test_a_backward_pass_after_that_of_another_thread_is_refused(tmp_path) -> None:
+    (tmp_path / "net.prototxt").write_text(TEXT.replace("dim: 2", "dim: 1", 1) + "force_backward: true")
+    net = caffe.Net(str(tmp_path / "net.prototxt"), caffe.TEST)
+    net.forward(data=inputs(0))
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(net.forward, data=inputs(3)).result()
+        with pytest.raises(RuntimeError, match="another thread has run this net since"):
+            net.backward()
+        net.forward(data=inputs(0))
+        net.backward()
