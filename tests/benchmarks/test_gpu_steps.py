@@ -17,7 +17,7 @@ from fake_gpu import NAME, POSSIBLE, fake_gpu
 from paths import ROOT
 
 SCRIPT = ROOT / "benchmarks" / "gpu_steps"
-SMALL = {"GPU": "", "BATCH": "2", "ITERATIONS": "1", "TRAIN": "4", "VALIDATION": "4", "FRAMES": "60"}
+SMALL = {"GPU": "", "BATCH": "2", "ITERATIONS": "1", "TRAIN": "4", "VALIDATION": "4", "FRAMES": "20"}
 
 
 @pytest.mark.slow
