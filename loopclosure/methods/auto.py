@@ -118,7 +118,9 @@ def answer(
         few = np.zeros(len(match), bool)
         evidence = np.zeros(len(match))
         for query in progress(np.flatnonzero(there), "verification", int(np.count_nonzero(there))):
-            for reference in dict.fromkeys((int(match[query]), int(single[query]))):
+            # Lamps of a tunnel repeat: one image that is verified does not overrule a sequence that is accepted.
+            other = match if accepted[query] else single
+            for reference in dict.fromkeys((int(match[query]), int(other[query]))):
                 agreement = agree(int(query), reference)
                 inliers[query] = check.enough(agreement)
                 evidence[query] = check.evidence(agreement)

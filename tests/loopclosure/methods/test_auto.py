@@ -125,6 +125,25 @@ def test_a_loop_ends_with_its_last_verified_match():
     assert not found.accepted[90:].any()
 
 
+def test_a_sequence_is_not_overruled_by_one_image_that_repeats():
+    """The lamps of a tunnel: each third image is verified with the next lamp, which it looks like most."""
+    road = drive(150, 6)
+    scores = alike(again(road, 1.0, 7), road)
+    lamps = np.arange(60, 90, 3)
+    scores[lamps, lamps + 6] = 1
+    good, bad = Agreement(60, 50, 20), Agreement(40, 9, 20)
+    found = answer(
+        scores,
+        everything(scores),
+        True,
+        0.99,
+        GeometricCheck(),
+        lambda q, r: good if r - q == 6 * (q in lamps) else bad,
+    )
+    assert np.all(np.abs(found.match - np.arange(150))[found.accepted] <= 3)
+    assert np.count_nonzero(found.accepted[60:90]) > 25
+
+
 @pytest.mark.parametrize("inliers", [20, 28])
 def test_a_facade_whose_windows_repeat_is_no_loop(inliers):
     scores = alike(drive(150, 1), drive(120, 101))
