@@ -26,6 +26,7 @@ from loopclosure.methods.base import Images, MethodResult, earlier
 from loopclosure.methods.decoys import search, settings
 from loopclosure.places.frames import read_bgr, read_gray
 from loopclosure.progress import silent
+from netspec.files.whole_file import whole_file
 
 ENOUGH = 0.7  # of the best setting's recall
 
@@ -89,7 +90,8 @@ class Kept:
     def save(self) -> None:
         """Write the file."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.write_bytes(pickle.dumps((self.rows, self.found, self.best)))
+        with whole_file(self.path) as unfinished:
+            unfinished.write_bytes(pickle.dumps((self.rows, self.found, self.best)))
 
 
 @dataclass
@@ -164,19 +166,24 @@ def _recall(scores: np.ndarray, truth: Any) -> float:
 def run(data: Path, work: Path, only: Sequence[str], say: Callable[[str], None]) -> list[Result]:
     """Measure all drives, or those of some families; what was measured is added to ``work``/settings.json."""
     file = work / "settings.json"
-    results = {}
-    if file.exists():
-        results = {f"{r['family']}/{r['kind']}": Result(**r) for r in json.loads(file.read_text())}
     kept: Kept | None = None
     for drive in drives(data, work, only):
         path = work / "kept" / f"{drive.family}.pickle"
         if kept is None or kept.path != path:
             kept = Kept(path)
-        results[drive.name] = measure(drive, kept)
-        say(line(results[drive.name]))
+        result = measure(drive, kept)
+        say(line(result))
         kept.save()
-        file.write_text(json.dumps([asdict(result) for result in results.values()], indent=1), encoding="utf-8")
-    return list(results.values())
+        results = {**_stored(file), drive.name: result}  # another process may have added to it
+        with whole_file(file) as unfinished:
+            unfinished.write_text(json.dumps([asdict(each) for each in results.values()], indent=1), encoding="utf-8")
+    return list(_stored(file).values())
+
+
+def _stored(file: Path) -> dict[str, Result]:
+    """Return what was measured before, by drive."""
+    found = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
+    return {f"{each['family']}/{each['kind']}": Result(**each) for each in found}
 
 
 def line(result: Result) -> str:

@@ -1,9 +1,11 @@
 """tools/bench settings and tables: drives whose loops are known, and figures between their markers."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pytest
 
 from benchmarks import drives, settings, tables
 
@@ -48,3 +50,17 @@ def test_what_auto_should_reach() -> None:
     assert [r.good for r in (silent, right, wrong)] == [False, True, False]
     said = settings.summary([silent, right, wrong])
     assert said == ("2 of 3 drives with a precision of 0.99; 2 of 3 with 0.7 of the best recall; on 1 auto cannot tell")
+
+
+def test_two_runs_in_one_folder_keep_the_results_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def drives_of(data: Path, work: Path, only: list[str]) -> list[SimpleNamespace]:
+        return [SimpleNamespace(family=name, kind="laps", name=f"{name}/laps") for name in only]
+
+    def measured(drive: SimpleNamespace, kept: settings.Kept) -> settings.Result:
+        if drive.family == "a":  # the other run ends meanwhile
+            settings.run(tmp_path, tmp_path, ["b"], print)
+        return settings.Result(drive.family, drive.kind, 9, 8, 1.0, 0.8, 0.9, "", [])
+
+    monkeypatch.setattr(settings, "drives", drives_of)
+    monkeypatch.setattr(settings, "measure", measured)
+    assert {result.family for result in settings.run(tmp_path, tmp_path, ["a"], print)} == {"a", "b"}
