@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from netspec.errors import SpecError, Where
+from netspec.layers.fused import has_bfloat16
 from netspec.layers.reading import Scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
@@ -30,7 +31,7 @@ from netspec.solver.checks import check_prefix, check_settings, fields_without_e
 from netspec.solver.extra import Remembered
 from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.options import TrainingOptions, choose_device
-from netspec.solver.precision import FP16
+from netspec.solver.precision import BF16, FP16
 from netspec.solver.replicas import Replicas
 from netspec.solver.tally import Outputs
 from netspec.solver.threads import dependence
@@ -193,7 +194,9 @@ class Training:
         if self.device.type == "cpu" and (said := waiting.too_late(torch.get_num_threads())):
             log.info("solver.cpp:57", said)
         if self.options.precision == FP16 and self.device.type == "cpu":
-            log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs")
+            log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs that have it")
+        if self.options.precision == BF16 and self.device.type == "cpu" and has_bfloat16() is False:
+            log.logger.warning("precision bf16: this CPU has no instructions for it, so it is slower than fp32")
 
     def check_inputs(self) -> None:
         """Raise SpecError where a net has inputs: nobody would fill them."""

@@ -10,6 +10,7 @@ import torch
 
 from golden_cases import train
 from netspec.errors import SpecError
+from netspec.solver import training
 from netspec.solver.precision import BF16, FIRST_SCALE, FP16, FP32, PATIENCE, TF32, LossScale, computing
 from netspec.solver.solver import load_solver
 
@@ -62,6 +63,21 @@ def test_an_unknown_precision_is_refused(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     with pytest.raises(ValueError, match="found precision 'fp8', expected 'fp32', 'tf32', 'bf16', 'fp16'"):
         load_solver("sgd_step/solver.prototxt", precision="fp8")
+
+
+@pytest.mark.parametrize(("precision", "has_it", "said"), [(BF16, False, 1), (BF16, True, 0), (FP32, False, 0)])
+def test_a_cpu_without_bf16_is_told_of(
+    precision: str,
+    has_it: bool,
+    said: int,
+    work_in: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    work_in("train/sgd_step")
+    monkeypatch.setattr(training, "has_bfloat16", lambda: has_it)
+    load_solver("sgd_step/solver.prototxt", precision=precision).close()
+    assert caplog.text.count("precision bf16: this CPU has no instructions for it, so it is slower than fp32") == said
 
 
 def test_the_loss_scale_is_halved_by_an_overflow_and_doubled_by_patience() -> None:
