@@ -6,13 +6,16 @@ Caffe: src/caffe/util/math_functions.cpp
 from __future__ import annotations
 
 import ctypes
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from importlib import import_module
+from importlib.machinery import PathFinder
+from importlib.util import module_from_spec
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from threadpoolctl import ThreadpoolController
 
@@ -24,13 +27,21 @@ CORE_TYPE = "OPENBLAS_CORETYPE"  # the environment variable by which OpenBLAS ch
 
 @cache
 def _library(name: str) -> Any:
-    """Return SciPy's BLAS, ``blas`` for arrays or ``cython_blas`` for addresses, with Caffe's kernels, for AVX-512.
+    """Return SciPy's BLAS, ``_fblas`` for arrays or ``cython_blas`` for addresses, with Caffe's kernels, for AVX-512.
 
     OpenBLAS chooses others on some newer CPUs. What the environment says stays; if SciPy's BLAS was loaded before, so
-    do its kernels. Loading takes half a second, for which nets without exact sums need not wait.
+    do its kernels. Only this module of ``scipy.linalg`` is loaded: all of it takes ten times as long.
     """
-    with environment({CORE_TYPE: CAFFES} if torch.backends.cpu.get_cpu_capability() == "AVX512" else {}):
-        return import_module(f"scipy.linalg.{name}")
+    name = f"scipy.linalg.{name}"
+    if name not in sys.modules:
+        spec = PathFinder.find_spec(name, [f"{folder}/linalg" for folder in scipy.__path__])
+        assert spec, f"this SciPy has no {name}"
+        assert spec.loader
+        with environment({CORE_TYPE: CAFFES} if torch.backends.cpu.get_cpu_capability() == "AVX512" else {}):
+            module = module_from_spec(spec)
+            spec.loader.exec_module(module)
+        sys.modules[name] = module
+    return sys.modules[name]
 
 
 _IN_DOUBLE = 32  # OpenBLAS' dot sums up fewer products than this in double, one by one
@@ -47,7 +58,7 @@ def array(values: torch.Tensor) -> np.ndarray:
 
 
 def _routine(name: str, values: np.ndarray) -> Callable[..., Any]:
-    return getattr(_library("blas"), values.dtype.char.replace("f", "s") + name)
+    return getattr(_library("_fblas"), values.dtype.char.replace("f", "s") + name)
 
 
 def gemm_routine(values: np.ndarray) -> Callable[..., Any]:
@@ -202,6 +213,6 @@ def other_kernels() -> str:
 @cache
 def _pools() -> list[Any]:
     """Return the OpenBLAS that SciPy brings, or every one there is where SciPy's has no place of its own."""
-    _library("blas")  # so that its OpenBLAS is there
+    _library("_fblas")  # so that its OpenBLAS is there
     pools = ThreadpoolController().select(internal_api="openblas").lib_controllers
     return [pool for pool in pools if "scipy.libs" in pool.filepath] or pools
