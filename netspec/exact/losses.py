@@ -28,17 +28,32 @@ def softmax(scores: torch.Tensor) -> torch.Tensor:
 def bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return what computes :func:`softmax` of float32 scores of one shape, in memory of its own, with one thread."""
     p = torch.empty(shape)
-    values, sums = p.numpy(), torch.empty(shape[0], 1, shape[2])
+    largest, sums = torch.empty(2, shape[0], 1, shape[2])
+    values, greatest, totals = p.numpy(), largest.numpy(), sums.numpy()
     add_up, ones = gemv_routine(values), np.ones(shape[1], np.float32)
-    rows = [(each.T, total[0]) for each, total in zip(values, sums.numpy(), strict=True)]
+    rows = [(each.T, total[0]) for each, total in zip(values, totals, strict=True)]
 
     def run(scores: torch.Tensor) -> torch.Tensor:
-        torch.sub(scores, scores.amax(1, keepdim=True), out=p)  # never above 0: see libm.exp
-        np.copyto(values, np.real(np.exp(values.astype(np.complex64))))
-        sums.zero_()
+        np.maximum.reduce(scores.numpy(), 1, out=greatest, keepdims=True)
+        torch.sub(scores, largest, out=p)  # never above 0: see libm.exp
+        np.copyto(values, np.exp(values.astype(np.complex64)).real)
+        totals.fill(0)
         for each, total in rows:
             add_up(1.0, each, ones, 1.0, total, 0, 1, 0, 1, 0, 1)
         return p.div_(sums)
+
+    return run
+
+
+def bound_cross_entropy(count: int, divisor: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return what computes the sum of -log p of so many float32 numbers, one after the other, by ``divisor``, ()."""
+    one, logs, loss = torch.ones(()), torch.empty(count), torch.empty(())
+    values, result = logs.numpy(), loss.numpy()
+
+    def run(p: torch.Tensor) -> torch.Tensor:
+        torch.special.xlogy(one, p.view(-1), out=logs)  # see libm.log
+        np.divide(-np.add.accumulate(values)[-1], np.float32(divisor), out=result)
+        return loss
 
     return run
 

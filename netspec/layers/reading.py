@@ -110,11 +110,6 @@ def changes_itself(layer: Layer) -> bool:
     return getattr(layer, "remembers", False)
 
 
-def waited(layers: Sequence[Layer]) -> float:
-    """Return how many seconds forward passes have waited for records."""
-    return sum(layer.waited for layer in layers if isinstance(layer, Waits))
-
-
 def bytes_ahead(layer: Layer) -> int:
     """Return the bytes of the batches that a layer reads before they are asked for."""
     return layer.ahead if isinstance(layer, Waits) else 0

@@ -74,6 +74,7 @@ class Net(torch.nn.Module):
         self.need, self.random = made.need, made.random
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
+        self._fed = [layer for layer in self.layers if isinstance(layer, Fed)]
         self._given = [
             v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
         ]
@@ -258,9 +259,7 @@ class Net(torch.nn.Module):
 
     def missing_inputs(self) -> Iterator[SpecError]:
         """Yield an error for each layer that needs inputs: a solver gives no inputs to its nets."""
-        for layer in self.layers:
-            if isinstance(layer, Fed) and (fault := layer.missing_input()):
-                yield fault
+        yield from filter(None, [layer.missing_input() for layer in self._fed])
 
     def restart_data(self) -> None:
         """Make every data layer start again at its first record."""

@@ -19,7 +19,7 @@ from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
 from netspec.graph.options import BuildOptions
-from netspec.layers.reading import reads_data, waited
+from netspec.layers.reading import Waits, reads_data
 from netspec.proto.text import parse_solver
 from netspec.solver import update
 from netspec.solver.checks import check_prefix
@@ -120,6 +120,7 @@ class Solver(Tested):
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self._scale = LossScale(self.options.precision)
+        self._waiting = [layer for layer in self.net.layers if isinstance(layer, Waits)]
 
     @property
     def learning_rate(self) -> float:
@@ -270,4 +271,4 @@ class Solver(Tested):
         self._displayed = (now, self.iteration)
 
     def _seconds_waited(self) -> float:
-        return waited(self.net.layers)
+        return sum(layer.waited for layer in self._waiting)

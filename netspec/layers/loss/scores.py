@@ -13,8 +13,7 @@ from google.protobuf.message import DecodeError
 
 from netspec.data.blobs import to_array
 from netspec.exact import SMALL_ITEM, libm
-from netspec.exact.blas import sum_in_order
-from netspec.exact.losses import Infogain, bound_softmax, logarithm, softmax
+from netspec.exact.losses import Infogain, bound_cross_entropy, bound_softmax, logarithm, softmax
 from netspec.files.limits import read_bytes
 from netspec.layers.base import Shape
 from netspec.layers.exporting import refusal
@@ -117,20 +116,21 @@ class SoftmaxWithLoss(SoftmaxLoss):
             return None
         shape, tops, room = self.bottom_shapes[0], self.num_tops, Room()
         split, flat = (self.outer, self.classes, self.inner), (self.outer, 1, self.inner)
-        divisor = normalizer(self.normalization, self.outer, self.inner, None)
+        divisor = float(normalizer(self.normalization, self.outer, self.inner, None))
         exact = self.is_exact(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM)
         minus_one = torch.tensor(-1.0).expand(flat)
         normalize = bound_softmax(split) if exact else partial(F.softmax, dim=1)
-        p = label = torch.empty(0)
+        sum_up = bound_cross_entropy(math.prod(flat), divisor) if exact else lambda p: (-p.log()).sum() / divisor
+        label = torch.empty(flat, dtype=torch.long)
+        p, classes = torch.empty(0), label.numpy()
 
         def forward(scores: torch.Tensor, labels: torch.Tensor) -> Any:
-            nonlocal p, label
-            label = labels.reshape(flat).long()
-            self.valid(label, None)
+            nonlocal p
+            label.copy_(labels.reshape(flat))
+            if classes.min() < 0 or classes.max() >= split[1]:
+                self.valid(label, None)
             p = normalize(scores.reshape(split))
-            chosen = p.gather(1, label).clamp_(min=FLT_MIN)
-            losses = -(libm.log(chosen) if exact else chosen.log())
-            loss = (sum_in_order(losses.flatten()) if exact else losses.sum()) / divisor
+            loss = sum_up(p.gather(1, label).clamp_(min=FLT_MIN))
             return (loss, p.reshape(shape))[:tops]
 
         def backward(diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
