@@ -24,7 +24,7 @@ from typing import IO, Any
 
 from loopclosure.report.table_one import read_runs, text_table, write_report
 from netspec.errors import SpecError, Where
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.graph.filter import filter_net, with_state
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, read_solver
@@ -132,8 +132,7 @@ def compare(
             _netspec([*words, *_on(gpu)], out / f"{entry.stem}.log", say, step, entry.length)
         runs.append(_judged(entry, out, gpu.replace("all", "0").partition(",")[0], say))
     file = out / "runs.json"
-    with whole_file(file) as unfinished:
-        unfinished.write_text(json.dumps(runs, indent=1))
+    write_whole(file, json.dumps(runs, indent=1))
     judged = read_runs(file)
     return text_table(judged), write_report(judged, out)
 

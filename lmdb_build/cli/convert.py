@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from lmdb_build.cli.bar import bar
 from lmdb_build.databases import (
     Entry,
     Options,
@@ -25,6 +24,7 @@ from netspec.data.mean import channel_means, compute_mean, write_mean
 from netspec.errors import Where
 from netspec.terminal import log
 from netspec.terminal.commands import Commands, WrongUsage, refuse
+from netspec.terminal.progress import bar
 
 
 def add_to(commands: Commands) -> None:

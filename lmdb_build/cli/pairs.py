@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from dataclasses import replace
 from pathlib import Path
 
-from lmdb_build.cli.bar import bar
 from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_list import (
     CAMERAS,
@@ -30,6 +28,7 @@ from loopclosure.places.source import POSES, TOPICS, Source, read_source
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
 from netspec.terminal.commands import Commands, WrongUsage, refuse
 from netspec.terminal.options import above_zero, seed
+from netspec.terminal.progress import bar, warn
 
 SEQUENCES = ("", *LAYOUTS)
 KINDS = {
@@ -139,7 +138,7 @@ def _pairs(arguments: argparse.Namespace) -> None:
         hard_share=arguments.hard_share,
         warp_share=1.0 if arguments.sources[0].kind == "singles" else arguments.warp_share,
     )
-    lists = build_lists(source, plan, root, arguments.out, print, _warn, bar)
+    lists = build_lists(source, plan, root, arguments.out, print, warn, bar)
     print(f"wrote {', '.join(map(str, lists.values()))}; the names of images in them are relative to {root}/")
 
 
@@ -223,7 +222,7 @@ def _pose_source(
     for (_, folder, _), sequence in zip(named, sequences, strict=True):
         print(f"{folder}: {len(sequence)} images with a pose, {sequence.dropped} without one left out")
         for doubt in sequence.doubts:
-            _warn(doubt)
+            warn(doubt)
     rule = PoseRule(
         max_distance_m=arguments.max_distance,
         max_angle_deg=arguments.max_angle,
@@ -235,10 +234,6 @@ def _pose_source(
     scenes = Scenes(tuple(arguments.same_scene), tuple(arguments.same_frame), arguments.different_scenes)
     folders = [Path(os.path.relpath(folder.resolve(), root.resolve())).as_posix() for _, folder, _ in named]
     return PoseSource(sequences, folders, rule, scenes)
-
-
-def _warn(doubt: str) -> None:
-    print(f"warning: {doubt}", file=sys.stderr)
 
 
 def _names(text: str) -> tuple[str, ...]:

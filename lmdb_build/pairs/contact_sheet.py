@@ -13,12 +13,13 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
 from netspec.errors import SpecError
 from netspec.files.opencv import cv2
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 240, 180
 BORDER, CAPTION, TITLE = 6, 40, 44
 PAPER, INK = (255, 255, 255), (30, 30, 30)
 SIDES = ((1, "the same place", (60, 150, 40)), (0, "other places", (50, 50, 200)))
+LONGEST = 32  # characters of a caption
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -58,8 +59,7 @@ def write_contact_sheet(list_file: Path, root: Path, out: Path, rows: int = 6, s
         raise InputError("cannot be written as a picture; a suffix such as .png says its format", out)
     with suppress(OSError):  # said when the file is written
         out.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(out) as unfinished:
-        unfinished.write_bytes(picture.tobytes())
+    write_whole(out, picture.tobytes())
 
 
 def _title(text: str, color: tuple[int, int, int]) -> NDArray:
@@ -99,7 +99,7 @@ def _fitted(picture: NDArray) -> NDArray:
     return frame
 
 
-def _caption(name: str, longest: int = 32) -> list[str]:
+def _caption(name: str) -> list[str]:
     """Return two lines: the end of the folder's name, the end of the file's name."""
     folder, _, file = name.rpartition("/")
-    return [text if len(text) <= longest else ".." + text[-(longest - 2) :] for text in (folder, file)]
+    return [text if len(text) <= LONGEST else ".." + text[2 - LONGEST :] for text in (folder, file)]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 ROOT_FOLDER = (
     "root folder"  # this setting is the folder that image names are relative to, itself relative to the list's folder
@@ -47,8 +47,7 @@ def write_pair_list(path: Path, pairs: Iterable[tuple[str, str, int]], settings:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", path) from error
-    with whole_file(path) as unfinished:
-        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="surrogateescape")
+    write_whole(path, "\n".join(lines) + "\n", "surrogateescape")
 
 
 def read_pair_list(path: Path) -> list[ListedPair]:

@@ -34,7 +34,7 @@ from loopclosure.places.trajectory import (
     write_rgb_list,
 )
 from netspec.files.opencv import cv2
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 Array = NDArray[np.float64]
 
@@ -120,8 +120,7 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     camera = walk.camera
     calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "
     calibration += f"{camera.center[0]:g} {camera.center[1]:g} {camera.width} {camera.height}\n"
-    with whole_file(folder / "calibration.txt") as unfinished:
-        unfinished.write_text(calibration, encoding="utf-8")
+    write_whole(folder / "calibration.txt", calibration)
     write_groundtruth(
         folder / "groundtruth.txt", Trajectory(walk.start_s + pose_times, poses.positions, poses.quaternions)
     )

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.cli.data_set import sequence, typed
-from loopclosure.cli.run import show_progress, warn
 from loopclosure.closing.close import Closed, close, summary, write_closed
 from loopclosure.closing.drift import drifted
 from loopclosure.closing.g2o import read_pose_graph, solve_pose_graph, write_solution
@@ -23,6 +22,7 @@ from loopclosure.places.source import FRAMES, POSES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, write_closed_paths
 from netspec.terminal.commands import Commands, WrongUsage
 from netspec.terminal.options import seed
+from netspec.terminal.progress import bar, warn
 
 # What belongs to frames, and means nothing to --graph.
 OF_FRAMES = (
@@ -82,7 +82,7 @@ def _close(a: argparse.Namespace) -> None:
         raise InputError(f"does not say what its camera is; give --camera {intrinsics.FORM}", frames.source)
     odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
     frames = frames.taken(source.selection())
-    loops = measure(frames, read_loops(a.loops, frames.names), camera, show_progress)
+    loops = measure(frames, read_loops(a.loops, frames.names), camera, bar)
     closed = close(odometry, loops, frames.poses)
     write_closed(out, closed, frames.stamps, frames.names)
     # Drawing takes seconds to import, which the other commands need not wait for.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loopclosure.cli.run import show_progress, warn
 from loopclosure.detector.run import Recording, open_recording
 from loopclosure.errors import InputError
 from loopclosure.places import datasets
@@ -19,6 +18,7 @@ from loopclosure.places.source import FRAMES, POSES, TOPICS, Kinds, Source, read
 from loopclosure.places.truth import Exclusion
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.options import above_zero
+from netspec.terminal.progress import bar, warn
 
 SEQUENCE = (*FRAMES, *POSES, "references")
 KINDS = {
@@ -98,7 +98,7 @@ def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence
     poses, path = source.pose_choice(), source.path
     if layout in RECORDED or (not layout and is_recording(path)):
         topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
-        path, said = extract(path, Path(out) / "frames", *topics, show_progress)
+        path, said = extract(path, Path(out) / "frames", *topics, bar)
         print(said)
         layout = "images"
     read = read_sequence(path, layout, poses=poses)
@@ -172,7 +172,7 @@ def recording_of(text: str, frames: Path) -> Recording:
     source = typed(text, {"": (*FRAMES, *TOPICS)})
     path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
     if is_bag(path):
-        path, said = extract(path, frames, topic, pose_topic, show_progress)
+        path, said = extract(path, frames, topic, pose_topic, bar)
         print(said)
     elif topic or pose_topic:
         raise WrongUsage(f"{source}: topics belong to bags")

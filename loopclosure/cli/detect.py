@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from loopclosure.cli.data_set import recording_of, typed
-from loopclosure.cli.run import show_progress, warn
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -25,8 +24,9 @@ from loopclosure.places.live import live_frames
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import Commands, WrongUsage
+from netspec.terminal.progress import bar, warn
 
 # The detector's settings that --resume takes from the saved one.
 SETTINGS = (
@@ -121,18 +121,17 @@ def _detect(a: argparse.Namespace) -> None:
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.precision is None else a.precision
         odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None
-        results, found = whole_drive(detector, recording, features, precision, show_progress, odometry)
+        results, found = whole_drive(detector, recording, features, precision, bar, odometry)
         said = [*found.reasons, found.counts()]
     else:
-        results = run.run_detector(detector, recording, features, show_progress)
+        results = run.run_detector(detector, recording, features, bar)
         said = [run.verdicts_said(results)]
     if recording is not None:
         names += recording.names
         if a.rerun:
-            write_detected(Path(a.rerun), recording, results, show_progress)
+            write_detected(Path(a.rerun), recording, results, bar)
     write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names)
-    with whole_file(out / "chosen.txt") as unfinished:
-        unfinished.write_text("\n".join(said) + "\n", encoding="utf-8")
+    write_whole(out / "chosen.txt", "\n".join(said) + "\n")
     loops = sum(result.accepted is not None for result in results)
     print("\n".join(said))
     print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}")

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from loopclosure import evaluate
 from loopclosure.cli.data_set import add_data_set, data_set
-from loopclosure.cli.run import show_progress
 from loopclosure.errors import InputError
 from loopclosure.methods.base import METHODS, MethodContext
 from loopclosure.places.frames import image_paths
 from loopclosure.places.source import FRAMES, Source, read_source
 from netspec.terminal.commands import Commands
 from netspec.terminal.options import seed
+from netspec.terminal.progress import bar
 
 
 def add_to(commands: Commands) -> None:
@@ -62,7 +62,7 @@ def _evaluate(a: argparse.Namespace) -> None:
         images = image_paths(source.path)
         train += [images[i] for i in source.selection().numbers(len(images))]
     training = f"{len(train)} images of {', '.join(t.path.name for t in a.train)}" if train else "no training images"
-    evaluation = evaluate.evaluate(data, methods, train, training, show_progress)
+    evaluation = evaluate.evaluate(data, methods, train, training, bar)
     page = write_report(evaluation, a.out, a.title, a.command_line)
     print(measures_text(evaluation))
     print(f"report: {page}")

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from loopclosure.cli.data_set import recording_of
-from loopclosure.cli.run import show_progress
 from loopclosure.detector import run
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe
@@ -15,6 +14,7 @@ from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.map import Map, checked_name
 from loopclosure.detector.visitor import Visitor
 from netspec.terminal.commands import Commands
+from netspec.terminal.progress import bar
 
 INDEX = "exact, faiss, or Milvus: FILE.db or http://HOST:PORT (default: exact)"
 
@@ -52,9 +52,7 @@ def _add(a: argparse.Namespace) -> None:
 def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
     for text in a.source:
         before, number = len(into), len(into.sessions)
-        results = into.add(
-            recording_of(text, Path(a.map) / "frames" / f"{number:06d}"), describe, a.index, show_progress
-        )
+        results = into.add(recording_of(text, Path(a.map) / "frames" / f"{number:06d}"), describe, a.index, bar)
         loops = [result.accepted for result in results if result.accepted is not None]
         between = sum(frame < before for frame in loops)
         said = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
@@ -66,7 +64,7 @@ def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
     recording = recording_of(a.source, out / "frames")
     detector = known.detector(run.load_describe(known.describer), a.index)
-    results: Sequence[LoopResult] = run.run_detector(Visitor(detector), recording, progress=show_progress)
+    results: Sequence[LoopResult] = run.run_detector(Visitor(detector), recording, progress=bar)
     found = [result for result in results if result]
     write_loops_csv(out / "loops.csv", found, recording.stamps, recording.names, detector.stamps, known.names)
     print(run.verdicts_said(results))

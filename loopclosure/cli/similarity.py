@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 
-from loopclosure.cli.run import show_progress
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS, top_k, write_similarity, write_top_k
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
 from netspec.terminal.commands import Commands, WrongUsage
+from netspec.terminal.progress import bar
 
 
 def add_to(commands: Commands) -> None:
@@ -35,7 +35,7 @@ def _similarity(a: argparse.Namespace) -> None:
     if queries.views > 1:
         raise InputError("describes several views of an image; this command compares one", a.features)
     if a.top_k is None:
-        shape = write_similarity(a.out, queries.features, references, a.metric, show_progress)
+        shape = write_similarity(a.out, queries.features, references, a.metric, bar)
         print(f"{shape[0]} x {shape[1]} scores, float32: {a.out}")
         return
     exclusion = Exclusion(a.exclude_frames, a.exclude_seconds) if references is None else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Rel
 from loopclosure.detector.export import LOOP_SIGMAS, write_pose_graph
 from loopclosure.errors import InputError
 from loopclosure.places.trajectory import Trajectory, write_trajectory
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_csv
 
 # The standard deviations of a step of odometry: a share of its length and of its turn, and this much at least.
 STEP_SHARE, STEP_M, TURN_SHARE, TURN_RAD = 0.02, 0.002, 0.02, 0.002
@@ -129,17 +128,14 @@ def write_closed(out: Path, closed: Closed, stamps: np.ndarray | None, names: Se
     kept = [edge for edge, accepted in zip(closed.edges, closed.accepted, strict=True) if accepted]
     edges = [(numbers[e.first], numbers[e.second], e.pose, e.information) for e in [*closed.steps, *kept]]
     write_pose_graph(out / "closed.g2o", dict(zip(numbers, closed.poses, strict=True)), edges)
-    with (
-        whole_file(out / "loops.csv") as unfinished,
-        unfinished.open("w", newline="", encoding="utf-8", errors="surrogateescape") as stream,
-    ):
-        writer = csv.writer(stream)
-        writer.writerow(["query_id", "match_id", "query_name", "match_name", "measured", "inliers", "used"])
-        for loop, accepted in zip(closed.loops, closed.accepted, strict=True):
-            assert loop.relative is not None
-            ends = (loop.query, loop.match)
-            row = [*ends, *(names[i] for i in ends), loop.relative.kind, loop.relative.inliers]
-            writer.writerow([*row, "yes" if accepted else "no"])
+    rows = []
+    for loop, accepted in zip(closed.loops, closed.accepted, strict=True):
+        assert loop.relative is not None
+        ends = (loop.query, loop.match)
+        row = [*ends, *(names[i] for i in ends), loop.relative.kind, loop.relative.inliers]
+        rows.append([*row, "yes" if accepted else "no"])
+    head = ("query_id", "match_id", "query_name", "match_name", "measured", "inliers", "used")
+    write_csv(out / "loops.csv", head, rows, "surrogateescape")
 
 
 def summary(closed: Closed) -> list[str]:

@@ -9,7 +9,6 @@ A graph of two dimensions is one of three whose poses lie in a plane: errors and
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from loopclosure.closing.graph import Edge, Solution, solve, squares_of
 from loopclosure.detector.export import EDGE, EDGE_2D, PLANE, VERTEX, VERTEX_2D, write_pose_graph
 from loopclosure.errors import InputError
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_csv
 
 Array = NDArray[np.float64]
 
@@ -103,11 +102,11 @@ def write_solution(out: Path, graph: PoseGraph, solution: Solution) -> None:
     edges = [(ids[edge.first], ids[edge.second], edge.pose, edge.information) for edge in [*graph.steps, *kept]]
     vertices = dict(zip(ids, solution.poses, strict=True))
     write_pose_graph(out / "closed.g2o", vertices, edges, [ids[row] for row in graph.held], graph.flat)
-    with whole_file(out / "loops.csv") as unfinished, unfinished.open("w", newline="", encoding="ascii") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["first", "second", "chi2", "used"])
-        for edge, square, used in zip(graph.loops, solution.squares, accepted, strict=True):
-            writer.writerow([ids[edge.first], ids[edge.second], f"{square:.6g}", "yes" if used else "no"])
+    rows = [
+        (ids[edge.first], ids[edge.second], f"{square:.6g}", "yes" if used else "no")
+        for edge, square, used in zip(graph.loops, solution.squares, accepted, strict=True)
+    ]
+    write_csv(out / "loops.csv", ("first", "second", "chi2", "used"), rows)
 
 
 def summary(graph: PoseGraph, solution: Solution) -> list[str]:

@@ -8,7 +8,6 @@ matters only for frames that are almost the same.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -19,7 +18,7 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import whole_file, write_csv
 
 METRICS = ("euclidean", "cosine")
 # 1024 x 16384 scores in float32 are 64 MiB, for a sequence of any length.
@@ -204,13 +203,13 @@ def write_similarity(
 
 def write_top_k(path: str | Path, found: TopK) -> None:
     """Write the best references of each query as CSV: query, rank from 1, reference, score."""
-    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["query", "rank", "reference", "score"])
-        for query, (indices, scores) in enumerate(zip(found.indices, found.scores, strict=True)):
-            for rank, (reference, score) in enumerate(zip(indices, scores, strict=True), start=1):
-                if reference >= 0:
-                    writer.writerow([query, rank, reference, f"{score:.9g}"])
+    rows = [
+        (query, rank, reference, f"{score:.9g}")
+        for query, (indices, scores) in enumerate(zip(found.indices, found.scores, strict=True))
+        for rank, (reference, score) in enumerate(zip(indices, scores, strict=True), start=1)
+        if reference >= 0
+    ]
+    write_csv(path, ("query", "rank", "reference", "score"), rows)
 
 
 def _pair(queries: np.ndarray, references: np.ndarray | None, metric: str) -> tuple[Descriptors, Descriptors]:

@@ -6,7 +6,6 @@ of i, T_i^-1 T_j, and the 21 upper entries of the information matrix, row by row
 
 from __future__ import annotations
 
-import csv
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,10 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.detector.decision import LoopResult
 from loopclosure.errors import InputError
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_csv, write_whole
 
 VERTEX, EDGE, VERTEX_2D, EDGE_2D = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"
 PLANE = np.array([0, 1, 5])  # x, y and the turn about z, of the six numbers of a pose's error
+LOOPS = ("query_id", "match_id", "score", "inliers", "query_stamp", "match_stamp", "query_name", "match_name")
 
 RelativePose = Callable[[int, int], np.ndarray | None]
 
@@ -63,23 +63,17 @@ def write_loops_csv(
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        whole_file(path) as unfinished,
-        unfinished.open("w", newline="", encoding="utf-8", errors="surrogateescape") as stream,
-    ):
-        every = (stamps, stamps if match_names is None else match_stamps)
-        all_names = (names, names if match_names is None else match_names)
-        writer = csv.writer(stream)
-        writer.writerow(
-            ["query_id", "match_id", "score", "inliers", "query_stamp", "match_stamp", "query_name", "match_name"]
-        )
-        for loop in loops:
-            assert loop.accepted is not None
-            ends = (loop.query_id, loop.accepted)
-            times = ["" if of is None or np.isnan(of[i]) else f"{of[i]:.6f}" for of, i in zip(every, ends, strict=True)]
-            names_of_ends = ["" if of is None else of[i] for of, i in zip(all_names, ends, strict=True)]
-            inliers = "" if loop.inliers is None else loop.inliers
-            writer.writerow([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends])
+    every = (stamps, stamps if match_names is None else match_stamps)
+    all_names = (names, names if match_names is None else match_names)
+    rows = []
+    for loop in loops:
+        assert loop.accepted is not None
+        ends = (loop.query_id, loop.accepted)
+        times = ["" if of is None or np.isnan(of[i]) else f"{of[i]:.6f}" for of, i in zip(every, ends, strict=True)]
+        names_of_ends = ["" if of is None else of[i] for of, i in zip(all_names, ends, strict=True)]
+        inliers = "" if loop.inliers is None else loop.inliers
+        rows.append([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends])
+    write_csv(path, LOOPS, rows, "surrogateescape")
 
 
 def write_g2o(
@@ -137,8 +131,7 @@ def write_pose_graph(
         lines.append(f"{edge} {i} {j} {_numbers(said(pose))} {_numbers(entries)}")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as unfinished:
-        unfinished.write_text("\n".join(lines) + "\n", encoding="ascii")
+    write_whole(path, "\n".join(lines) + "\n")
 
 
 def _flat_pose(pose: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from loopclosure.errors import InputError
 from loopclosure.index.index import INDEXES, open_index
 from loopclosure.progress import Progress, silent
 from netspec.files.arrays import check_array, map_npy, read_npz
-from netspec.files.whole_file import only_one, whole_file, whole_folder
+from netspec.files.whole_file import only_one, whole_file, whole_folder, write_whole
 
 FORMAT = 1
 SESSION = "a session of a map that loopclosure map wrote"
@@ -86,8 +86,7 @@ class Map:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError("is there already; loopclosure map add adds to a map", folder)
         folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(folder / "map.json") as unfinished:
-            unfinished.write_text(json.dumps({"format": FORMAT, "describer": describer}) + "\n", encoding="utf-8")
+        write_whole(folder / "map.json", json.dumps({"format": FORMAT, "describer": describer}) + "\n")
         return cls(folder)
 
     def __len__(self) -> int:

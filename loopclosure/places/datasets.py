@@ -19,7 +19,7 @@ from loopclosure.places.sequences import ImageSequence, posed, read_sequence
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
 from netspec.files.opencv import cv2
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 # Ten seconds are common for TUM's 30 Hz sequences; the other sets have no time.
 TUM_EXCLUSION = Exclusion(seconds=10.0)
@@ -307,8 +307,7 @@ def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
             if images[0].shape[0] != images[1].shape[0]:
                 raise InputError(f"is {images[1].shape[0]} pixels high, {left.name} {images[0].shape[0]}", right)
             _, picture = cv2.imencode(".png", np.hstack(images))
-            with whole_file(path) as unfinished:
-                unfinished.write_bytes(picture.tobytes())
+            write_whole(path, picture.tobytes())
         joined.append(path)
     return joined
 

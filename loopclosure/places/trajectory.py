@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 # TUM's own associate.py takes 0.02 s; with 30 Hz images and motion capture at 100 Hz a gap of 0.03 s does no harm.
 MAX_DIFFERENCE_S = 0.03
@@ -161,8 +161,7 @@ def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame], what: 
     """Write ``rgb.txt`` or ``depth.txt`` with TUM's three comment lines; stamps with microseconds."""
     lines = [f"# {what}", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
     lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
-    with whole_file(Path(path)) as unfinished:
-        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="backslashreplace")
+    write_whole(Path(path), "\n".join(lines) + "\n", "backslashreplace")
 
 
 def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
@@ -181,8 +180,7 @@ def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what:
         trajectory.stamps, trajectory.positions, trajectory.quaternions, strict=True
     ):
         lines.append(f"{stamp:.6f} " + " ".join(f"{value:.6f}" for value in (*position, *quaternion)))
-    with whole_file(Path(path)) as unfinished:
-        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="backslashreplace")
+    write_whole(Path(path), "\n".join(lines) + "\n", "backslashreplace")
 
 
 def associate(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import math
 from collections.abc import Sequence
@@ -13,16 +11,17 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from loopclosure.errors import InputError
 from loopclosure.evaluate import RECALL_AT, SOFT_ZONE
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report.files import SOFT_MEASURES, share
+from loopclosure.report.page import png, rendered
 from loopclosure.report.plots import COLORS, STYLE, draw_curve, frame_curves, legends_below
 from netspec.errors import printable
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
+from netspec.terminal.columns import in_columns
 
 EXPECTED = "a report.json that loopclosure evaluate wrote"
 BY_CONVENTION = ("average precision", "recall at 100 % precision", "best F1")
@@ -144,18 +143,9 @@ def text(reports: Sequence[Report]) -> str:
     """Return the table for a terminal, with warnings."""
     rows = [("method", "report", *(head for _, head in COLUMNS))]
     rows += [(row.method, row.report, *row.cells) for row in table(reports)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     spans = [(ALL_PAIRS, 3), (BEST_MATCH, 3 + len(RECALL_AT)), ("soft zone", 2)]
-    over, at = " " * (sum(widths[:2]) + 2), 2
-    for name, columns in spans:
-        over += f"  {' ' + name + ' ':-^{sum(widths[at : at + columns]) + 2 * (columns - 1)}}"
-        at += columns
-    lines = [
-        "  ".join(c.ljust(w) if i < 2 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
-        for row in rows
-    ]
     first = reports[0]
-    return "\n".join([*warnings(reports), f"{first.data_set}: {first.truth}", over, *lines])
+    return "\n".join([*warnings(reports), f"{first.data_set}: {first.truth}", *in_columns(rows, 2, spans)])
 
 
 def curves(reports: Sequence[Report]) -> Figure:
@@ -185,20 +175,15 @@ def curves(reports: Sequence[Report]) -> Figure:
 
 def write_comparison(reports: Sequence[Report], path: str | Path, command: str = "") -> None:
     """Write table and curves as one self-contained HTML page."""
-    stream = io.BytesIO()
-    curves(reports).savefig(stream, format="png", metadata={"Software": None})
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
-    )
-    page = environment.get_template("compare.html.jinja").render(
+    page = rendered(
+        "compare.html.jinja",
         reports=reports,
         warnings=warnings(reports),
         heads=[head for _, head in COLUMNS],
         spans=[(ALL_PAIRS, 3), (BEST_MATCH, 3 + len(RECALL_AT)), (f"{BEST_MATCH}, soft zone", 2)],
         rows=table(reports),
-        picture=base64.b64encode(stream.getvalue()).decode("ascii"),
+        picture=png(curves(reports)),
         command=command,
     )
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(Path(path)) as unfinished:
-        unfinished.write_text(page, "utf-8", "backslashreplace")
+    write_whole(path, page, "backslashreplace")

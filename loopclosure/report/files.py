@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import re
@@ -13,7 +12,8 @@ import numpy as np
 
 from loopclosure.evaluate import RECALL_AT, SOFT_ZONE, Evaluation, Outcome
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, BestMatches, PrecisionRecall
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_csv, write_whole
+from netspec.terminal.columns import in_columns
 
 # A curve in report.json has at most so many points; curve_*.csv has them all.
 POINTS = 400
@@ -35,8 +35,7 @@ def write_files(evaluation: Evaluation, folder: Path, command: str = "") -> None
         _write_curves_csv(outcome, folder / f"curve_{slug}.csv")
         _write_matches_csv(evaluation, outcome, folder / f"matches_{slug}.csv")
     text = json.dumps(summary(evaluation, command), indent=2, ensure_ascii=False, allow_nan=False)
-    with whole_file(folder / "report.json") as unfinished:
-        unfinished.write_text(text + "\n", "utf-8", "backslashreplace")
+    write_whole(folder / "report.json", text + "\n", "backslashreplace")
 
 
 def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
@@ -102,49 +101,43 @@ def measures_text(evaluation: Evaluation) -> str:
         if soft:
             cells += [share(values[BEST_MATCH + SOFT_ZONE][name]) for name in SOFT_MEASURES]
         rows.append([outcome.name, *cells, f"{1e3 * outcome.seconds_on_frames / evaluation.image_count:.2f}"])
-    widths = [max(len(row[i]) for row in [heads, *rows]) for i in range(len(heads))]
-    lines = [
-        "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
-        for row in [heads, *rows]
-    ]
-    pairs_width = sum(widths[1:4]) + 4
-    over = f"{'':{widths[0]}}  {ALL_PAIRS:-^{pairs_width}}  {' ' + BEST_MATCH + ' ':-^{sum(widths[4:10]) + 10}}"
+    spans = [(ALL_PAIRS, 3), (BEST_MATCH, 3 + len(RECALL_AT))]
     data = evaluation.data
     said = [f"{data.name}: {data.truth.description}"]
     if soft:
-        over += f"  {' soft zone ':-^{sum(widths[10:12]) + 2}}"
+        spans.append(("soft zone", len(SOFT_MEASURES)))
         said.append(f"soft zone, best match of each query: a match is no mistake if {data.overlap_rule}")
     answers = [f"{outcome.name}: {outcome.answer}" for outcome in evaluation.outcomes if outcome.answer]
-    return "\n".join([*said, over, *lines, *answers])
+    return "\n".join([*said, *in_columns([heads, *rows], spans=spans), *answers])
 
 
 def _write_measures_csv(evaluation: Evaluation, path: Path) -> None:
-    rows = [["method", "convention", "figure", "value", "truth and exclusion"]]
+    rows = []
     for outcome in evaluation.outcomes:
         curves = curves_of(outcome)
         for convention, values in outcome.measures.items():
             for name, value in values.items():
                 rows.append([outcome.name, convention, name, f"{value:.6f}", curves[convention].truth_description])
-    _write_csv(path, rows)
+    write_csv(path, ("method", "convention", "figure", "value", "truth and exclusion"), rows, "backslashreplace")
 
 
 def _write_times_csv(evaluation: Evaluation, path: Path) -> None:
-    rows = [["method", "stage", "seconds", "milliseconds a frame", "frames"]]
+    rows = []
     for outcome in evaluation.outcomes:
         for stage, seconds in outcome.seconds.items():
             each = "" if stage in outcome.training_stages else f"{1e3 * seconds / evaluation.image_count:.6f}"
             rows.append([outcome.name, stage, f"{seconds:.6f}", each, str(evaluation.image_count)])
-    _write_csv(path, rows)
+    write_csv(path, ("method", "stage", "seconds", "milliseconds a frame", "frames"), rows, "backslashreplace")
 
 
 def _write_curves_csv(outcome: Outcome, path: Path) -> None:
     """Write the points at which recall increases: average precision is a sum over these."""
-    rows = [["convention", "threshold", "precision", "recall", "truth and exclusion"]]
+    rows = []
     for convention, curve in curves_of(outcome).items():
         for i in _rises(curve):
             values = [f"{v[i]:.9g}" for v in (curve.thresholds, curve.precision, curve.recall)]
             rows.append([convention, *values, curve.truth_description])
-    _write_csv(path, rows)
+    write_csv(path, ("convention", "threshold", "precision", "recall", "truth and exclusion"), rows, "backslashreplace")
 
 
 def _rises(curve: PrecisionRecall) -> np.ndarray:
@@ -163,8 +156,9 @@ def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> 
         "query has a loop",
         "query image",
         "reference image",
+        "truth and exclusion",
     ]
-    rows = [[*heads, "truth and exclusion"]]
+    rows = []
     for query in np.flatnonzero(matches.reference >= 0):
         reference = int(matches.reference[query])
         soft = "" if outcome.soft is None else verdict(outcome.soft.matches, query)
@@ -172,20 +166,12 @@ def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> 
         numbers = [str(query), str(reference), f"{matches.score[query]:.9g}", *verdicts, str(int(loops[query]))]
         images = [str(data.query_images[query]), str(data.references[reference])]
         rows.append([*numbers, *images, data.truth.description])
-    _write_csv(path, rows)
+    write_csv(path, heads, rows, "backslashreplace")
 
 
 def verdict(matches: BestMatches, query: int | np.intp) -> str:
     """Say what the best match of a query is."""
     return "right" if matches.right[query] else "ignored" if matches.ignored[query] else "wrong"
-
-
-def _write_csv(path: Path, rows: list[list[str]]) -> None:
-    with (
-        whole_file(path) as unfinished,
-        unfinished.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream,
-    ):
-        csv.writer(stream).writerows(rows)
 
 
 def _slugs(names: list[str]) -> list[str]:

@@ -24,7 +24,7 @@ from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import plots
 from loopclosure.report.files import EXPLANATION, SOFT_MEASURES, share, write_files
 from netspec.files.opencv import cv2
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 PAIRS_SHOWN = 4
 PICTURE_HEIGHT = 120  # pixels of the pictures of pairs
@@ -32,9 +32,9 @@ PICTURE_HEIGHT = 120  # pixels of the pictures of pairs
 
 @dataclass(frozen=True)
 class _Pair:
-    """A pair of images side by side (JPEG in base64), and what stands below it."""
+    """A pair of images side by side (JPEG), and what stands below it."""
 
-    picture: str
+    picture: bytes
     caption: str
 
 
@@ -64,16 +64,17 @@ def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", co
     }
     if plots.has_map(evaluation):
         pictures["map"] = plots.maps(evaluation)
-    encoded = {name: _save(figure, folder / f"{name}.png") for name, figure in pictures.items()}
+    encoded = {name: png(figure) for name, figure in pictures.items()}
+    for name, picture in encoded.items():
+        write_whole(folder / f"{name}.png", picture)
     page = folder / "report.html"
     text = _page(evaluation, encoded, title or f"Loop closure on {evaluation.data.name}", command)
-    with whole_file(page) as unfinished:
-        unfinished.write_text(text, "utf-8", "backslashreplace")
+    write_whole(page, text, "backslashreplace")
     write_files(evaluation, folder, command)
     return page
 
 
-def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command: str) -> str:
+def _page(evaluation: Evaluation, pictures: dict[str, bytes], title: str, command: str) -> str:
     data, truth = evaluation.data, evaluation.data.truth
     judged = int(np.count_nonzero(truth.judged))
     loops = int(np.count_nonzero(truth.queries_with_a_loop))
@@ -89,11 +90,8 @@ def _page(evaluation: Evaluation, pictures: dict[str, str], title: str, command:
     }
     if data.soft_truth is not None:
         facts["soft zone"] = f"beside the rule: a match is no mistake if {data.overlap_rule}"
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
-    )
-    environment.filters |= {"share": share, "significant": _significant}
-    return environment.get_template("report.html.jinja").render(
+    return rendered(
+        "report.html.jinja",
         title=title,
         command=command,
         data=data,
@@ -154,22 +152,13 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:
         return [_pair(evaluation, outcome, queries[i], references[i]) for i in _spread(queries, evaluation)]
 
     both = "" if outcome.soft is None else " in both zones"
-    return [
+    kinds = [
         _Kind("found", "right, highest score", pairs(right, matches.reference[right])),
         _Kind("false", f"wrong{both}, highest score", pairs(wrong[~excused], matches.reference[wrong[~excused]])),
-        *(
-            [
-                _Kind(
-                    "excused",
-                    "wrong by the rule, views overlap",
-                    pairs(wrong[excused], matches.reference[wrong[excused]]),
-                )
-            ]
-            if outcome.soft is not None
-            else []
-        ),
+        _Kind("excused", "wrong by the rule, views overlap", pairs(wrong[excused], matches.reference[wrong[excused]])),
         _Kind("missed", "true, lowest score", pairs(loops[lowest], true[lowest])),
     ]
+    return kinds if outcome.soft is not None else [kind for kind in kinds if kind.name != "excused"]
 
 
 def _spread(queries: np.ndarray, evaluation: Evaluation) -> list[int]:
@@ -197,7 +186,7 @@ def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) 
     ]
     gap = np.full((PICTURE_HEIGHT, 2, 3), 255, np.uint8)
     _, jpeg = cv2.imencode(".jpg", np.hstack([small[0], gap, small[1]]), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    return _Pair(base64.b64encode(jpeg.tobytes()).decode("ascii"), caption)
+    return _Pair(jpeg.tobytes(), caption)
 
 
 def _apart(evaluation: Evaluation, query: int, reference: int) -> str:
@@ -210,13 +199,24 @@ def _apart(evaluation: Evaluation, query: int, reference: int) -> str:
     return f"; {float(distances_m(a, b)):.2g} m and {float(angles_deg(a, b)):.0f} degrees apart, {seen}"
 
 
-def _save(figure: Figure, path: Path) -> str:
-    """Write a figure as PNG and return the same bytes in base64."""
+def png(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
-    with whole_file(path) as unfinished:
-        unfinished.write_bytes(stream.getvalue())
-    return base64.b64encode(stream.getvalue()).decode("ascii")
+    return stream.getvalue()
+
+
+def rendered(template: str, **values: object) -> str:
+    """Return a page made from a template beside this file, all values escaped."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
+    )
+    environment.filters |= {"share": share, "significant": _significant, "base64": _in_base64}
+    return environment.get_template(template).render(**values)
+
+
+def _in_base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
 
 
 def _significant(value: float) -> str:

@@ -241,16 +241,10 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
     across, along = sorted(np.argsort(-spans, kind="stable")[:2])
     place = positions[:, [across, along]]
     axis.plot(place[:, 0], place[:, 1], color="#303030", linewidth=0.6, zorder=1)
-    found, excused, false, missed = _drawn(outcome, truth)
-    lines = [
-        (missed, best_true_references(outcome, truth, missed), MISSED, 0.6),
-        (found, outcome.matches.reference[found], FOUND, 0.9),
-        (excused, outcome.matches.reference[excused], OVERLAPPING, 0.9),
-        (false, outcome.matches.reference[false], FALSE, 0.9),
-    ]
-    for order, (queries, references, color, width) in enumerate(lines, start=2):
+    for order, (queries, references, color) in enumerate(_drawn(outcome, truth), start=2):
         chords = np.stack([place[queries], place[references]], axis=1)
         thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords would merge
+        width = 0.6 if color == MISSED else 0.9
         axis.add_collection(LineCollection(list(chords), colors=color, linewidths=width * thin, zorder=order))
         axis.plot(place[queries, 0], place[queries, 1], ".", color=color, markersize=2.5, zorder=order)
     axis.set_aspect("equal", adjustable="datalim")
@@ -258,26 +252,21 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
     axis.set_ylabel(f"{'xyz'[along]} [m]")
 
 
-def _drawn(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the queries found, false but excused in the soft zone, false, and missed."""
+def _drawn(outcome: Outcome, truth: Truth) -> list[tuple[np.ndarray, np.ndarray, str]]:
+    """Return queries, their references, and a color: missed, found, false but excused in the soft zone, and false."""
     found, false, missed = decisions(outcome, truth)
-    excused = overlapping(outcome, false)
-    return found, false[excused], false[~excused], missed
+    excused, reference = overlapping(outcome, false), outcome.matches.reference
+    colored = [(found, FOUND), (false[excused], OVERLAPPING), (false[~excused], FALSE)]
+    return [
+        (missed, best_true_references(outcome, truth, missed), MISSED),
+        *((queries, reference[queries], color) for queries, color in colored),
+    ]
 
 
 def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
-    found, excused, false, missed = _drawn(outcome, truth)
     rows, columns = np.nonzero(truth.hard & truth.judged)
     axis.plot(columns, rows, ".", color="#d8d8d8", markersize=3, zorder=1)
-    for order, (queries, references, color) in enumerate(
-        [
-            (missed, best_true_references(outcome, truth, missed), MISSED),
-            (found, outcome.matches.reference[found], FOUND),
-            (excused, outcome.matches.reference[excused], OVERLAPPING),
-            (false, outcome.matches.reference[false], FALSE),
-        ],
-        start=2,
-    ):
+    for order, (queries, references, color) in enumerate(_drawn(outcome, truth), start=2):
         axis.plot(references, queries, ".", color=color, markersize=4, zorder=order)
     axis.set_xlim(-1, truth.hard.shape[1])
     axis.set_ylim(truth.hard.shape[0], -1)

@@ -6,7 +6,6 @@ validation pair, the names of the arrays in them, and the validation losses duri
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Sequence
@@ -19,7 +18,8 @@ from matplotlib.figure import Figure
 
 from loopclosure.errors import InputError
 from loopclosure.report.pair_metrics import PairMetrics, judge_pairs, pair_distances
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import whole_file, write_csv
+from netspec.terminal.columns import in_columns
 
 # Qiu et al., IEEE IV 2018, Table I. The paper gives neither the threshold nor the recall.
 PAPER = (
@@ -113,17 +113,11 @@ def _array(arrays: Any, name: str, path: str) -> np.ndarray:
 
 def text_table(runs: Sequence[Run]) -> str:
     """Return the table as text, with the paper's precisions below it."""
-    rows = [COLUMNS, *(run.cells() for run in runs)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
-    lines = [
-        "  ".join(c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True)))
-        for row in rows
-    ]
     paper = ", ".join(f"{name} {100 * precision:.1f} %" for name, precision in PAPER)
     pairs = f"{runs[0].metrics.pairs} validation pairs" if runs else "no runs"
     return "\n".join(
         [
-            *lines,
+            *in_columns([COLUMNS, *(run.cells() for run in runs)]),
             "",
             f"Judged on {pairs}; threshold of best accuracy on the training pairs; distance: Euclidean.",
             f"The paper's Table I, precision: {paper}.",
@@ -135,10 +129,7 @@ def write_report(runs: Sequence[Run], folder: Path) -> list[Path]:
     """Write ``table.csv``, ``losses.png`` (the paper's Figure 3) and ``distances.png``; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in ("table.csv", "losses.png", "distances.png")]
-    with whole_file(paths[0]) as unfinished, unfinished.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        writer.writerows(run.cells() for run in runs)
+    write_csv(paths[0], COLUMNS, (run.cells() for run in runs))
     _draw_losses(runs, paths[1])
     _draw_distances(runs, paths[2])
     return paths

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
-from collections.abc import Callable
 from typing import Any
 
 from netspec.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
@@ -203,13 +201,6 @@ def device(gpu: str) -> Any:
     if others:
         raise SpecError(f"--gpu {gpu}: only training runs on several GPUs; give one number")
     return first
-
-
-def bar(description: str, unit: str) -> Callable[[Any], Any]:
-    """Return a wrapper that shows a progress bar on a terminal."""
-    from tqdm import tqdm
-
-    return lambda items: tqdm(items, desc=description, unit=unit, disable=not sys.stderr.isatty(), leave=False)
 
 
 def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str, write_files: bool = True) -> Any:

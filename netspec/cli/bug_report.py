@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from netspec.cli.run import Commands
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 
 def add_to(commands: Commands) -> None:
@@ -23,6 +23,5 @@ def _bug_report(arguments: argparse.Namespace) -> None:
     if not arguments.out:
         print(text, end="")
         return
-    with whole_file(arguments.out) as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
+    write_whole(arguments.out, text)
     print(f"{arguments.out}: read it before you send it; a prototxt and a log are in it as they are")

@@ -8,7 +8,7 @@ import logging
 from netspec.cli.arguments import add_shapes, device, options, positive
 from netspec.cli.run import BUILT, READ, Commands
 from netspec.errors import SpecError
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.terminal import log
 from netspec.terminal.commands import WrongUsage
 
@@ -91,24 +91,19 @@ def _upgrade_net_text(arguments: argparse.Namespace) -> None:
         raise WrongUsage("--shape is for the net inside a .caffemodel; a prototxt has its own shapes")
     else:
         net = read_net(arguments.input)
-    _write(arguments.output, write_text(net).encode())
+    write_whole(arguments.output, write_text(net))
     log.info("upgrade_net_proto_text.cpp:49", f"Wrote upgraded NetParameter text proto to {arguments.output}")
 
 
 def _upgrade_net_binary(arguments: argparse.Namespace) -> None:
     from netspec.proto.binary import read_net_binary
 
-    _write(arguments.output, read_net_binary(arguments.input).SerializeToString())
+    write_whole(arguments.output, read_net_binary(arguments.input).SerializeToString())
     log.info("upgrade_net_proto_binary.cpp:49", f"Wrote upgraded NetParameter binary proto to {arguments.output}")
 
 
 def _upgrade_solver_text(arguments: argparse.Namespace) -> None:
     from netspec.proto.text import read_solver, write_text
 
-    _write(arguments.output, write_text(read_solver(arguments.input)).encode())
+    write_whole(arguments.output, write_text(read_solver(arguments.input)))
     log.info("upgrade_solver_proto_text.cpp:49", f"Wrote upgraded SolverParameter text proto to {arguments.output}")
-
-
-def _write(path: str, data: bytes) -> None:
-    with whole_file(path) as unfinished:
-        unfinished.write_bytes(data)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from functools import partial
 from typing import TYPE_CHECKING
 
-from netspec.cli.arguments import bar, positive
+from netspec.cli.arguments import positive
 from netspec.cli.run import Commands
 from netspec.errors import printable
 from netspec.terminal.commands import DONE, FAULT, WrongUsage, refuse
+from netspec.terminal.progress import bar
 
 if TYPE_CHECKING:
     from netspec.data.records import Records
@@ -51,7 +53,7 @@ def _data(arguments: argparse.Namespace) -> int:
     records = open_records(arguments.source)
     if arguments.start is not None and not 0 <= arguments.start < len(records):
         raise WrongUsage(f"found --start {arguments.start}, expected 0 to {len(records) - 1}")
-    found = survey(records, spread(len(records), arguments.records), bar("look", "record"))
+    found = survey(records, spread(len(records), arguments.records), partial(bar, stage="look", unit="record"))
     if arguments.what == STAT:
         return _tell(arguments, found)
     _show(arguments, records, found)

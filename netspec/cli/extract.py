@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from netspec.cli.arguments import (
     add_state,
     add_steps,
     add_strict,
-    bar,
     choice,
     device,
     load_weights,
@@ -37,6 +37,7 @@ from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
 from netspec.terminal import log
 from netspec.terminal.commands import WrongUsage, refuse
+from netspec.terminal.progress import bar
 
 
 def add_to(commands: Commands) -> None:
@@ -126,7 +127,7 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     size, kind = " x ".join(map(str, net.shape)), "gray" if net.shape[0] == 1 else "RGB" if net.scaling.swap else "BGR"
     print(f"{model(arguments)}: {blob} of {len(images.paths)} images from {arguments.images}")
     print(f"{arguments.input} ({size}): {kind}, {net.scaling}")
-    return extract_images(net, images, bar("extract", "batch"))
+    return extract_images(net, images, partial(bar, stage="extract", unit="batch"))
 
 
 def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -143,7 +144,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     net = build_net(stated, source, options(arguments, device=str(device(arguments.gpu))))
     load_weights(net, arguments.weights, arguments.strict)
     net = run_by(net, arguments, arguments.weights)
-    arrays = extract_records(net, arguments.blob, arguments.iterations, bar("extract", "batch"))
+    arrays = extract_records(net, arguments.blob, arguments.iterations, partial(bar, stage="extract", unit="batch"))
     net.close()
     print(f"{model(arguments)}: {', '.join(arguments.blob)} of {len(arrays['keys'])} records")
     return arrays

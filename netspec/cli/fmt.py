@@ -54,8 +54,7 @@ def _differs(path: str, text: str, formatted: str) -> int:
 
 
 def _write(path: str, text: str) -> None:
-    from netspec.files.whole_file import whole_file
+    from netspec.files.whole_file import write_whole
 
-    with whole_file(path) as unfinished:
-        unfinished.write_bytes(text.encode(errors="surrogateescape"))
+    write_whole(path, text, "surrogateescape")
     print(f"{path}: formatted")

@@ -22,9 +22,10 @@ def add_to(commands: Commands) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> None:
-    from netspec.draw.style import ending_of, write_bytes, write_figure
+    from netspec.draw.style import ending_of, write_figure
     from netspec.draw.training import Look, training_figure
     from netspec.draw.training_page import training_page
+    from netspec.files.whole_file import write_whole
     from netspec.runs.run import read_log
     from netspec.runs.summary import summary
 
@@ -35,7 +36,7 @@ def _plot(arguments: argparse.Namespace) -> None:
     runs = [read_log(path, name) for path, name in zip(arguments.logs, names, strict=True)]
     figure = training_figure(runs, Look(arguments.smooth, arguments.log_scale))
     if ending == "html":
-        write_bytes(arguments.out, training_page(runs, figure, ", ".join(names)).encode())
+        write_whole(arguments.out, training_page(runs, figure, ", ".join(names)))
     else:
         write_figure(figure, arguments.out)
     for run in runs:

@@ -16,7 +16,7 @@ from netspec.data.datum import datum_to_array, parse_datum, times
 from netspec.errors import SpecError, Where
 from netspec.files.lfs import pointer_fault
 from netspec.files.limits import read_bytes
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.proto.schema import BlobProto
 from netspec.terminal import log
 
@@ -102,8 +102,7 @@ def write_mean(path: str, mean: np.ndarray) -> None:
     log.info("compute_image_mean.cpp:108", f"Write to {path}")
     channels, height, width = mean.shape
     proto = BlobProto(num=1, channels=channels, height=height, width=width, data=mean.ravel().tolist())
-    with whole_file(path) as unfinished:
-        unfinished.write_bytes(proto.SerializeToString())
+    write_whole(path, proto.SerializeToString())
 
 
 def channel_means(mean: np.ndarray) -> list[float]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from netspec.data.blobs import in_half_precision, to_array
 from netspec.dnn.errors import as_dnn_error
 from netspec.errors import SpecError, Where
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.proto.binary import parse_net_binary
 
 
@@ -28,5 +28,4 @@ def shrinkCaffeModel(
                     message = f'blob {i} of layer "{layer.name}": {fault}'
                     raise SpecError(message, Where(os.fspath(src))) from None
                 blob.CopyFrom(small)
-        with whole_file(os.fspath(dst)) as unfinished:
-            unfinished.write_bytes(net.SerializeToString())
+        write_whole(os.fspath(dst), net.SerializeToString())

@@ -10,7 +10,7 @@ from netspec.draw.html import html_of
 from netspec.draw.picture import picture_of
 from netspec.draw.svg import svg_of
 from netspec.errors import SpecError
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.graph.options import BuildOptions
 from netspec.net.recovered import recover_net
 from netspec.proto.binary import is_net_binary
@@ -42,8 +42,7 @@ def write_picture(
         content = html_of(diagram, picture).encode()
     else:
         content = svg_of(picture, unfolded).encode()
-    with whole_file(out) as unfinished:
-        unfinished.write_bytes(content)
+    write_whole(out, content)
     return diagram
 
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from netspec.errors import SpecError, Where
-from netspec.files.whole_file import whole_file, why_unwritable
+from netspec.files.whole_file import why_unwritable, write_whole
 
 # Color-blind readers can distinguish these too (Okabe and Ito).
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
@@ -49,13 +49,7 @@ def ending_of(path: str | Path, endings: Sequence[str] = ENDINGS) -> str:
 def write_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG or SVG, as the name asks for. Raises SpecError."""
     data = svg(figure).encode() if ending_of(path) == "svg" else _png(figure)
-    write_bytes(path, data)
-
-
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file that appears whole."""
-    with whole_file(path) as unfinished:
-        unfinished.write_bytes(data)
+    write_whole(path, data)
 
 
 def svg(figure: Figure) -> str:

@@ -16,7 +16,7 @@ import torch
 from netspec.errors import SpecError
 from netspec.export.preprocess import Preprocess
 from netspec.export.shapes import Fixed, NetShapes, settled
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import whole_file, write_whole
 from netspec.layers.base import Layer
 from netspec.layers.exporting import export
 from netspec.layers.learned import values_of
@@ -53,8 +53,7 @@ def export_onnx(
     writer, notes = _written(net, preprocess)
     path = Path(path)
     if sum(array.nbytes for array in writer.initializers.values()) <= largest:
-        with whole_file(path) as unfinished:
-            unfinished.write_bytes(writer.model(metadata or {}).SerializeToString())
+        write_whole(path, writer.model(metadata or {}).SerializeToString())
         return notes
     data = path.with_name(f"{path.name}.data")
     with whole_file(path) as unfinished, whole_file(data) as unfinished_data:

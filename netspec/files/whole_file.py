@@ -7,14 +7,16 @@ whether a file can be written.
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import logging
 import os
 import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -66,6 +68,22 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     except OSError as fault:
         reason = os.strerror(fault.errno) if fault.errno else fault  # h5py's own text is a paragraph
         raise _fault(f"cannot be written: {reason}", path) from None
+
+
+def write_whole(path: str | Path, content: str | bytes, errors: str = "strict") -> None:
+    """Write bytes, or text as UTF-8, to a file that appears whole; see :func:`whole_file`.
+
+    ``errors``, as in :func:`open`, is for text that UTF-8 does not have: names of files may be any bytes.
+    """
+    with whole_file(path) as unfinished:
+        unfinished.write_bytes(content.encode("utf-8", errors) if isinstance(content, str) else content)
+
+
+def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[object]], errors: str = "strict") -> None:
+    """Write a table as CSV to a file that appears whole; ``errors`` as in :func:`write_whole`."""
+    text = io.StringIO()
+    csv.writer(text).writerows([head, *rows])
+    write_whole(path, text.getvalue(), errors)
 
 
 @contextmanager
