@@ -51,15 +51,20 @@ class Entry:
 
 @dataclass(frozen=True)
 class Options:
-    """How images become Datums.
+    """How images become Datums of a database.
 
     ``size`` is (height, width), None for the files' own. ``encoding`` None stores pixels; "" stores the format that the
-    file's name ends with, any other text that format ("png", "jpg").
+    file's name ends with, any other text that format ("png", "jpg"). ``check_size`` refuses an image of another size
+    than the first. With ``skip`` an entry that cannot be read is logged and left out, as Caffe's convert_imageset does,
+    unless that is every entry; the keys of the others stay.
     """
 
     color: bool = True
     size: tuple[int, int] | None = None
     encoding: str | None = None
+    backend: str = "lmdb"
+    check_size: bool = False
+    skip: bool = False
 
 
 def read_pairs(path: str) -> list[Entry]:
@@ -94,19 +99,14 @@ def write_databases(
     paths: Sequence[str],
     options: Options,
     key: Callable[[int, Entry], str],
-    backend: str = "lmdb",
-    check_size: bool = False,
     workers: int | None = None,
     progress: Progress = silent,
-    skip: bool = False,
 ) -> None:
     """Write entries, in order, into new databases, which appear when they are complete.
 
     ``paths`` names one database, or, with encoded images, one for each image of an entry. ``root`` is put in front of
     image names, with a slash between. Images are read by ``workers`` processes (None: one per core). Raises SpecError,
-    with the line in the list, for an image that is missing, unreadable, or differs in size from its partner (with
-    ``check_size``: from the first). With ``skip`` an entry that cannot be read is logged and left out, as Caffe's
-    convert_imageset does, unless that is every entry; the keys of the others stay.
+    with the line in the list, for an image that is missing, unreadable, or differs in size from its partner.
     """
     assert len(paths) == (1 if options.encoding is None else len(entries[0].images))
     work = partial(_try, root=root if root.endswith("/") or not root else root + "/", options=options)
@@ -114,18 +114,18 @@ def write_databases(
     written, skipped = 0, None
     with ExitStack() as stack:
         results = stack.enter_context(_Workers(workers or os.cpu_count() or 1)).ordered(work, entries)
-        writers = [stack.enter_context(Writer(path, backend)) for path in paths]
+        writers = [stack.enter_context(Writer(path, options.backend)) for path in paths]
         for number, result in enumerate(progress(results, "records", len(entries))):
             entry = entries[number]
             if isinstance(result, SpecError):
-                if not skip:
+                if not options.skip:
                     raise result
                 log.error("io.cpp:80", str(result))
                 skipped = skipped or result
                 continue
             records, shape = result
             first = first or shape
-            if check_size and shape != first:
+            if options.check_size and shape != first:
                 message = f"gives {times(shape)}, but the first line gives {times(first)} (-check_size)"
                 raise SpecError(f'"{entry.images[0]}" {message}', entry.where)
             for writer, record in zip(writers, records, strict=True):

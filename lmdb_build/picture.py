@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from loopclosure.places.frames import write_picture
+from loopclosure.places.frames import DEPTH_PER_M, write_picture
 from netspec.files.opencv import cv2
 
 JPEG_QUALITY = 95
-DEPTH_PER_M = 5000
 CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)  # of a picture of size 1: x, y, clockwise
 
 

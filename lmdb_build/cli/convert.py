@@ -118,19 +118,11 @@ def _convert(
         color=not arguments.gray,
         size=(height, width) if height else None,
         encoding=arguments.encode_type.lstrip(".") if _is_encoded(arguments) else None,
+        backend=arguments.backend,
+        check_size=arguments.check_size,
+        skip=skip,
     )
-    write_databases(
-        entries,
-        arguments.ROOTFOLDER,
-        databases,
-        options,
-        key,
-        arguments.backend,
-        arguments.check_size,
-        arguments.workers,
-        bar,
-        skip,
-    )
+    write_databases(entries, arguments.ROOTFOLDER, databases, options, key, arguments.workers, bar)
 
 
 def _is_encoded(arguments: argparse.Namespace) -> bool:

@@ -96,9 +96,7 @@ def build_lists(
             pairs.first[~pairs.warped], pairs.second[~pairs.warped], pairs.labels[~pairs.warped]
         ):
             warn(f"{split}: {doubt}")
-        seconds = [source.names[index] for index in pairs.second]
-        if pairs.warped.any():
-            seconds = _write_warped(source, pairs, seconds, plan.seed, split, root, out, progress)
+        seconds = _write_warped(source, pairs, plan.seed, split, root, out, progress)
         lists[split] = out / f"{split}.txt"
         listed = zip((source.names[index] for index in pairs.first), seconds, pairs.labels.tolist(), strict=True)
         write_pair_list(lists[split], listed, _head(source, plan, split, splits[split], pairs, root, out))
@@ -118,20 +116,15 @@ def _stream(seed: int, split: str, *more: int) -> np.random.Generator:
 
 
 def _write_warped(
-    source: PairSource,
-    pairs: Pairs,
-    seconds: list[str],
-    seed: int,
-    split: str,
-    root: Path,
-    out: Path,
-    progress: Progress,
+    source: PairSource, pairs: Pairs, seed: int, split: str, root: Path, out: Path, progress: Progress
 ) -> list[str]:
-    """Write the warped images; return the names of the second images, with those of the warped images."""
+    """Write the warped images, if any; return the names of the second images, with those of the warped images."""
+    names = [source.names[index] for index in pairs.second]
+    if not pairs.warped.any():
+        return names
     folder = _below(out / f"{split}_warped", root)
-    names = list(seconds)
     for number in progress(np.flatnonzero(pairs.warped), f"{split}: warping"):
-        original = PurePosixPath(seconds[number])
+        original = PurePosixPath(names[number])
         names[number] = f"{folder}/{number:06d}_{original.name}"
         write_warped(root / original, root / names[number], _stream(seed, split, 1, int(number)))
     return names

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lmdb_build.picture import write_depth, write_jpeg
 from lmdb_build.walk.house import House, build_house
@@ -28,10 +29,8 @@ from loopclosure.places.trajectory import (
     Frame,
     Poses,
     Trajectory,
-    quaternions_from_matrices,
-    rotation_matrices,
-    write_groundtruth,
     write_rgb_list,
+    write_trajectory,
 )
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
@@ -121,7 +120,7 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "
     calibration += f"{camera.center[0]:g} {camera.center[1]:g} {camera.width} {camera.height}\n"
     write_whole(folder / "calibration.txt", calibration)
-    write_groundtruth(
+    write_trajectory(
         folder / "groundtruth.txt", Trajectory(walk.start_s + pose_times, poses.positions, poses.quaternions)
     )
     if depths:
@@ -135,7 +134,7 @@ def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iter
     outside = weather(walk.seed, walk.season)
     noise = rng.normal(0, NOISE * outside.noise, (walk.height + 64, walk.width + 64, 3)).astype(np.int8)
     poses = carrier.poses(times)
-    rotations = rotation_matrices(poses.quaternions)
+    rotations = Rotation.from_quat(poses.quaternions).as_matrix()
     laps = np.minimum(carrier.walked_m(times) // house.way_length_m, walk.laps - 1).astype(int)
     renderer: Renderer | None = None
     for index, (position, rotation) in enumerate(zip(poses.positions, rotations, strict=True)):
@@ -204,7 +203,7 @@ class _Carrier:
             [x - side * np.sin(along), y + side * np.cos(along), EYE_HEIGHT_M + 0.02 * np.sin(stride)]
         )
         roll, pitch = np.radians(0.8 * np.sin(stride / 2)), np.radians(6 + 0.6 * np.sin(stride + 1))
-        return Poses(positions, quaternions_from_matrices(_look(yaw, pitch, roll)))
+        return Poses(positions, Rotation.from_matrix(_look(yaw, pitch, roll)).as_quat(canonical=True))
 
 
 def _look(yaw: Array, pitch: Array, roll: Array) -> Array:

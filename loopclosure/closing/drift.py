@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from loopclosure.detector.export import relative_pose
 from loopclosure.errors import InputError
 
 Array = NDArray[np.float64]
@@ -16,10 +17,7 @@ DEGREES_PER_M = 0.1
 
 def steps_between(poses: Array) -> Array:
     """Return the pose (N - 1, 7) of each of N poses (7,) in the frame of the one before."""
-    turns = Rotation.from_quat(poses[:, 3:])
-    back = turns[:-1].inv()
-    steps = back.apply(np.diff(poses[:, :3], axis=0))
-    return np.hstack([steps, (back * turns[1:]).as_quat(canonical=True)])
+    return relative_pose(poses[:-1], poses[1:])
 
 
 def path_of(start: Array, steps: Array) -> Array:

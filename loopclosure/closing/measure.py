@@ -14,14 +14,13 @@ import numpy as np
 from loopclosure.closing.relative import LEAST_INLIERS, Relative, View, relative_view
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_bgr, read_pixels
+from loopclosure.places.frames import read_bgr, read_depth
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.sequences import ImageSequence
 from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 
 CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS)
-DEPTH_PER_M = 5000  # TUM RGB-D: 16-bit values per meter, 0 = not known
 KEPT_VIEWS = 500  # their features, in memory
 
 
@@ -69,7 +68,11 @@ def measure(
         height, width = image.shape[:2]
         depths = sequence.depths
         file = None if depths is None else depths[frame]
-        depth = None if file is None else read_depth(file, width, height)
+        depth = (
+            None
+            if file is None
+            else cv2.resize(read_depth(file).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
+        )
         return View(CHECK.describe(image), camera.of_size(width, height), depth)
 
     measured = []
@@ -78,16 +81,6 @@ def measure(
         matches = CHECK.matches(match.local, query.local)
         measured.append(Loop(loop.query, loop.match, relative_view(match, query, matches)))
     return measured
-
-
-def read_depth(path: Path, width: int, height: int) -> np.ndarray:
-    """Read a depth image of TUM's form as meters (height, width), 0 where not known, at the size of its color image."""
-    image = read_pixels(path, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2 or image.dtype != np.uint16:
-        raise InputError("is no depth image; expected one channel of 16 bits, 5000 per meter, as of TUM RGB-D", path)
-    if image.shape != (height, width):
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST)
-    return image.astype(np.float32) / DEPTH_PER_M
 
 
 def _frame(row: dict[str, str], end: str, numbers: dict[str, int], path: Path, line: int) -> int:

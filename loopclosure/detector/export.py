@@ -42,11 +42,10 @@ LOOP_SIGMAS = Sigmas(0.1, 0.05)
 
 
 def relative_pose(pose_a: np.ndarray, pose_b: np.ndarray) -> np.ndarray:
-    """Return the pose (7,) of b in the frame of a, T_a^-1 T_b, with w >= 0; poses are tx ty tz qx qy qz qw."""
-    rotation_a, rotation_b = Rotation.from_quat(pose_a[3:]), Rotation.from_quat(pose_b[3:])
-    quaternion = (rotation_a.inv() * rotation_b).as_quat()
-    step = rotation_a.inv().apply(pose_b[:3] - pose_a[:3])
-    return np.concatenate([step, quaternion if quaternion[3] >= 0 else -quaternion])
+    """Return the pose (..., 7) of each b in the frame of its a, T_a^-1 T_b, w >= 0; poses are tx ty tz qx qy qz qw."""
+    back, there = Rotation.from_quat(pose_a[..., 3:]).inv(), Rotation.from_quat(pose_b[..., 3:])
+    step = back.apply(pose_b[..., :3] - pose_a[..., :3])
+    return np.concatenate([step, (back * there).as_quat(canonical=True)], axis=-1)
 
 
 def write_loops_csv(
@@ -81,8 +80,6 @@ def write_g2o(
     poses: np.ndarray,
     loops: Sequence[LoopResult],
     relative: RelativePose,
-    odometry: Sigmas = ODOMETRY_SIGMAS,
-    closure: Sigmas = LOOP_SIGMAS,
 ) -> int:
     """Write a pose graph; return how many loops were left out because their relative pose is not known.
 
@@ -96,7 +93,9 @@ def write_g2o(
     known: list[int] = np.flatnonzero(np.all(np.isfinite(poses), axis=1)).tolist()
     if not known:
         raise InputError("no frame has a pose; a pose graph needs the poses of the frames")
-    edges = [(a, b, relative_pose(poses[a], poses[b]), odometry.information()) for a, b in itertools.pairwise(known)]
+    edges = [
+        (a, b, relative_pose(poses[a], poses[b]), ODOMETRY_SIGMAS.information()) for a, b in itertools.pairwise(known)
+    ]
     left_out = 0
     with_pose = set(known)
     for loop in loops:
@@ -105,7 +104,7 @@ def write_g2o(
         if step is None or not {loop.query_id, loop.accepted} <= with_pose:
             left_out += 1
             continue
-        edges.append((loop.accepted, loop.query_id, step, closure.information()))
+        edges.append((loop.accepted, loop.query_id, step, LOOP_SIGMAS.information()))
     write_pose_graph(path, {i: poses[i] for i in known}, edges)
     return left_out
 

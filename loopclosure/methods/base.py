@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.verification import Pairs
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
@@ -106,7 +107,7 @@ METHODS: dict[str, str] = {
 }
 REFINERS = ("seqslam", "verified", "auto")
 
-# The argument after the colon, the context, the inner method.
+# The argument after the colon, the context, the inner method (None where it is no refiner).
 Factory = Callable[[str, MethodContext, "Method | None"], Method]
 
 
@@ -120,6 +121,8 @@ def make_method(spec: str, context: MethodContext | None = None) -> Method:
     if name in REFINERS or argument.startswith("+"):
         argument, plus, inner_spec = argument.partition("+")
         inner = make_method(inner_spec, context) if plus else None
+    if inner is not None and name not in REFINERS:
+        raise InputError(f"{name}+{inner.name}: {name} works on images, not on the scores of another method")
     module_name, _, factory_name = METHODS[name].partition(":")
     factory: Any = getattr(importlib.import_module(module_name), factory_name)
     return factory(argument.removeprefix(":"), context, inner)
@@ -128,12 +131,6 @@ def make_method(spec: str, context: MethodContext | None = None) -> Method:
 def earlier(frames: int, exclude: int) -> np.ndarray:
     """Return which pairs (query, reference) of one sequence can be loops: reference < query - exclude, (n, n) bool."""
     return np.tri(frames, frames, -1 - exclude, dtype=bool)
-
-
-def refuse_inner(method: str, inner: Method | None) -> None:
-    """Raise InputError if a method that works on images is given another method to refine."""
-    if inner is not None:
-        raise InputError(f"{method}+{inner.name}: {method} works on images, not on the scores of another method")
 
 
 def refuse_overlap(train_images: list[Path], test_images: list[Path], model: str | Path = "") -> None:
@@ -157,3 +154,19 @@ def describe_each(
         with timed(seconds, stage):
             found.append(describe(path))
     return found
+
+
+def compared(
+    rows: Sequence[np.ndarray],
+    images: Images,
+    metric: str,
+    seconds: dict[str, float],
+    notes: Sequence[str] = (),
+    once: tuple[str, ...] = (),
+    views: int = 1,
+) -> MethodResult:
+    """Compare the descriptors (D,) of the tested images, of so many views each; ``once`` are the training stages."""
+    with timed(seconds, "similarity"):
+        queries, references = np.split(np.array(rows), [len(images.queries)])
+        scores = similarity_matrix(queries, None if images.references is None else references, metric, views)
+    return MethodResult(scores, seconds, [*notes, f"{len(rows[0])} dimensions, {metric}"], once)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from loopclosure.methods.base import (
     MethodContext,
     MethodResult,
     describe_each,
-    refuse_inner,
     refuse_overlap,
 )
 from loopclosure.methods.settings import configure
@@ -147,33 +147,28 @@ class ThumbnailMethod:
         return MethodResult(scores, seconds, [f"mean absolute difference of gray thumbnails; {self.thumbnailer}"])
 
 
-def fabmap(argument: str, context: MethodContext, inner: Method | None) -> FabMapMethod:
-    """Build ``fabmap[:setting=value,...]``."""
-    refuse_inner("fabmap", inner)
-    method, source, training, extractor, settings = configure(
-        "fabmap",
-        argument,
-        FabMapMethod(),
-        WordModelSource(),
-        Training(seed=context.seed),
-        Extractor(),
-        FabMapSettings(recent=context.exclude_frames, seed=context.seed),
+def configure_words(argument: str, method: Any, training: Training, *parts: Any) -> list[Any]:
+    """Return a method whose ``source`` is a word model, and other parts, with the settings that ``argument`` gives."""
+    method, source, training, extractor, *others = configure(
+        method.name, argument, method, WordModelSource(), training, Extractor(), *parts
     )
     source = replace(source, training=replace(training, extractor=extractor))
-    return replace(method, source=source, settings=settings)
+    return [replace(method, source=source), *others]
+
+
+def fabmap(argument: str, context: MethodContext, inner: Method | None) -> FabMapMethod:
+    """Build ``fabmap[:setting=value,...]``."""
+    plain = FabMapSettings(recent=context.exclude_frames, seed=context.seed)
+    method, settings = configure_words(argument, FabMapMethod(), Training(seed=context.seed), plain)
+    return replace(method, settings=settings)
 
 
 def bag_of_words(argument: str, context: MethodContext, inner: Method | None) -> BagOfWordsMethod:
     """Build ``bow[:setting=value,...]``."""
-    refuse_inner("bow", inner)
-    method, source, training, extractor = configure(
-        "bow", argument, BagOfWordsMethod(), WordModelSource(), Training(seed=context.seed), Extractor()
-    )
-    return replace(method, source=replace(source, training=replace(training, extractor=extractor)))
+    return configure_words(argument, BagOfWordsMethod(), Training(seed=context.seed))[0]
 
 
 def thumbnails(argument: str, context: MethodContext, inner: Method | None) -> ThumbnailMethod:
     """Build ``thumbnails[:setting=value,...]``."""
-    refuse_inner("thumbnails", inner)
     method, thumbnailer = configure("thumbnails", argument, ThumbnailMethod(), Thumbnailer())
     return replace(method, thumbnailer=thumbnailer)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopclosure.descriptors.similarity import METRICS, similarity_matrix
+from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector.run import load_describe, views_of
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_inner
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, compared
 from loopclosure.places.frames import read_bgr
 from loopclosure.progress import Progress, timed
 
@@ -38,16 +38,11 @@ class DescribedMethod:
                 rows.append(np.asarray(describe(read_bgr(path)), np.float32).reshape(-1))
             if len(rows[-1]) != len(rows[0]):
                 raise InputError(f"{self.function} gave {len(rows[-1])} numbers, and {len(rows[0])} before", path)
-        with timed(seconds, "similarity"):
-            queries, references = np.split(np.array(rows), [len(images.queries)])
-            others = None if images.references is None else references
-            scores = similarity_matrix(queries, others, self.metric, views_of(describe, None))
-        return MethodResult(scores, seconds, [f"{len(rows[0])} dimensions, {self.metric}"], ("loading",))
+        return compared(rows, images, self.metric, seconds, once=("loading",), views=views_of(describe, None))
 
 
 def described(argument: str, context: MethodContext, inner: Method | None) -> DescribedMethod:
     """Build ``describe:NAME|MODULE:FUNCTION|FILE.py:FUNCTION[:euclidean|cosine]``."""
-    refuse_inner("describe", inner)
     function, _, metric = argument.rpartition(":")
     if metric not in METRICS:
         function, metric = argument, METRICS[0]

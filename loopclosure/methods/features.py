@@ -100,8 +100,6 @@ def features(argument: str, context: MethodContext, inner: Method | None) -> Fea
 
     FILES is PATH.npz, or QUERIES.npz,REFERENCES.npz.
     """
-    if inner is not None:
-        raise InputError("features cannot refine another method; write features:PATH.npz")
     described, *settings = SETTINGS_BEGIN.split(argument, maxsplit=1)
     files, colon, metric = described.rpartition(":")
     if not colon or metric.endswith(".npz"):

@@ -18,7 +18,7 @@ from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import Recording, run_detector, verdicts_said
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, refuse_inner
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
 
@@ -72,7 +72,6 @@ class OnlineMethod:
 
 def online(argument: str, context: MethodContext, inner: Method | None) -> OnlineMethod:
     """Build ``detector:FILE.npz[:threshold=T,setting=value,...]``."""
-    refuse_inner("detector", inner)
     path, *settings = SETTINGS_BEGIN.split(argument, maxsplit=1)
     if not path.endswith(".npz"):
         raise InputError(

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from loopclosure.descriptors.hog import Hog
-from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, describe_each, refuse_inner
-from loopclosure.methods.baselines import WordModelSource
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, compared, describe_each
+from loopclosure.methods.baselines import WordModelSource, configure_words
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
 from loopclosure.words.vlad import vlad
-from loopclosure.words.vocabulary import Extractor
 from loopclosure.words.word_model import TRAINING_STAGES, Training
 
 # Few words, each with a whole vector: 64 x 128 numbers for SIFT.
@@ -35,7 +33,7 @@ class HogMethod:
         rows = describe_each(
             images, "HOG", lambda path: self.hog.blocks(read_gray(path)).reshape(-1), progress, seconds
         )
-        return _cosine(np.array(rows), images, seconds, [f"{self.hog}"])
+        return compared(rows, images, "cosine", seconds, [f"{self.hog}"])
 
 
 @dataclass
@@ -92,19 +90,17 @@ class VladMethod:
         rows = describe_each(
             images, "features", lambda path: vlad(words.extractor(read_gray(path)), words), progress, seconds
         )
-        return _cosine(np.array(rows), images, seconds, notes, TRAINING_STAGES)
+        return compared(rows, images, "cosine", seconds, notes, TRAINING_STAGES)
 
 
 def hog(argument: str, context: MethodContext, inner: Method | None) -> HogMethod:
     """Build ``hog[:setting=value,...]``."""
-    refuse_inner("hog", inner)
     method, descriptor = configure("hog", argument, HogMethod(), Hog())
     return replace(method, hog=descriptor)
 
 
 def cohog(argument: str, context: MethodContext, inner: Method | None) -> CoHogMethod:
     """Build ``cohog[:setting=value,...]``."""
-    refuse_inner("cohog", inner)
     plain = CoHogMethod()
     method, descriptor = configure("cohog", argument, plain, plain.hog)
     return replace(method, hog=descriptor)
@@ -112,19 +108,4 @@ def cohog(argument: str, context: MethodContext, inner: Method | None) -> CoHogM
 
 def vlad_method(argument: str, context: MethodContext, inner: Method | None) -> VladMethod:
     """Build ``vlad[:setting=value,...]``; ``kind=orb`` for ORB words."""
-    refuse_inner("vlad", inner)
-    training = Training(words=VLAD_WORDS, seed=context.seed)
-    method, source, training, extractor = configure(
-        "vlad", argument, VladMethod(), WordModelSource(), training, Extractor()
-    )
-    return replace(method, source=replace(source, training=replace(training, extractor=extractor)))
-
-
-def _cosine(
-    rows: np.ndarray, images: Images, seconds: dict[str, float], notes: list[str], once: tuple[str, ...] = ()
-) -> MethodResult:
-    """Compare the descriptors (N, D) of the tested images."""
-    with timed(seconds, "similarity"):
-        queries, references = np.split(rows, [len(images.queries)])
-        scores = similarity_matrix(queries, None if images.references is None else references, "cosine")
-    return MethodResult(scores, seconds, [*notes, f"{rows.shape[1]} dimensions, cosine"], once)
+    return configure_words(argument, VladMethod(), Training(words=VLAD_WORDS, seed=context.seed))[0]

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
+from loopclosure.places.pose_files import moved
 from netspec.errors import SpecError
 from netspec.files.opencv import cv2
 
@@ -80,10 +81,7 @@ class Bag:
         mount = self._mount(child) if child and self.frame else None
         if mount is None:
             return np.array(stamps), poses, f"poses of {self.pose_topic} are taken as the camera's"
-        turns = Rotation.from_quat(poses[:, 3:])
-        poses[:, :3] += turns.apply(mount[:3, 3])
-        poses[:, 3:] = (turns * Rotation.from_matrix(mount[:3, :3])).as_quat()
-        return np.array(stamps), poses, f"poses of {self.pose_topic}, moved from {child} to {self.frame}"
+        return np.array(stamps), moved(poses, mount), f"poses of {self.pose_topic}, moved from {child} to {self.frame}"
 
     def camera(self) -> Intrinsics | None:
         """Return the camera that a CameraInfo beside the images says, None without one."""

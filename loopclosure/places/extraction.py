@@ -12,7 +12,7 @@ from loopclosure.places.bags import is_bag, open_bag
 from loopclosure.places.frames import VIDEO_SUFFIXES, video_frames, video_length, write_picture
 from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.pose_files import DIRECTIONS, FORMS, ORDERS
-from loopclosure.places.trajectory import Frame, Trajectory, write_groundtruth, write_rgb_list
+from loopclosure.places.trajectory import Frame, Trajectory, write_rgb_list, write_trajectory
 from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_folder
@@ -79,7 +79,7 @@ def _bag(source: Path, folder: Path, topic: str, pose_topic: str, progress: Prog
             if len(poses):
                 order = np.argsort(stamps, kind="stable")
                 trajectory = Trajectory(stamps[order], poses[order, :3], poses[order, 3:])
-                write_groundtruth(folder / "groundtruth.txt", trajectory)
+                write_trajectory(folder / "groundtruth.txt", trajectory)
                 about += f", {said}"
     return frames, about
 

@@ -16,6 +16,8 @@ from netspec.files.png import is_cut_png
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
+DEPTH_PER_M = 5000  # of depth images, as TUM RGB-D has them
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -81,6 +83,14 @@ def read_pixels(path: str | Path, mode: int) -> np.ndarray:
     if image is None:
         raise InputError("is not a readable image", path)
     return image
+
+
+def read_depth(path: str | Path) -> np.ndarray:
+    """Read a depth image of TUM RGB-D (16 bits, 5000 per meter) as meters (H, W), 0 where not known; or InputError."""
+    image = read_pixels(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise InputError("is no depth image; expected one channel of 16 bits, 5000 per meter, as of TUM RGB-D", path)
+    return image / DEPTH_PER_M
 
 
 def write_picture(path: Path, image: np.ndarray, *settings: int) -> None:

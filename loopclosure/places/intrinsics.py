@@ -46,10 +46,7 @@ class Intrinsics:
 
 def from_text(text: str) -> Intrinsics:
     """Read the numbers that a command's ``--camera`` gives. Raises InputError for other texts."""
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
+    numbers = _floats(text.split(","))
     if len(numbers) not in (4, 8, 9):
         raise InputError(f'expected {FORM} in pixels, found "{text}"')
     return _checked(numbers[:4], numbers[4:], None, "")
@@ -84,10 +81,7 @@ def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:
         matrix = kitti_projection(text, camera, path)
         return _checked([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], [], None, path)
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    try:
-        numbers = [float(field) for field in rows[0]] if len(rows) == 1 else []
-    except ValueError:
-        numbers = []
+    numbers = _floats(rows[0]) if len(rows) == 1 else []
     if len(numbers) not in (6, 10, 11):
         raise InputError("expected one row: fx fy cx cy width height, and k1 k2 p1 p2 [k3] with distortion", path)
     return _checked(numbers[:4], numbers[6:], numbers[4:6], path)
@@ -96,10 +90,7 @@ def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:
 def yaml_numbers(text: str, key: str, count: int, path: Path) -> list[float]:
     """Return the ``count`` numbers in brackets behind ``key:`` of a YAML text, over several lines or one."""
     found = re.search(rf"^[ \t]*{key}[ \t]*:\s*\[([^\]]*)\]", text, re.MULTILINE)
-    try:
-        numbers = [float(part) for part in found[1].split(",")] if found else []
-    except ValueError:
-        numbers = []
+    numbers = _floats(found[1].split(",")) if found else []
     if len(numbers) != count:
         raise InputError(f'expected "{key}: [...]" with {count} numbers, as in the sensor.yaml of EuRoC', path)
     return numbers
@@ -108,15 +99,20 @@ def yaml_numbers(text: str, key: str, count: int, path: Path) -> list[float]:
 def kitti_projection(text: str, camera: str, path: Path) -> np.ndarray:
     """Return the projection (3, 4) of a ``camera``, P0 to P3, from the text of KITTI's ``calib.txt``."""
     found = re.search(rf"^{camera}\s*:(.*)$", text, re.MULTILINE)
-    try:
-        numbers = [float(part) for part in found[1].split()] if found else []
-    except ValueError:
-        numbers = []
+    numbers = _floats(found[1].split()) if found else []
     known = len(numbers) == 12 and np.all(np.isfinite(numbers))
     matrix = np.array(numbers).reshape(3, 4) if known else np.zeros((3, 4))
     if not (matrix[0, 0] > 0 and np.linalg.matrix_rank(matrix[:, :3]) == 3):
         raise InputError(f'expected "{camera}:" and the twelve numbers of a projection, as in KITTI\'s calib.txt', path)
     return matrix
+
+
+def _floats(parts: Sequence[str]) -> list[float]:
+    """Return texts as numbers; none at all where one is no number."""
+    try:
+        return [float(part) for part in parts]
+    except ValueError:
+        return []
 
 
 def _checked(

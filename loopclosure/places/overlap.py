@@ -15,19 +15,17 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_pixels
+from loopclosure.places.frames import read_depth
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.same_place import distances_m, view_angles_deg
-from loopclosure.places.trajectory import Poses, rotation_matrices
-from netspec.files.opencv import cv2
+from loopclosure.places.trajectory import Poses
 
 ASSUMED_M = (2.0, 4.0, 8.0)
 FOV_DEG = 60.0  # of a camera that is not known
 GRID = (6, 8)  # rows and columns of points in a view
-# Depth images of TUM RGB-D: 16 bits, 5000 per meter, 0 where there is no depth.
-DEPTH_UNITS_PER_M = 5000.0
 # A point that is farther than what the other view sees in its direction, by more than this factor, is hidden there.
 HIDDEN = 1.25
 WIDEST_TURN_DEG = 90.0
@@ -91,12 +89,10 @@ def views(poses: Poses, depth_images: Sequence[Path | None] = ()) -> Views:
     for i, path in enumerate(depth_images):
         if path is None:
             continue
-        depth = read_pixels(path, cv2.IMREAD_UNCHANGED)
-        if depth.dtype != np.uint16 or depth.ndim != 2:
-            raise InputError("is not a depth image; expected one channel of 16 bits, 5000 per meter", path)
+        depth = read_depth(path)
         y = ((np.arange(rows) + 0.5) / rows * depth.shape[0]).astype(int)
         x = ((np.arange(columns) + 0.5) / columns * depth.shape[1]).astype(int)
-        meters = depth[np.ix_(y, x)].reshape(-1) / DEPTH_UNITS_PER_M
+        meters = depth[np.ix_(y, x)].reshape(-1)
         measured[i] = meters > 0
         ranges[i, measured[i]] = meters[measured[i], None]
     return Views(poses, ranges, measured)
@@ -119,7 +115,7 @@ def _shares(a: Views, b: Views, settings: ViewOverlap, aspect: float) -> NDArray
     y, x = np.mgrid[:rows, :columns].reshape(2, -1)
     rays = np.stack([(2 * (x + 0.5) / columns - 1) * half, (2 * (y + 0.5) / rows - 1) * half * aspect], axis=1)
     rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
-    rotations_a, rotations_b = rotation_matrices(a.poses.quaternions), rotation_matrices(b.poses.quaternions)
+    rotations_a, rotations_b = (Rotation.from_quat(each.poses.quaternions).as_matrix() for each in (a, b))
     shares = np.zeros((len(a.poses), len(b.poses)))
     reach = 2 * max(a.ranges.max(initial=0), b.ranges.max(initial=0))
     for i in range(len(a.poses)):

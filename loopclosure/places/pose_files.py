@@ -25,7 +25,6 @@ from loopclosure.places.trajectory import (
     associate,
     content_lines,
     number,
-    quaternions_from_matrices,
     read_groundtruth,
 )
 
@@ -132,7 +131,8 @@ def read_poses(path: str | os.PathLike[str], form: PoseForm = PoseForm()) -> Pos
         stamps, positions, quaternions = table[:, 0] * 1e-9, table[:, 1:4], table[:, 4:8]
     else:
         matrices = _rows(path, kind, 12).reshape(-1, 3, 4)
-        stamps, positions, quaternions = None, matrices[:, :, 3], quaternions_from_matrices(matrices[:, :, :3])
+        stamps, positions = None, matrices[:, :, 3]
+        quaternions = Rotation.from_matrix(matrices[:, :, :3]).as_quat(canonical=True)
     if kind != "kitti" and order == "w-first":
         quaternions = np.roll(quaternions, -1, axis=1)
     poses = np.hstack([positions, quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)])

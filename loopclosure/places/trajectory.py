@@ -17,7 +17,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 from netspec.files.whole_file import write_whole
@@ -164,12 +163,7 @@ def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame], what: 
     write_whole(Path(path), "\n".join(lines) + "\n", "backslashreplace")
 
 
-def write_groundtruth(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write ``groundtruth.txt`` as :func:`write_trajectory` does."""
-    write_trajectory(path, trajectory, "ground truth")
-
-
-def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what: str) -> None:
+def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what: str = "ground truth") -> None:
     """Write poses in TUM's form with its three comment lines; meters and quaternions with six decimals."""
     lines = [
         f"# {what} trajectory",
@@ -195,16 +189,6 @@ def associate(
     before = (after - 1).clip(0)
     nearest = np.where(np.abs(stamps[before] - frame_stamps) <= np.abs(stamps[after] - frame_stamps), before, after)
     return np.where(np.abs(stamps[nearest] - frame_stamps) <= max_difference, nearest, -1)
-
-
-def rotation_matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera-to-world matrices (N, 3, 3) of unit quaternions (N, 4) xyzw; their columns are the camera's axes."""
-    return Rotation.from_quat(quaternions).as_matrix()
-
-
-def quaternions_from_matrices(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternions (N, 4) xyzw, w >= 0, of rotation matrices (N, 3, 3)."""
-    return Rotation.from_matrix(matrices).as_quat(canonical=True)
 
 
 def content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple[int, str]]:

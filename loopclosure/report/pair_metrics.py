@@ -39,25 +39,17 @@ class PairMetrics:
         return self.true_positives + self.false_positives + self.true_negatives + self.false_negatives
 
 
-def pair_distances(features_a: np.ndarray, features_b: np.ndarray, metric: str = "euclidean") -> np.ndarray:
-    """Return the distance of each row of ``features_a`` to the same row of ``features_b``.
+def pair_distances(features_a: np.ndarray, features_b: np.ndarray) -> np.ndarray:
+    """Return the Euclidean distance, which ContrastiveLoss trains, of each row to the same row of ``features_b``.
 
     features_a, features_b   (N, D); further axes are flattened
-    metric                   "euclidean", the distance that ContrastiveLoss trains, or "cosine": 1 - cosine similarity
     returns                  (N,) float64
     """
     a = np.asarray(features_a, dtype=np.float64)
     b = np.asarray(features_b, dtype=np.float64)
     if a.shape != b.shape or a.ndim < 2:
         raise InputError(f"the two features of a pair differ in shape: {a.shape} and {b.shape}; expected (N, D) twice")
-    a, b = a.reshape(len(a), -1), b.reshape(len(b), -1)
-    if metric == "euclidean":
-        return np.linalg.norm(a - b, axis=1)
-    if metric == "cosine":
-        norms = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-        # A feature of zeros has no direction: it is similar to nothing.
-        return 1.0 - np.divide(np.sum(a * b, axis=1), norms, out=np.zeros(len(a)), where=norms > 0)
-    raise InputError(f'unknown metric "{metric}"; known: euclidean, cosine')
+    return np.linalg.norm((a - b).reshape(len(a), -1), axis=1)
 
 
 def best_threshold(distances: np.ndarray, labels: np.ndarray) -> float:

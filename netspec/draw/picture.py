@@ -12,30 +12,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from netspec.draw.blocks import Block, find_blocks
-from netspec.draw.diagram import Attached, Box, Diagram, Output
+from netspec.draw.box import INK, LINE, PAD, PALE, SHARED, SMALL, WIDEST, amount_text, box_marks, box_size, color_of
+from netspec.draw.diagram import Diagram, Output
 from netspec.draw.layout import Layout, Piece, Size, Wire, lay_out
 from netspec.draw.marks import Curve, Mark, Rect, Text, moved, shortened, text_width
 from netspec.errors import printable
 
-INK, PALE, WIRE, TRACK, EDGE = "#1f2933", "#52606d", "#7b8794", "#e4e7eb", "#cbd2d9"
-COLORS = {  # by the room of netspec.layers, the most special first
-    "vision.pooling": ("pooling", "#e08e0b"),
-    "vision": ("convolution", "#2f6fb7"),
-    "common": ("inner product", "#7c4fc4"),
-    "recurrent": ("recurrent", "#b83280"),
-    "activation": ("activation", "#2f9e44"),
-    "powers": ("activation", "#2f9e44"),
-    "normalization": ("normalization", "#0c8599"),
-    "scale": ("normalization", "#0c8599"),
-    "loss": ("loss and score", "#d6336c"),
-    "data": ("data", "#495057"),
-    "utility": ("utility", "#868e96"),
-    "dialect": ("dialect", "#a0522d"),
-    "": ("unknown type", "#e03131"),
-}
-NAME, SMALL = 12, 10.5  # sizes of text
-LINE, PAD, STRIP = 15, 8, 5
-ROOM, WIDEST = 190, 290  # width of a text that may be left out, and of any text
+WIRE = "#7b8794"
 LABEL = 17  # height of the shapes under a box
 MARGIN, FRAME, TITLE = 24, 14, 24
 LEAST_GAP, MOST_GAP = 24, 70
@@ -73,19 +56,6 @@ class Picture:
 def picture_of(diagram: Diagram) -> Picture:
     """Return the picture of a net."""
     return _Painter(diagram).paint()
-
-
-def color_of(kind: str) -> tuple[str, str]:
-    """Return what a kind of layers is called, and its color."""
-    return next(COLORS[room] for room in COLORS if not room or kind == room or kind.startswith(f"{room}."))
-
-
-def amount_text(number: int) -> str:
-    """Return ``18.4 M``."""
-    for unit, size in (("T", 10**12), ("G", 10**9), ("M", 10**6), ("k", 10**3)):
-        if number >= size:
-            return f"{number / size:.3g} {unit}" if number < 999.5 * size else f"{number / size:.0f} {unit}"
-    return str(number)
 
 
 def _stack(drawings: Sequence[Drawing]) -> Drawing:
@@ -196,14 +166,15 @@ class _Painter:
 
     def _box_size(self, k: int, entries: int) -> Size:
         box = self.diagram.boxes[k]
-        width = max(_text_width(box), 12 * entries + 2 * PAD)
+        text, height = box_size(box)
+        width = max(text, 12 * entries + 2 * PAD)
         labels = [math.ceil(text_width(label, SMALL)) + 16 for label in self._labels(k)]
         width = max(width, sum(labels) if len(labels) > 1 else 0)
         width += width % 2
         half = width // 2
         right = half if len(labels) > 1 else max(half, *labels, 0)
         port = 8 - half if len(labels) > 1 else 0
-        return Size(half, right, _box_height(box) + LABEL * bool(labels), port, tuple(labels), half - PAD)
+        return Size(half, right, height + LABEL * bool(labels), port, tuple(labels), half - PAD)
 
     def _labels(self, k: int) -> list[str]:
         """Return what stands beside the wires of a box: the shape, and the blob's name where it has another."""
@@ -281,7 +252,7 @@ class _Painter:
         marks: list[Mark] = []
         for (x1, one, size1), (x2, two, size2) in pairwise(placed):
             if one and two and size1 and size2 and self._share(one, two):
-                marks.append(Curve(((x1 + size1.left, 18), (x2 - size2.left, 18)), "#b83280", dashed=True))
+                marks.append(Curve(((x1 + size1.left, 18), (x2 - size2.left, 18)), SHARED, dashed=True))
         return marks
 
     def _share(self, one: _Part, two: _Part) -> bool:
@@ -297,33 +268,8 @@ class _Painter:
 
     def _box(self, k: int, size: Size, ports: Sequence[int]) -> Drawing:
         box = self.diagram.boxes[k]
-        width, height = 2 * size.left, _box_height(box)
-        left = -size.left
-        color = color_of(box.kind)[1]
-        marks: list[Mark] = [
-            Rect(left, 0, width, height, "#ffffff", EDGE, 5, k),
-            Rect(left, 0, STRIP, height, color, radius=2),
-        ]
-        x, y = left + STRIP + PAD, 17
-        name = shortened(printable(box.name), NAME, WIDEST - _badges_width(box.phases), bold=True)
-        marks.append(Text(x, y, name, NAME, INK, bold=True))
-        marks += _badges(box.phases, x + text_width(name, NAME, True) + 6, y)
-        y += LINE
-        marks.append(Text(x, y, _kind_text(box), SMALL, PALE))
-        for attached in box.attached:
-            y += LINE
-            text = _attached_text(attached)
-            marks.append(Rect(x, y - 8, 7, 7, color_of(attached.kind)[1], radius=2))
-            marks.append(Text(x + 12, y, text, SMALL, PALE))
-            marks += _badges(attached.phases, x + 12 + text_width(text, SMALL) + 6, y)
-        if cost := _cost_text(box):
-            y += LINE
-            marks.append(Text(x, y, cost, SMALL, PALE if not box.owner else "#b83280"))
-        if box.work:
-            track = width - STRIP - 2 * PAD
-            filled = max(2.0, round(track * box.work / self.most, 1))
-            marks.append(Rect(x, y + 6, track, 3, TRACK, radius=1.5))
-            marks.append(Rect(x, y + 6, filled, 3, color, radius=1.5))
+        height = box_size(box)[1]
+        marks = box_marks(box, k, 2 * size.left, self.most)
         for port, label in zip(ports, self._labels(k), strict=True):
             marks.append(Text(port + 6, height + 13, label, SMALL, PALE))
         return Drawing(marks, height + LABEL * bool(ports))
@@ -353,58 +299,6 @@ def _curve(x1: float, y1: float, x2: float, y2: float, arrow: bool) -> Curve:
     middle = (y1 + end) / 2
     points = ((x1, y1), (x1, middle), (x2, middle), (x2, end))
     return Curve((*points, (x2, y2)) if arrow else points, WIRE, bent=True, arrow=arrow)
-
-
-def _box_height(box: Box) -> int:
-    lines = 2 + len(box.attached) + bool(_cost_text(box))
-    return 8 + LINE * lines + (8 if box.work else 0)
-
-
-def _text_width(box: Box) -> int:
-    lines = [
-        min(text_width(printable(box.name), NAME, True) + _badges_width(box.phases), WIDEST),
-        text_width(_kind_text(box), SMALL),
-        text_width(_cost_text(box), SMALL),
-    ]
-    for other in box.attached:
-        text = _attached_text(other)
-        lines.append(12 + text_width(text, SMALL) + _badges_width(other.phases))
-    return math.ceil(max(lines)) + STRIP + 2 * PAD
-
-
-def _kind_text(box: Box) -> str:
-    return shortened(printable(" ".join(filter(None, (box.type, box.settings)))), SMALL, WIDEST)
-
-
-def _attached_text(attached: Attached) -> str:
-    """Return the type and the name, with the settings where there is room for them."""
-    text = shortened(printable(f"{attached.type} · {attached.name}"), SMALL, WIDEST - 12)
-    longer = printable(f"{text} · {attached.settings}") if attached.settings else text
-    return longer if text_width(longer, SMALL) <= ROOM else text
-
-
-def _cost_text(box: Box) -> str:
-    words = [f"{amount_text(box.work)} mult-adds"] if box.work else []
-    if box.weights:
-        words.append(f"{amount_text(box.weights)} weights")
-    if box.owner:
-        words.append(shortened(f"weights of {printable(box.owner)}", SMALL, 180))
-    return " · ".join(words)
-
-
-def _badges_width(phases: Sequence[str]) -> float:
-    return sum(text_width(phase, SMALL, True) + 16 for phase in phases)
-
-
-def _badges(phases: Sequence[str], x: float, baseline: float) -> list[Mark]:
-    marks: list[Mark] = []
-    for phase in phases:
-        width = text_width(phase, SMALL, True) + 8
-        color = "#9c4221" if phase == "TRAIN" else "#2b6cb0"
-        marks += [Rect(x, baseline - 11, width, 14, color, radius=3)]
-        marks.append(Text(x + 4, baseline, phase, SMALL, "#ffffff", True))
-        x += width + 4
-    return marks
 
 
 def _title(diagram: Diagram, block: Block) -> str:

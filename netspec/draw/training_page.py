@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from netspec.draw.html import page
 from netspec.draw.style import COLORS, svg
 from netspec.draw.training import MOST_POINTS
 from netspec.runs.curve import Curve, thinned
@@ -22,8 +21,6 @@ _FEW = 6  # test outputs that the cursor reads
 
 def training_page(runs: Sequence[Run], figure: Figure, title: str) -> str:
     """Return the page; ``figure`` is the picture of the runs. It needs nothing from elsewhere."""
-    environment = Environment(autoescape=True, trim_blocks=False)
-    template = environment.from_string(Path(__file__).with_name("training_page.html.jinja").read_text(encoding="utf-8"))
     told = [summary(run) for run in runs]
     columns = list(dict.fromkeys(name for line in told for name in line))
     shown = [
@@ -35,7 +32,8 @@ def training_page(runs: Sequence[Run], figure: Figure, title: str) -> str:
         for number, (run, line) in enumerate(zip(runs, told, strict=True))
     ]
     drawing = svg(figure)
-    return template.render(
+    return page(
+        "training_page.html.jinja",
         title=title,
         runs=shown,
         parts=_PARTS,

@@ -12,13 +12,12 @@ from lmdb_build.walk.house import House, Quad, Room, build_house
 from lmdb_build.walk.render import Camera, Light, Renderer
 from lmdb_build.walk.season import redecorate
 from lmdb_build.walk.sequence import Walk, write_walk
-from loopclosure.closing.measure import read_depth
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_gray
+from loopclosure.places.frames import read_depth, read_gray
 from loopclosure.places.same_place import same_place_matrix
 from loopclosure.places.sequences import read_posed, read_sequence
-from loopclosure.places.trajectory import PosedSequence, read_groundtruth, rotation_matrices
+from loopclosure.places.trajectory import PosedSequence, read_groundtruth
 
 pytestmark = pytest.mark.slow
 
@@ -87,7 +86,7 @@ def test_depth_is_written_in_the_form_of_tum_and_says_how_far_the_walls_are(tmp_
     assert sequence.depths is not None
     assert sequence.poses is not None
     assert sequence.camera is not None
-    first, second = (read_depth(path, SMALL.width, SMALL.height) for path in sequence.depths[:2] if path)
+    first, second = (read_depth(path) for path in sequence.depths[:2] if path)
     assert 0 < first.min() < first.max() < 13.2
     rows, columns = (part.ravel() for part in np.mgrid[4 : SMALL.height : 4, 4 : SMALL.width : 4])
     rays = np.column_stack([sequence.camera.rays(np.column_stack([columns, rows])), np.ones(len(rows))])
@@ -244,7 +243,7 @@ def test_another_season_moves_nothing() -> None:
 
 
 def test_the_camera_is_carried_upright(sequence: PosedSequence) -> None:
-    axes = rotation_matrices(sequence.quaternions)
+    axes = Rotation.from_quat(sequence.quaternions).as_matrix()
     assert (axes[:, 2, 1] < -0.98).all()  # y points down
     assert (np.abs(axes[:, 2, 0]) < 0.05).all()  # x is level
     assert (np.abs(sequence.positions[:, 2] - 1.5) < 0.1).all()

@@ -11,12 +11,10 @@ from loopclosure.places.trajectory import (
     Frame,
     Trajectory,
     associate,
-    quaternions_from_matrices,
     read_groundtruth,
     read_rgb_list,
-    rotation_matrices,
-    write_groundtruth,
     write_rgb_list,
+    write_trajectory,
 )
 from paths import shared
 
@@ -99,7 +97,7 @@ def test_associate_takes_the_nearest_pose_within_the_limit() -> None:
 
 def test_frames_without_a_pose_are_counted_and_left_out(tmp_path: Path) -> None:
     write_rgb_list(tmp_path / "rgb.txt", [Frame(stamp, f"rgb/{stamp:g}.png") for stamp in (1.0, 1.01, 5.0, 2.0)])
-    write_groundtruth(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
+    write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
     sequence = read_posed(tmp_path, "tum")
     assert sequence.name == tmp_path.name
     assert [frame.path for frame in sequence.frames] == ["rgb/1.png", "rgb/1.01.png", "rgb/2.png"]
@@ -110,7 +108,7 @@ def test_frames_without_a_pose_are_counted_and_left_out(tmp_path: Path) -> None:
 
 def test_no_frame_with_a_pose_at_all_says_both_time_spans(tmp_path: Path) -> None:
     write_rgb_list(tmp_path / "rgb.txt", [Frame(100.0, "rgb/a.png")])
-    write_groundtruth(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
+    write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
     with pytest.raises(InputError, match=r"images from 100\.000 to 100\.000 s, poses from 1\.000 to 2\.000 s"):
         read_posed(tmp_path, "tum")
 
@@ -122,18 +120,11 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     written = Trajectory(1e9 + np.arange(20) / 97, rng.normal(size=(20, 3)), quaternions)
     folder = tmp_path / "caf\udce9"  # a name that is not UTF-8
     folder.mkdir()
-    write_groundtruth(folder / "groundtruth.txt", written)
+    write_trajectory(folder / "groundtruth.txt", written)
     back = read_groundtruth(folder / "groundtruth.txt")
     np.testing.assert_allclose(back.stamps, written.stamps, atol=1e-6)
     np.testing.assert_allclose(back.positions, written.positions, atol=1e-6)
     np.testing.assert_allclose(back.quaternions, written.quaternions, atol=2e-6)
-
-
-def test_rotation_matrices_and_quaternions_agree() -> None:
-    turn_left = np.array([[0, 0, 0.5**0.5, 0.5**0.5]])  # by 90 degrees about z
-    matrix = rotation_matrices(turn_left)
-    np.testing.assert_allclose(matrix[0] @ [1, 0, 0], [0, 1, 0], atol=1e-15)
-    np.testing.assert_allclose(quaternions_from_matrices(matrix), turn_left, atol=1e-15)
 
 
 @pytest.mark.parametrize(("name", "posed", "listed"), [("xyz", 796, 798), ("rpy", 721, 723)])

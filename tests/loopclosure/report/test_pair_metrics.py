@@ -12,7 +12,6 @@ def test_distances_of_pairs():
     a = np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 4.0]])
     b = np.array([[3.0, 4.0], [0.0, 2.0], [3.0, 4.0]])
     np.testing.assert_allclose(pair_distances(a, b), [5.0, np.sqrt(5.0), 0.0])
-    np.testing.assert_allclose(pair_distances(a, b, "cosine"), [1.0, 1.0, 0.0], atol=1e-15)
 
 
 def test_distances_flatten_blobs_of_four_axes():
@@ -94,8 +93,6 @@ def test_faults_are_named(distances, labels, sentence):
         best_threshold(np.array(distances), np.array(labels))
 
 
-def test_unequal_features_and_unknown_metric_are_refused():
+def test_unequal_features_are_refused():
     with pytest.raises(InputError, match="differ in shape"):
         pair_distances(np.zeros((2, 3)), np.zeros((2, 4)))
-    with pytest.raises(InputError, match='unknown metric "l1"'):
-        pair_distances(np.zeros((2, 3)), np.zeros((2, 3)), "l1")

@@ -14,10 +14,11 @@ from drawn_coordinates import SCREEN, faults, texts_of
 from each import each, last_parts
 from netspec.cli import main
 from netspec.draw.blocks import find_blocks
+from netspec.draw.box import COLORS, color_of
 from netspec.draw.diagram import Box, Diagram, diagram_of, kind_of
 from netspec.draw.html import html_of
 from netspec.draw.marks import Rect
-from netspec.draw.picture import COLORS, color_of, picture_of
+from netspec.draw.picture import picture_of
 from netspec.draw.settings import settings_text
 from netspec.draw.svg import svg_of
 from netspec.errors import SpecError, Where
