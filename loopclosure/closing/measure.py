@@ -67,12 +67,9 @@ def measure(
         image = read_bgr(sequence.images[frame])
         height, width = image.shape[:2]
         depths = sequence.depths
-        file = None if depths is None else depths[frame]
-        depth = (
-            None
-            if file is None
-            else cv2.resize(read_depth(file).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
-        )
+        file, depth = None if depths is None else depths[frame], None
+        if file is not None:
+            depth = cv2.resize(read_depth(file).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
         return View(CHECK.describe(image), camera.of_size(width, height), depth)
 
     measured = []

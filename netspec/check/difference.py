@@ -11,6 +11,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 from netspec.errors import Where, printable
 from netspec.proto.schema import Field, fields_of
 from netspec.proto.source_map import Place
+from netspec.proto.writer import scalar_text
 
 #: Fields whose absence means something else than their default.
 TOLD_BY_PRESENCE = {
@@ -129,21 +130,8 @@ def _told(field: Field, message: Any) -> str:
     value = field.get(message)
     if field.type == Declared.TYPE_MESSAGE:
         return "given"
-    return " ".join(_words(field, value if field.repeated else [value])) or ABSENT
-
-
-def _words(field: Field, values: Collection[Any]) -> Iterator[str]:
-    for value in values:
-        if field.type == Declared.TYPE_ENUM:
-            yield field.descriptor.enum_type.values_by_number[value].name
-        elif field.type == Declared.TYPE_BOOL:
-            yield "true" if value else "false"
-        elif field.type in (Declared.TYPE_FLOAT, Declared.TYPE_DOUBLE):
-            yield f"{value:.7g}"
-        elif field.type == Declared.TYPE_STRING:
-            yield f'"{value}"'
-        else:
-            yield str(value)
+    values = value if field.repeated else [value]
+    return " ".join(f'"{v}"' if isinstance(v, str) else scalar_text(field, v) for v in values) or ABSENT
 
 
 def labeled(difference: Difference, layer: Any) -> Difference:

@@ -10,7 +10,7 @@ import torch
 from torch.utils.data import Dataset
 from typing_extensions import override
 
-from netspec.datasets.opened import Opened, PerProcess, of_layer
+from netspec.datasets.opened import Opened, PerProcess
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
@@ -48,8 +48,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
     ) -> None:
         state = (phase_of(phase), level, tuple(stages))
         self._opened = PerProcess(partial(_open, str(model), state, layer, seed, rank, ranks))
-        opened = self._opened()
-        cursor = opened.source.cursor
+        cursor = self._opened()[0].cursor
         self._iterations = iterations or -(-cursor.count // (cursor.batch_size * ranks))
 
     def __len__(self) -> int:
@@ -59,13 +58,12 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
     def __getitem__(self, iteration: int) -> dict[str, torch.Tensor]:
         if not 0 <= iteration < self._iterations:
             raise IndexError(f"found iteration {iteration}, expected 0 to {self._iterations - 1}")
-        opened = self._opened()
-        arrays = opened.source.batch(iteration)
-        return {top: torch.from_numpy(array) for top, array in zip(opened.tops, arrays, strict=False)}
+        source, tops = self._opened()
+        return {top: torch.from_numpy(array) for top, array in zip(tops, source.batch(iteration), strict=False)}
 
     def keys(self, iteration: int) -> list[str]:
         """Return the keys (or file names) of the records of an iteration."""
-        return self._opened().source.keys(iteration)
+        return self._opened()[0].keys(iteration)
 
 
 def _open(model: str, state: _State, name: str, seed: int, rank: int, ranks: int) -> Opened:
@@ -88,4 +86,4 @@ def _open(model: str, state: _State, name: str, seed: int, rank: int, ranks: int
     param.phase = phase
     at = partial(source.at, index, layer=param.name, type=param.type)
     context = Context(phase, BuildOptions(data_seed=seed, rank=rank, ranks=ranks), at=at)
-    return of_layer(cls(param, [], context))
+    return cls(param, [], context).source, tuple(param.top)

@@ -4,24 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from netspec.data.sources import Source
-from netspec.layers.data.files import ReadingLayer
 
-
-@dataclass(frozen=True)
-class Opened:
-    """A source, and the names of its tops."""
-
-    source: Source
-    tops: tuple[str, ...]
-
-
-def of_layer(layer: ReadingLayer) -> Opened:
-    """Return what a data layer reads."""
-    return Opened(layer.source, tuple(layer.param.top))
+Opened = tuple[Source, tuple[str, ...]]  # and the names of its tops
 
 
 class PerProcess:

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from typing_extensions import override
 
 from netspec.data.hdf5 import Hdf5Source
-from netspec.datasets.opened import Opened, PerProcess, of_layer
+from netspec.datasets.opened import Opened, PerProcess
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers.context import Context
@@ -55,7 +55,7 @@ class Records(Dataset[tuple[torch.Tensor, ...]]):
         else:
             opener = partial(_open_database, str(source), transform, phase, seed)
         self._opened = PerProcess(opener)
-        self._count = self._opened().source.cursor.count
+        self._count = self._opened()[0].cursor.count
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # workers that stay see a change
 
     def __len__(self) -> int:
@@ -63,12 +63,12 @@ class Records(Dataset[tuple[torch.Tensor, ...]]):
 
     @override
     def __getitem__(self, number: int) -> tuple[torch.Tensor, ...]:
-        arrays = self._opened().source.batch(self._position(number))
+        arrays = self._opened()[0].batch(self._position(number))
         return tuple(torch.from_numpy(array)[0] for array in arrays)
 
     def key(self, number: int) -> str:
         """Return the key of a record."""
-        return self._opened().source.keys(self._position(number))[0]
+        return self._opened()[0].keys(self._position(number))[0]
 
     def set_epoch(self, epoch: int) -> None:
         """Draw mirrors and crops as Caffe does when it reads the records for the ``epoch``-th time, from 0."""
@@ -88,9 +88,9 @@ def _open_database(source: str, transform: str, phase: str, seed: int) -> Opened
     text = f"transform_param {{ {transform} }} {write_text(param)}"
     layer = make_layer(text, [], Context(phase_of(phase), BuildOptions(data_seed=seed)))
     assert isinstance(layer, ReadingLayer)
-    return of_layer(layer)
+    return layer.source, tuple(layer.param.top)
 
 
 def _open_hdf5(source: str, tops: tuple[str, ...]) -> Opened:
     files = [source] if h5py.is_hdf5(source) else source
-    return Opened(Hdf5Source(files, tops, 1), tops)
+    return Hdf5Source(files, tops, 1), tops

@@ -8,6 +8,7 @@ from typing import Any
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 
 from netspec.proto.schema import fields_of
+from netspec.proto.writer import scalar_text
 
 MOST = 6  # settings that are shown
 OWN = "_param"  # how the names of the fields end that hold a layer's own settings
@@ -55,10 +56,4 @@ def _words(param: Any) -> Iterator[str]:
 def _value(field: Any, value: Any) -> str:
     values = list(value) if field.repeated else [value]
     separator = "×" if field.name in WINDOWS else " "
-    if field.type == Declared.TYPE_ENUM:
-        values = [field.descriptor.enum_type.values_by_number[number].name for number in values]
-    elif field.type == Declared.TYPE_BOOL:
-        values = ["true" if value else "false" for value in values]
-    elif field.type in (Declared.TYPE_FLOAT, Declared.TYPE_DOUBLE):
-        values = [f"{value:.6g}" for value in values]
-    return separator.join(map(str, values))
+    return separator.join(each if isinstance(each, str) else scalar_text(field, each) for each in values)

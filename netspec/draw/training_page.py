@@ -55,8 +55,7 @@ def _curves(run: Run, number: int) -> dict[str, object]:
     """Return the curves that the cursor reads, as points (iteration, value); None is a value that is not finite."""
     named = [("loss", run.loss), ("learning rate", run.rate)]
     for net, curves in run.tests.items():
-        label = "test" if len(run.tests) == 1 else f"test net {net}"
-        named += [(f"{label} {name}", curve) for name, curve in list(curves.items())[:_FEW]]
+        named += [(f"{run.test_label(net)} {name}", curve) for name, curve in list(curves.items())[:_FEW]]
     return {
         "name": run.name,
         "color": COLORS[number % len(COLORS)],

@@ -19,6 +19,7 @@ from netspec.proto.lexer import NAME, STRING
 from netspec.proto.schema import NetParameter, fields_of
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net_text, parse_solver_text
+from netspec.proto.writer import scalar_text
 
 ERROR, WARNING, HINT = "error", "warning", "hint"
 BLOBS = ("bottom", "top")
@@ -93,14 +94,7 @@ def _field_text(message: str, field: Any) -> str:
     if field.type == Declared.TYPE_ENUM:
         text += f"\n\none of {', '.join(field.descriptor.enum_type.values_by_name)}"
     if not field.repeated and field.type != Declared.TYPE_MESSAGE:
-        default = field.descriptor.default_value
-        if field.type == Declared.TYPE_ENUM:
-            default = field.descriptor.enum_type.values_by_number[default].name
-        elif field.type == Declared.TYPE_BOOL:
-            default = str(default).lower()
-        elif isinstance(default, str):
-            default = f'"{default}"'
-        text += f"\n\ndefault: {default:.7g}" if isinstance(default, float) else f"\n\ndefault: {default}"
+        text += f"\n\ndefault: {scalar_text(field, field.descriptor.default_value)}"
     return text
 
 

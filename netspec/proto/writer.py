@@ -29,10 +29,11 @@ def _write(message: Message, indent: str, lines: list[str]) -> None:
                 _write(value, indent + "  ", lines)
                 lines.append(f"{indent}}}")
             else:
-                lines.append(f"{indent}{field.name}: {_scalar(field, value)}")
+                lines.append(f"{indent}{field.name}: {scalar_text(field, value)}")
 
 
-def _scalar(field: Field, value: Any) -> str:
+def scalar_text(field: Field, value: Any) -> str:
+    """Return a value of a field that is no message, as the text of a prototxt has it."""
     if field.type == Declared.TYPE_FLOAT:
         return _shortest(value, 6, 9, "f")
     if field.type == Declared.TYPE_DOUBLE:

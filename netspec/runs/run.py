@@ -77,6 +77,10 @@ class Run:
         found = self.settings.get("max_iter", "")
         return int(found) if re.fullmatch(_COUNT, found) else None
 
+    def test_label(self, net: int) -> str:
+        """Return what a test net is called: "test" where it is the only one."""
+        return "test" if len(self.tests) == 1 else f"test net {net}"
+
     def curves(self) -> list[Curve]:
         """Return all curves."""
         tests = [curve for net in self.tests.values() for curve in net.values()]

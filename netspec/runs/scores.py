@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,7 @@ class Scores:
 
     def write(self, path: str | Path) -> None:
         """Write the file atomically. Raises SpecError if it cannot be written."""
-        with whole_file(path) as unfinished:
-            unfinished.write_text(json.dumps(asdict(self), indent=1) + "\n")
+        write_whole(path, json.dumps(asdict(self), indent=1) + "\n")
 
 
 def read_scores(path: str | Path) -> Scores:

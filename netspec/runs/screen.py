@@ -87,11 +87,10 @@ def _scores(run: Run) -> list[str]:
         told.append(f"learning rate {number(run.rate.last)}")
     lines = [", ".join(told)] if told else []
     for net, curves in run.tests.items():
-        label = "test" if len(run.tests) == 1 else f"test net {net}"
         values = [f"{name} {number(curve.values[-1])}" for name, curve in list(curves.items())[:_FEW] if len(curve)]
         at = max((curve.iterations[-1] for curve in curves.values() if len(curve)), default=0)
         if values:
-            lines.append(f"{label} at {at:,}: " + ", ".join(values))
+            lines.append(f"{run.test_label(net)} at {at:,}: " + ", ".join(values))
     return lines
 
 

@@ -16,7 +16,7 @@ def summary(run: Run) -> dict[str, str]:
     if run.loss.last is not None:
         told["last loss"] = number(run.loss.last)
     for net, curves in run.tests.items():
-        label = "test" if len(run.tests) == 1 else f"test net {net}"
+        label = run.test_label(net)
         for name, curve in list(curves.items())[:_FEW]:
             told[f"{label} {name}"] = number(curve.values[-1])
             finite = [value for value in curve.values if math.isfinite(value)]
