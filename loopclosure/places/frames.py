@@ -89,7 +89,7 @@ def read_depth(path: str | Path) -> np.ndarray:
     """Read a depth image of TUM RGB-D (16 bits, 5000 per meter) as meters (H, W), 0 where not known; or InputError."""
     image = read_pixels(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype != np.uint16:
-        raise InputError("is no depth image; expected one channel of 16 bits, 5000 per meter, as of TUM RGB-D", path)
+        raise InputError("is not a depth image; expected one channel of 16 bits, 5000 per meter, as of TUM RGB-D", path)
     return image / DEPTH_PER_M
 
 
