@@ -13,7 +13,7 @@ import pytest
 
 from fresh_dialects import fresh_dialects
 
-OTHERS = {"PYTEST_CURRENT_TEST", "TORCHINDUCTOR_CACHE_DIR"}  # set by pytest, and by torch once it compiles
+LIBRARIES = ("PYTEST", "TORCH", "_TORCH", "TRITON", "KMP", "OPENCV", "QT")  # set variables of theirs once they are used
 LOGGERS = [logging.getLogger(name) for name in ("", "netspec", "loopclosure", "lmdb_build")]
 SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)]  # Windows has no SIGHUP
 
@@ -36,7 +36,7 @@ def settings() -> dict[str, Any]:
     import torch
 
     return {
-        **{name: value for name, value in os.environ.items() if name not in OTHERS},
+        **{name: value for name, value in os.environ.items() if not name.startswith(LIBRARIES)},
         "folder": os.getcwd(),
         "handlers of signals": [signal.getsignal(number) for number in SIGNALS],
         "loggers": [(log.name, log.level, log.propagate, log.disabled, list(log.handlers)) for log in LOGGERS],
