@@ -17,6 +17,7 @@ COLORS = {  # by the room of netspec.layers, the most special first
     "recurrent": ("recurrent", "#b83280"),
     "activation": ("activation", "#2f9e44"),
     "powers": ("activation", "#2f9e44"),
+    "contrast": ("normalization", "#0c8599"),
     "normalization": ("normalization", "#0c8599"),
     "scale": ("normalization", "#0c8599"),
     "loss": ("loss and score", "#d6336c"),
