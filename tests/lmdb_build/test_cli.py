@@ -62,6 +62,7 @@ def test_what_it_says_of_its_lists_is_what_convert_needs(
     assert (out / "mean.binaryproto").stat().st_size > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", ["--different-scenes", "-different-scenes=true", "-nodifferent-scenes -different-scenes"]
 )

@@ -44,6 +44,7 @@ def as_sets(pairs: np.ndarray) -> set[tuple[int, int]]:
     return {(min(a, b), max(a, b)) for a, b in pairs.tolist()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["time", "group"])
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("lengths", [(120, 90, 110), (61, 200, 40, 77)])

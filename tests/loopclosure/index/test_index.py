@@ -27,6 +27,7 @@ def each_index(metrics: tuple[str, ...]) -> list:
     return [pytest.param((*one.values, metric), marks=one.marks) for one in NAMES for metric in metrics]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", each_index(("cosine", "euclidean")), ids=str)
 def test_the_most_similar_are_found(kind: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -68,6 +68,7 @@ def test_they_find_the_second_lap(spec, two_laps, tmp_path):
     assert outcome.name == spec.partition(":")[0]
 
 
+@pytest.mark.slow
 def test_vlad_of_orb_words(tmp_path):
     paths = []
     for i in range(10):

@@ -106,6 +106,7 @@ DATA_LAYERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["check", "time", "train"])
 @pytest.mark.parametrize("kind", DATA_LAYERS)
 def test_data_that_takes_too_much(command: str, kind: str, capsys: pytest.CaptureFixture[str]) -> None:

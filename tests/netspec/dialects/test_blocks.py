@@ -29,6 +29,7 @@ def run(layer: Layer, *bottoms: torch.Tensor) -> np.ndarray:
     return top.detach().numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [2, 4])
 def test_axpy(build: Build, gradcheck: Gradcheck, axes: int) -> None:
     a, x, y = numbers(2, 3, 1, 1)[(...,) if axes == 4 else (..., 0, 0)], numbers(2, 3, 4, 5), numbers(2, 3, 4, 5)

@@ -33,6 +33,7 @@ def test_a_layer_computes_what_the_fork_computed(folder: Path) -> None:
         assert float(np.abs(value - case.golden[key]).max(initial=0)) <= 1e-5 * scale, key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["enet", "crnn"])
 def test_a_training_follows_the_fork(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(FORKS / "training" / name, tmp_path / name)

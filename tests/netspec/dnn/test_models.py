@@ -17,6 +17,7 @@ def read(folder: Path) -> dnn.Net:
     return dnn.readNet(str(weights), str(prototxt))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OPENCV)
 def test_outputs_are_opencvs(name: str) -> None:
     folder = shared("golden", "models", name)

@@ -65,6 +65,7 @@ def test_a_request_with_wrong_parameters_is_answered(params: object) -> None:
     assert "result" in answer(found, 99)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise",
     [

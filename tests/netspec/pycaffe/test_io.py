@@ -177,6 +177,7 @@ def test_settings_that_do_not_suit_the_input(transformer: Transformer) -> None:
 # ---- Images ----
 
 
+@pytest.mark.slow
 def test_images_are_loaded_as_scikit_image_does(tmp_path: Path) -> None:
     skimage_io = pytest.importorskip("skimage.io")
     from skimage import img_as_float

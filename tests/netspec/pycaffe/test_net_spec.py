@@ -164,6 +164,7 @@ def test_a_spec_is_copied() -> None:
     assert copy.deepcopy(n).to_proto() == n.to_proto()
 
 
+@pytest.mark.slow
 def test_a_deep_net_needs_no_deep_stack() -> None:
     top = L.Input(shape={"dim": [1, 1]})
     for _ in range(3000):

@@ -27,6 +27,7 @@ def solver(write: Callable[..., str]) -> caffe.SGDSolver:
     return solver
 
 
+@pytest.mark.slow
 def test_solve(solver: caffe.SGDSolver) -> None:
     assert solver.iter == 0
     solver.solve()
@@ -64,6 +65,7 @@ def test_snapshot_and_restore(solver: caffe.SGDSolver) -> None:
     assert (solver.net.params["filters"][0].data == weights).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SGD", "Nesterov", "AdaGrad", "RMSProp", "AdaDelta", "Adam"])
 def test_six_solvers(name: str, write: Callable[..., str]) -> None:
     write(SMALL)

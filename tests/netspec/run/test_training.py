@@ -70,6 +70,7 @@ def is_prepared(solver: Solver) -> bool:
     return isinstance(solver.net._training, TrainingStep)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", ["momentum: 0.9", 'type: "Adam" iter_size: 2', 'type: "AdaGrad" clip_gradients: 0.1'])
 @pytest.mark.parametrize("exact", ["none", "small", "all"])
 @pytest.mark.parametrize("net", NETS)
