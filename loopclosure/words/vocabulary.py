@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -106,15 +105,8 @@ def nearest_centers(descriptors: np.ndarray, centers: np.ndarray) -> np.ndarray:
     return nearest
 
 
-def check_kmeans() -> None:
-    """Raise InputError where scikit-learn, which has k-means, is not installed."""
-    if find_spec("sklearn") is None:
-        raise InputError("a vocabulary by k-means needs scikit-learn: pip install 'netspec-caffe[sklearn]'")
-
-
 def kmeans(descriptors: np.ndarray, words: int, seed: int = 0) -> np.ndarray:
-    """Return ``words`` centers (words, d) float32 of the descriptors (n, d) by mini-batch k-means; or InputError."""
-    check_kmeans()
+    """Return ``words`` centers (words, d) float32 of the descriptors (n, d) by mini-batch k-means."""
     from sklearn.cluster import MiniBatchKMeans
 
     if len(descriptors) < words:

@@ -17,7 +17,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
 from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
-from loopclosure.words.vocabulary import Extractor, Vocabulary, check_kmeans, kmeans, sequential_clusters
+from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
 from netspec.errors import SpecError
 from netspec.files.arrays import check_array, from_json, read_npz
 from netspec.files.whole_file import whole_file
@@ -127,8 +127,6 @@ def train(
     paths = [Path(image).resolve() for image in images]
     if not paths:
         raise InputError("a vocabulary needs training images, of other places than the tested ones; none are given")
-    if training.words:
-        check_kmeans()  # before the features are found, which takes minutes
     rng = np.random.default_rng(training.seed)
     share = max(1, training.max_descriptors // len(paths))
     found = []

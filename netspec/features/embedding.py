@@ -45,7 +45,6 @@ def in_plane(values: np.ndarray, method: str = PCA) -> tuple[np.ndarray, str]:
     """Return descriptors (N, D) as points (N, 2), and a sentence that says what the plane is.
 
     The signs of principal components are chosen so that the entry of greatest size is positive; t-SNE starts from them.
-    Raises SpecError where scikit-learn, which has t-SNE, is not installed.
     """
     centered = values - values.mean(axis=0)
     left, sizes, right = np.linalg.svd(centered, full_matrices=False)
@@ -56,10 +55,7 @@ def in_plane(values: np.ndarray, method: str = PCA) -> tuple[np.ndarray, str]:
     shares = np.square(sizes) / max(float(np.square(sizes).sum()), 1e-300)
     if method == PCA:
         return points, f"two principal components, {100 * shares[:2].sum():.0f} % of the variance"
-    try:
-        from sklearn.manifold import TSNE as TSne
-    except ImportError:
-        raise SpecError("--method tsne needs scikit-learn: pip install 'netspec-caffe[sklearn]'") from None
+    from sklearn.manifold import TSNE as TSne
 
     perplexity = min(_PERPLEXITY, (len(values) - 1) / 3)
     start: Any = points / max(float(points[:, 0].std()), 1e-12) * 1e-4

@@ -1,6 +1,3 @@
-import sys
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +5,6 @@ from scipy.spatial.distance import cdist
 
 from loopclosure.errors import InputError
 from loopclosure.words.vocabulary import Extractor, Vocabulary, founders, kmeans, nearest_centers, sequential_clusters
-from loopclosure.words.word_model import train
 
 
 def texture(seed: int) -> np.ndarray:
@@ -95,13 +91,6 @@ def test_kmeans_finds_clusters_and_follows_the_seed() -> None:
 def test_kmeans_needs_as_many_descriptors_as_words() -> None:
     with pytest.raises(InputError, match="7 descriptors cannot make 8 words"):
         kmeans(unit_vectors(7), 8)
-
-
-def test_kmeans_without_scikit_learn_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "sklearn", None)
-    with pytest.raises(InputError) as found:
-        train([Path("a.png")])  # before any image is read
-    assert str(found.value) == "a vocabulary by k-means needs scikit-learn: pip install 'netspec-caffe[sklearn]'"
 
 
 def founders_one_by_one(descriptors: np.ndarray, radius: float) -> list[int]:

@@ -1,7 +1,6 @@
 """Pictures of nets: ``filters``, ``maps``, ``saliency``, ``embedding``, and what they are drawn from."""
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from matplotlib.offsetbox import AnnotationBbox
 import netspec
 from netspec.data.stored_weights import stored_layers
 from netspec.draw.learned import embedding_figure, filters_figure, maps_figure, saliency_figure
-from netspec.errors import SpecError
 from netspec.features.embedding import in_plane, read_features
 from netspec.features.images import ImageNet
 from netspec.features.saliency import of_distance, of_unit
@@ -97,13 +95,6 @@ def test_principal_components_keep_distances_in_a_plane() -> None:
 
 
 @pytest.mark.slow
-def test_tsne_without_scikit_learn_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "sklearn.manifold", None)
-    with pytest.raises(SpecError) as found:
-        in_plane(np.eye(3), "tsne")
-    assert str(found.value) == "--method tsne needs scikit-learn: pip install 'netspec-caffe[sklearn]'"
-
-
 def test_tsne_keeps_clusters_apart_and_is_always_the_same() -> None:
     rng = np.random.default_rng(0)
     values = np.concatenate([rng.normal(size=(20, 6)), rng.normal(size=(20, 6)) + 20])
