@@ -83,14 +83,16 @@ def in_half_precision(values: np.ndarray) -> Any:
 def _values(proto: Any, names: tuple[str, str]) -> np.ndarray:
     single, double = names
     name, dtype = (double, "<f8") if len(getattr(proto, double)) else (single, "<f4")
-    runs = _Runs.FromString(proto.SerializeToString())
-    values = np.frombuffer(getattr(runs, name), dtype)
-    shape = shape_of(proto)
-    count = math.prod(shape)
-    if len(values) != count and not len(values) and names == _DATA and runs.raw_data:
+    numbers, shape = getattr(proto, name), shape_of(proto)
+    count, runs = math.prod(shape), None
+    if not numbers or not hasattr(numbers, "__array__"):  # only newer protobuf's numbers have it
+        runs = _Runs.FromString(proto.SerializeToString())
+    if len(numbers) != count and not numbers and names == _DATA and runs and runs.raw_data:
         return _raw_values(runs, count).reshape(shape)
-    if len(values) != count:
-        raise ValueError(f"found {len(values)} numbers in {name}, expected {count} for shape {shape}")
+    if len(numbers) != count:
+        raise ValueError(f"found {len(numbers)} numbers in {name}, expected {count} for shape {shape}")
+    values = np.frombuffer(getattr(runs, name), dtype) if runs else np.asarray(numbers, dtype)
+    values.flags.writeable = False
     return values.reshape(shape)
 
 
