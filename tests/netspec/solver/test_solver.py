@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
+from netspec.layers.reading import Fed
 from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 from netspec.solver.snapshot import read_state
@@ -158,6 +159,19 @@ def test_the_learning_rate_is_that_of_the_iteration_to_come(make):
         rates.append(solver.learning_rate)
         solver.step(1)
     assert rates == pytest.approx([0.1, 0.1, 0.05, 0.05])
+
+
+def test_a_step_asks_no_layer_what_it_is(make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether it is fed, or waits for records, is known before: to ask takes longer than a small layer's pass."""
+    solver = make()
+    solver.step(1)
+
+    def refuse(protocol: type, layer: object) -> bool:
+        raise AssertionError(f"{protocol.__name__} was asked for")
+
+    monkeypatch.setattr(type(Fed), "__instancecheck__", refuse)
+    solver.step(1)
+    assert solver.iteration == 2
 
 
 # Snapshots and requests
