@@ -7,23 +7,18 @@ import sys
 from collections.abc import Sequence
 
 from netspec.cli import (
-    bug_report,
     caffe_tools,
     check,
-    completion,
     data,
-    diff,
-    draw,
     export,
     extract,
-    fmt,
-    layers,
     lint,
     look,
-    lsp,
     measure,
+    nets,
     plot,
     run_script,
+    shell,
     train,
     watch,
 )
@@ -33,11 +28,11 @@ from netspec.terminal.commands import program, run
 # The headings of ``netspec --help``, and the modules whose commands stand below each.
 _GROUPS = {
     "Caffe's programs": (train, measure, caffe_tools),
-    "look at nets": (check, lint, draw, diff, fmt, layers, look),
+    "look at nets": (check, lint, nets, look),
     "look at data and trainings": (data, plot, watch),
     "use a net elsewhere": (extract, export),
     "old programs": (run_script,),
-    "editor, shell, help": (lsp, completion, bug_report),
+    "editor, shell, help": (shell,),
 }
 
 

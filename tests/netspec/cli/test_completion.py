@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from netspec.cli import main, parser
-from netspec.cli.completion import SHELLS
+from netspec.cli.shell import SHELLS
 
 pytest.importorskip("shtab")
 

@@ -1,0 +1,82 @@
+"""``netspec lsp``, ``completion`` and ``bug-report``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from netspec.cli.run import Commands
+from netspec.errors import SpecError
+from netspec.files.whole_file import write_whole
+
+SHELLS = ("bash", "zsh", "fish")
+WORDS = (None, str, Path)  # the types of values that may be names of files
+
+
+def add_to(commands: Commands) -> None:
+    """Add the commands."""
+    summary = "a language server for editors, on standard input and output"
+    commands.add("lsp", _serve, summary, quiet=True).set_defaults(log_form=None)
+
+    p = commands.add("completion", _complete, "print a shell's completion")
+    p.description = """Print what makes a shell complete the commands of netspec.
+    bash: netspec completion bash > ~/.local/share/bash-completion/completions/netspec;
+    zsh: netspec completion zsh > a file _netspec in a folder of $fpath;
+    fish: netspec completion fish > ~/.config/fish/completions/netspec.fish"""
+    p.add_argument("shell", choices=SHELLS, help="the shell")
+    p.set_defaults(log_form=None)
+
+    summary = "collect versions, and files' shapes without weights or images, for a report of a fault"
+    p = commands.add("bug-report", _bug_report, summary, quiet=True)
+    p.add_argument("files", nargs="*", metavar="FILE", help="prototxt, weights, database, log: what the fault is about")
+    p.add_argument("--out", metavar="F.md", help="write the report here (default: print it)")
+
+
+def _serve(arguments: argparse.Namespace) -> None:
+    try:
+        from netspec.editor.server import make_server
+    except ImportError as fault:
+        if not (fault.name or "").startswith(("pygls", "lsprotocol")):
+            raise
+        raise SpecError("the language server needs pygls: pip install pygls, or 'netspec-caffe[lsp]'") from None
+    from importlib.metadata import version
+
+    from netspec.editor.messages import Messages
+
+    make_server(version("netspec-caffe")).start_io(Messages(sys.stdin.buffer))  # type: ignore[arg-type]
+
+
+def _complete(arguments: argparse.Namespace) -> None:
+    from netspec.cli import parser  # which makes the parser of all commands, this one among them
+
+    try:
+        import shtab
+    except ImportError:
+        raise SpecError("completion needs shtab: pip install shtab, or 'netspec-caffe[completion]'") from None
+    made = parser()
+    for action in _actions(made):
+        if action.nargs != 0 and not action.choices and action.type in WORDS:
+            vars(action)["complete"] = shtab.FILE
+    print(shtab.complete(made, shell=arguments.shell))
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Yield the arguments of a parser and of its commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _actions(command)
+
+
+def _bug_report(arguments: argparse.Namespace) -> None:
+    from netspec.check.bug_report import bug_report
+
+    text = bug_report(arguments.files)
+    if not arguments.out:
+        print(text, end="")
+        return
+    write_whole(arguments.out, text)
+    print(f"{arguments.out}: read it before you send it; a prototxt and a log are in it as they are")
