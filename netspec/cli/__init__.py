@@ -12,7 +12,6 @@ from netspec.cli import (
     data,
     export,
     extract,
-    lint,
     look,
     measure,
     nets,
@@ -28,7 +27,7 @@ from netspec.terminal.commands import program, run
 # The headings of ``netspec --help``, and the modules whose commands stand below each.
 _GROUPS = {
     "Caffe's programs": (train, measure, caffe_tools),
-    "look at nets": (check, lint, nets, look),
+    "look at nets": (check, nets, look),
     "look at data and trainings": (data, plot, watch),
     "use a net elsewhere": (extract, export),
     "old programs": (run_script,),

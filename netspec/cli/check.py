@@ -1,4 +1,4 @@
-"""``netspec check``."""
+"""``netspec check`` and ``netspec lint``."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import shutil
 import sys
 
 from netspec.cli.arguments import add_passes, add_python, add_shapes, add_state, add_strict, options
-from netspec.cli.run import BUILT, Commands
+from netspec.cli.run import BUILT, READ, Commands
 from netspec.errors import printable
 from netspec.process.garbage import no_collection
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import PHASES
-from netspec.terminal.commands import refuse
+from netspec.terminal.commands import DONE, SOMETHING, UNREADABLE, WrongUsage, refuse
 
 
 def add_to(commands: Commands) -> None:
-    """Add the command."""
+    """Add the commands."""
     p = commands.add(
         "check",
         _check,
@@ -38,6 +38,17 @@ def add_to(commands: Commands) -> None:
         help="print blobs, params, inputs, outputs as JSON; or the faults, if any",
     )
     add_strict(p)
+    add_python(p)
+
+    p = commands.add(
+        "lint", _lint, "find what is legal but likely a mistake, in nets and solvers", quiet=True, net=READ
+    )
+    p.add_argument("files", nargs="*", metavar="FILE", help="a net's or a solver's prototxt")
+    p.add_argument("--rules", action="store_true", help="print the rules, with their reasons")
+    p.add_argument("--json", action="store_true", help="print faults and findings as JSON, one object for each file")
+    add_state(p, phase=None)
+    add_shapes(p, "the shape of a data layer's top; some rules need shapes")
+    p.add_argument("--data", action="store_true", help="open databases, lists and mean files")
     add_python(p)
 
 
@@ -86,3 +97,30 @@ def _check(arguments: argparse.Namespace) -> int:
         if arguments.plan:
             print(plan_text(net) + "\n")
     return 0
+
+
+def _lint(arguments: argparse.Namespace) -> int:
+    if arguments.rules == bool(arguments.files):
+        raise WrongUsage("give files, or --rules")
+    if arguments.rules:
+        refuse(
+            arguments, ("json", "level", "stage", "shape", "data", "allow_python_layers"), "is for files, not --rules"
+        )
+    from netspec.check.findings import RULES, said_as_json, said_once
+    from netspec.check.lint import lint_file
+
+    for rule in sorted(RULES.values(), key=lambda rule: rule.name) if arguments.rules else ():
+        print(f"{rule.name}: {rule.reason}")
+    status = DONE
+    for path in arguments.files:
+        given = dict(arguments.shape)
+        linted = lint_file(path, options(arguments, device="meta", given_shapes=given, passes=()))
+        for fault in linted.unknown:
+            print(f"warning: {fault}; rules that need shapes are not applied", file=sys.stderr)
+        if arguments.json:
+            print(json.dumps({"file": path, **said_as_json(linted.faults, linted.found)}))
+        for line in [*linted.faults, *said_once(linted.found)] if not arguments.json else ():
+            print(line, file=sys.stdout if linted.readable else sys.stderr)
+        found = SOMETHING if linted.faults or linted.found else DONE
+        status = max(status, found if linted.readable else UNREADABLE)
+    return status
