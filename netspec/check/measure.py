@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import torch
 
@@ -34,17 +35,8 @@ def time_net(net: Net, iterations: int) -> None:
     info("caffe.cpp:351", "Performing Forward")
     info("caffe.cpp:356", f"Initial loss: {number(_pass(net, [0.0] * layers, [0.0] * layers))}")
     info("caffe.cpp:357", "Performing Backward")
-    info("caffe.cpp:365", "*** Benchmark begins ***")
-    info("caffe.cpp:366", f"Testing for {iterations} iterations.")
     forward, backward = [0.0] * layers, [0.0] * layers
-    began = time.perf_counter()
-    for k in range(1, iterations + 1):
-        start = time.perf_counter()
-        _pass(net, forward, backward)
-        info(
-            "caffe.cpp:394", f"Iteration: {k} forward-backward time: {number((time.perf_counter() - start) * 1e3)} ms."
-        )
-    total = (time.perf_counter() - began) * 1e3
+    total = _milliseconds(iterations, "forward-backward", lambda: _pass(net, forward, backward))
     info("caffe.cpp:397", "Average time per layer: ")
     for node, ahead, back in zip(net.plan.nodes, forward, backward, strict=True):
         info("caffe.cpp:400", f"{node.name:>10}\tforward: {number(ahead * 1e3 / iterations)} ms.")
@@ -65,17 +57,22 @@ def time_forward(net: Net, iterations: int) -> None:
     with torch.no_grad():
         info("caffe.cpp:351", "Performing Forward")
         info("caffe.cpp:356", f"Initial loss: {number(float(net.forward_loss(**inputs)[0]))}")
-        info("caffe.cpp:365", "*** Benchmark begins ***")
-        info("caffe.cpp:366", f"Testing for {iterations} iterations.")
-        began = time.perf_counter()
-        for k in range(1, iterations + 1):
-            start = time.perf_counter()
-            net(**inputs)
-            info("caffe.cpp:394", f"Iteration: {k} forward time: {number((time.perf_counter() - start) * 1e3)} ms.")
-    total = (time.perf_counter() - began) * 1e3
+        total = _milliseconds(iterations, "forward", lambda: net(**inputs))
     info("caffe.cpp:408", f"Average Forward pass: {number(total / iterations)} ms.")
     info("caffe.cpp:414", f"Total Time: {number(total)} ms.")
     info("caffe.cpp:415", "*** Benchmark ends ***")
+
+
+def _milliseconds(iterations: int, what: str, run: Callable[[], object]) -> float:
+    """Call a function so often; log the time of each call and return that of all."""
+    info("caffe.cpp:365", "*** Benchmark begins ***")
+    info("caffe.cpp:366", f"Testing for {iterations} iterations.")
+    began = time.perf_counter()
+    for k in range(1, iterations + 1):
+        start = time.perf_counter()
+        run()
+        info("caffe.cpp:394", f"Iteration: {k} {what} time: {number((time.perf_counter() - start) * 1e3)} ms.")
+    return (time.perf_counter() - began) * 1e3
 
 
 def _pass(net: Net, forward: list[float], backward: list[float]) -> float:
