@@ -72,18 +72,6 @@ def _lrn(layer: Layer) -> int:
     return first + ((size + 2 * (channels - size)) * pixels if half < channels else 0)
 
 
-def _power(layer: Layer) -> int:
-    return (2 if layer.param.power_param.power == 1 else 10) * math.prod(layer.bottom_shapes[0])
-
-
-def _eltwise(layer: Layer) -> int:
-    return len(layer.bottom_shapes) * math.prod(layer.bottom_shapes[0])
-
-
-def _scale(layer: Layer) -> int:
-    return 2 * sum(map(math.prod, layer.bottom_shapes))
-
-
 def _mvn(layer: Layer) -> int:
     shape: Shape = layer.bottom_shapes[0]
     axes = 2 if layer.param.mvn_param.normalize_variance else 1
@@ -101,12 +89,12 @@ _COUNTS: dict[str, Callable[[Layer], int]] = {
     "ConvolutionDepthwise": _convolution,
     "DepthwiseConvolution": _convolution,
     "Deconvolution": _deconvolution,
-    "Eltwise": _eltwise,
+    "Eltwise": lambda layer: len(layer.bottom_shapes) * math.prod(layer.bottom_shapes[0]),
     "InnerProduct": _inner_product,
     "LRN": _lrn,
     "MVN": _mvn,
     "Pooling": _pooling,
-    "Power": _power,
+    "Power": lambda layer: (2 if layer.param.power_param.power == 1 else 10) * math.prod(layer.bottom_shapes[0]),
     "PriorBox": _prior_box,
-    "Scale": _scale,
+    "Scale": lambda layer: 2 * sum(map(math.prod, layer.bottom_shapes)),
 }

@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
-import torch
 
 from netspec.dnn.caffe_files import CaffeFiles
 from netspec.dnn.costs import operations
@@ -119,7 +118,8 @@ class Described:
     def getMemoryConsumption(self, *arguments: Any, **named: Any) -> tuple[int, int]:
         """Return bytes of weights and of tops, of all layers or of one; arguments as :meth:`getFLOPS`."""
         net, entries = self._asked("getMemoryConsumption", arguments, named)
-        weights = sum(blob.numel() for entry in entries for blob in self._own_blobs(net, entry))
+        owners = [entry for entry in entries if entry.name != INPUT and entry.top <= 0]
+        weights = sum(blob.numel() for entry in owners for blob in self._layer(net, entry).blobs)
         return 4 * weights, 4 * sum(math.prod(shape) for entry in entries for shape in self._shapes(net, entry)[1])
 
     def _asked(self, func: str, arguments: Sequence[Any], named: Mapping[str, Any]) -> tuple[CaffeNet, list[Entry]]:
@@ -160,9 +160,6 @@ class Described:
         if layer.type == "Axpy":
             return (2 if entry.top < 0 else 1) * sum(math.prod(shape) for shape in self._shapes(net, entry)[0])
         return operations(layer)
-
-    def _own_blobs(self, net: CaffeNet, entry: Entry) -> Iterable[torch.Tensor]:
-        return () if entry.name == INPUT or entry.top > 0 else self._layer(net, entry).blobs
 
     # What changes nothing, and what it refuses
 

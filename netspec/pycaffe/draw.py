@@ -90,7 +90,8 @@ def get_pydot_graph(
             continue
         key = f"{layer.name}_{layer.type}"
         in_place = len(layer.bottom) == 1 and list(layer.bottom) == list(layer.top)
-        style = NEURON_LAYER_STYLE if in_place else _style(layer)
+        colored = {**LAYER_STYLE_DEFAULT, "fillcolor": choose_color_by_layertype(layer.type)}
+        style = NEURON_LAYER_STYLE if in_place else colored
         nodes[key] = pydot.Node(get_layer_label(layer, rankdir, display_lrm), **style)
         for blob in layer.bottom:
             nodes[f"{blob}_blob"] = pydot.Node(_quoted(blob), **BLOB_STYLE)
@@ -159,10 +160,6 @@ def choose_color_by_layertype(layertype: str) -> str:
 def get_pooling_types_dict() -> dict[int, str]:
     """Return the names of the pooling methods by their numbers."""
     return {number: name for name, number in caffe_pb2.PoolingParameter.PoolMethod.items()}
-
-
-def _style(layer: Any) -> dict[str, str]:
-    return {**LAYER_STYLE_DEFAULT, "fillcolor": choose_color_by_layertype(layer.type)}
 
 
 def _included(layer: Any, phase: int) -> bool:

@@ -192,10 +192,6 @@ def _scipy_misc(misc: Any) -> None:
         _give(misc, name, getattr(special, name))
 
 
-def _scipy_ndimage(ndimage: Any) -> None:
-    _give(ndimage, "imread", imread)
-
-
 def imread(name: Any, flatten: bool = False, mode: str | None = None) -> Any:
     """Return an image file as an array, (H, W) or (H, W, 3 or 4) uint8; with ``flatten`` as gray float32."""
     from PIL import Image
@@ -352,7 +348,7 @@ _PATCHES: dict[str, Callable[[Any], None]] = {
     "numpy": _numpy,
     "numpy.random": _numpy_random,
     "scipy.misc": _scipy_misc,
-    "scipy.ndimage": _scipy_ndimage,
+    "scipy.ndimage": lambda ndimage: _give(ndimage, "imread", imread),
     "skimage.io": _skimage_io,
     "skimage.color": _skimage_color,
     "lmdb": _lmdb,

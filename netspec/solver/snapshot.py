@@ -126,13 +126,9 @@ def _read_hdf5(path: str | Path) -> State:
         if history is None:
             raise SpecError("this is not a solver state: /history is not a group")
         learned_net = bytes(file.values("learned_net").item()).decode() if "learned_net" in file.names() else ""
-        arrays = [_floats(history, str(i)) for i in range(len(history.names()))]
+        arrays = [history.values(str(i)).astype(np.float32) for i in range(len(history.names()))]
         iteration, step = (_whole_number(file, name) for name in ("iter", "current_step"))
         return State(iteration, learned_net, step, arrays)
-
-
-def _floats(group: Hdf5Group, name: str) -> np.ndarray:
-    return group.values(name).astype(np.float32)
 
 
 def _whole_number(group: Hdf5Group, name: str) -> int:

@@ -44,11 +44,6 @@ class Floor(torch.autograd.Function):
         return grads[0], None
 
 
-def _around(shape: Shape, axis: int) -> tuple[int, int]:
-    """Return how many elements lie before and after an axis."""
-    return math.prod(shape[:axis]), math.prod(shape[axis + 1 :])
-
-
 class Classified(Layer):
     """Base of the layers that compare class scores along an axis with integer labels."""
 
@@ -58,7 +53,7 @@ class Classified(Layer):
         """Keep outer x classes x inner of the scores; refuse labels of another count than outer x inner."""
         scores, labels = bottom_shapes[:2]
         axis = self.canonical_axis(axis, scores, *path)
-        self.outer, self.inner = _around(scores, axis)
+        self.outer, self.inner = math.prod(scores[:axis]), math.prod(scores[axis + 1 :])
         self.classes = scores[axis]
         if math.prod(labels) != self.outer * self.inner:
             raise self.error(
