@@ -36,7 +36,7 @@ def bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch
     def run(scores: torch.Tensor) -> torch.Tensor:
         np.maximum.reduce(scores.numpy(), 1, out=greatest, keepdims=True)
         torch.sub(scores, largest, out=p)  # never above 0: see libm.exp
-        np.copyto(values, np.exp(values.astype(np.complex64)).real)
+        np.copyto(values, np.real(np.exp(values.astype(np.complex64))))
         totals.fill(0)
         for each, total in rows:
             add_up(1.0, each, ones, 1.0, total, 0, 1, 0, 1, 0, 1)
