@@ -64,14 +64,14 @@ def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Whe
             yield line.strip(), Where(path, number, 1)
 
 
-def read_image_list(path: str) -> list[ListedImage]:
+def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:
     """Read lines of ``name label``, split at the last space, so that names may contain spaces.
 
     Raises SpecError for a line without an integer label, and for a list without lines. (Caffe reads a label that is not
     a number as 0.)
     """
     images = []
-    for line, place in list_lines(path):
+    for line, place in list_lines(path, where):
         name, _, label = line.rpartition(" ") if " " in line else line.rpartition("\t")
         try:
             images.append(ListedImage(name.rstrip(), int(label), place))
@@ -80,5 +80,5 @@ def read_image_list(path: str) -> list[ListedImage]:
         if not name:
             raise SpecError(f'found "{line}", expected an image name, a space and an integer label', place)
     if not images:
-        raise SpecError(f'the image list "{path}" is empty', Where(path))
+        raise SpecError(f'the image list "{path}" is empty', where or Where(path))
     return images
