@@ -1,8 +1,8 @@
-"""A head for places on a trunk that stays as it is: what views of one place have in common in EfficientNet's maps.
+"""Words for places on a trunk that stays as it is, trained on many negatives, and siamese_words_256 beside them.
 
-python trained_head.py FOLDER LIST...: FOLDER has the files of efficientnet_lite0.py, a LIST pairs of views of one place
-(lmdb-build views --view-size 192x144). Directions in which the views of a pair differ become short (within-class
-whitening; Mikolajczyk and Matas, ICCV 2007). docs/trained.md says what the net reaches.
+python trained_head.py FOLDER ITERATIONS LIST...: FOLDER has the files of efficientnet_lite0.py, a LIST batches of 64
+pairs of views (lmdb-build views --size 64 --view-size 192x144). It writes places.prototxt and places.caffemodel, with
+blobs "head_feat", the trained words alone, and "feat", both: docs/trained.md. The loss is that of Sohn, NIPS 2016.
 """
 
 import sys
@@ -10,51 +10,51 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
+import netspec
 import netspec.pycaffe as caffe
+from loopclosure.places.frames import read_bgr
+from netspec.features.describer import Describer
 from netspec.proto.text import read_net, write_text
-from netspec.pycaffe import layers as L
-from netspec.pycaffe import params as P
 
-SHRINK = 0.3  # of the mean variance is added to each: few places
-folder, lists = Path(sys.argv[1]), [Path(name) for name in sys.argv[2:]]
-n = caffe.NetSpec()
-n.block10 = L.Input(shape={"dim": [48, 112, 9, 12]})
-n.positions = L.Convolution(n.block10, num_output=112, kernel_size=1)
-n.negative = L.Power(n.positions, scale=-1)
-n.cubes = L.Power(L.ReLU(L.Concat(n.positions, n.negative)), power=3)
-n.means = L.Power(L.Pooling(n.cubes, pool=P.Pooling.AVE, global_pooling=True), power=1 / 3, shift=1e-9)
-n.parts = L.Pooling(n.positions, pool=P.Pooling.AVE, kernel_size=3, stride=3)
-units = []
-for name, size in (("means", 224), ("parts", 1344)):
-    n[f"white_{name}"] = white = L.InnerProduct(n[name], num_output=size)
-    squares = L.Reduction(white, operation=P.Reduction.SUMSQ, axis=1)  # each half of feat gets the length 0.707
-    n[f"length_{name}"] = length = L.Power(squares, power=-0.5, scale=2, shift=1e-8)
-    units.append(L.Scale(white, length, axis=0))
-n.feat = L.Concat(*units)
-(folder / "head.prototxt").write_text(str(n.to_proto()))
-net, source = read_net(folder / "efficientnet_lite0.prototxt"), str(folder / "efficientnet_lite0.caffemodel")
+RATE, WARM, SCALE, VIEWS = 2e-3, 30, 20, 128  # rate of learning, and iterations until it is reached; views of a batch
+folder, iterations, lists = Path(sys.argv[1]), int(sys.argv[2]), [Path(name) for name in sys.argv[3:]]
+example = Path(__file__).with_suffix(".prototxt")
+many = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_words_256"
+source, prototxt = folder / "efficientnet_lite0.caffemodel", folder / "places.prototxt"
+net, layers, words = (read_net(p) for p in (source.with_suffix(".prototxt"), example, many / "deploy.prototxt"))
 del net.layer[[layer.name for layer in net.layer].index("block10") + 1 :]
 net.layer[0].input_param.shape[0].dim[:] = [1, 3, 144, 192]
-net.layer.extend(read_net(folder / "head.prototxt").layer[1:])
-(folder / "places.prototxt").write_text(write_text(net))
-whole = caffe.Net(str(folder / "places.prototxt"), source, caffe.TEST)
-head = caffe.Net(str(folder / "head.prototxt"), caffe.TEST)
+words.layer[1].bottom[0] = "small"
+words.layer[-1].name = words.layer[-1].top[0] = "words_feat"
+words.layer[-1].power_param.scale *= 1.49**-0.5
+net.layer.extend([*layers.layer[1:-2], *words.layer[1:], *layers.layer[-2:]])
+prototxt.write_text(write_text(net))
+trunk, maps = Describer(prototxt, source, "block10").image_net, []
 for views in lists:
     if not views.with_suffix(".npy").exists():
         files = [views.parent / name for row in views.open() if row[0] != "#" for name in row.split()[:2]]
-        images = np.stack([np.asarray(cv2.imread(str(file)), np.float32) for file in files]).transpose(0, 3, 1, 2)
-        np.save(views.with_suffix(".npy"), whole.forward_all(["block10"], data=images)["block10"].astype(np.float16))
-maps = np.concatenate([np.load(views.with_suffix(".npy")).reshape(-1, 112, 9, 12) for views in lists])
-for layer, of in (("positions", "block10"), ("white_means", "means"), ("white_parts", "parts")):
-    x = maps[:6000] if of == "block10" else head.forward_all([of], block10=maps.astype(np.float32))[of]
-    x = np.asarray(np.moveaxis(x, 1, -1) if of == "block10" else x.reshape(len(x), 1, -1), np.float32)
-    apart = (x[::2] - x[1::2]).reshape(-1, x.shape[-1])
-    within = apart.T @ apart / len(apart) / 2
-    values, directions = np.linalg.eigh(within + SHRINK * np.trace(within) / len(within) * np.eye(len(within)))
-    white = directions * values**-0.5 @ directions.T
-    for params in (head.params[layer], whole.params[layer]):
-        params[0].data[...] = white.reshape(params[0].data.shape)
-        params[1].data[...] = -white @ x.reshape(-1, len(white)).mean(axis=0)
-whole.save(str(folder / "places.caffemodel"))
-print(f"{folder}/places.caffemodel: a head of {len(maps) // 2} pairs of views")
+        batches = ([read_bgr(file) for file in files[k : k + VIEWS]] for k in range(0, len(files), VIEWS))
+        np.save(views.with_suffix(".npy"), np.concatenate([trunk(batch).astype(np.float16) for batch in batches]))
+    maps.extend(np.load(views.with_suffix(".npy"), mmap_mode="r").reshape(-1, VIEWS, 112, 9, 12))
+head, rng = netspec.load_net(example, "TRAIN", seed=1), np.random.default_rng(1)
+optimizer = torch.optim.AdamW(head.parameters())
+itself, partner = 1e4 * torch.eye(VIEWS), torch.arange(VIEWS) ^ 1  # views 0 and 1 are a pair, 2 and 3, ...
+for k in range(iterations):
+    x = torch.from_numpy(maps[rng.integers(len(maps))].astype(np.float32))
+    units = head(block10=x.flip(3) if rng.random() < 0.5 else x)["head_feat"].split([256, 768], 1)
+    loss = torch.stack([torch.nn.functional.cross_entropy(2 * SCALE * u @ u.T - itself, partner) for u in units]).sum()
+    optimizer.param_groups[0]["lr"] = RATE * min(1, (k + 1) / WARM) * (0.55 + 0.45 * np.cos(np.pi * k / iterations))
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+netspec.save_weights(head, folder / "head.caffemodel")
+places = caffe.Net(str(prototxt), caffe.TEST)
+for weights in (source, folder / "head.caffemodel", many / "siamese_words_256.caffemodel"):
+    places.copy_from(str(weights))
+lines = cv2.resize(np.eye(6), (6, 5))
+for layer, square in (("resized", np.kron(lines, lines)), ("small", np.eye(25))):
+    places.params[layer][0].data.reshape(3, *square.shape)[...] = square
+places.save(str(folder / "places.caffemodel"))
+print(f"{folder}/places.caffemodel: {len(maps)} batches, loss {loss:.3f}")

@@ -11,6 +11,8 @@ import forked
 from loopclosure.evaluate import judge
 from loopclosure.methods.base import MethodContext, make_method
 from loopclosure.places.datasets import load_traverses
+from loopclosure.places.frames import read_bgr
+from netspec.features.describer import Describer
 from netspec.proto.text import read_net
 from paths import ROOT, shared
 
@@ -19,6 +21,7 @@ pytestmark = pytest.mark.slow
 # tests/test_ros_node.py runs the node; shapes.py is a part of two others.
 EXAMPLES = sorted(path for path in ROOT.glob("examples/*.py") if path.stem not in {"ros_node", "shapes"})
 FASTER = ROOT / "examples" / "faster_rcnn.prototxt"
+WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
 SHORTER: dict[str, list[object]] = {"faster_rcnn": [FASTER, FASTER, 20], "mobilenet_ssd": [80]}  # iterations
 
 
@@ -34,7 +37,7 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     given = [shared("data", "sequences")] if request.param.stem == "validation_set" else short
     folder = tmp_path_factory.mktemp(request.param.stem)
     if request.param.stem == "trained_head":
-        given = [write_pairs(folder)]
+        given = [20, write_pairs(folder)]
         run(request.param.with_name("efficientnet_lite0.py"), folder)
     return request.param.stem, run(request.param, folder, *given), folder
 
@@ -47,15 +50,15 @@ def run(script: Path, folder: Path, *words: object) -> str:
 
 
 def write_pairs(folder: Path) -> Path:
-    """Write six pairs of views, each of one place and in other light, and the list of them."""
+    """Write a batch of 64 pairs of views, each of one place and in other light, and the list of them."""
     rng = np.random.default_rng(0)
     rows = []
-    for k in range(6):
-        place = rng.integers(0, 200, (144, 192, 3)).astype(np.uint8)
+    for k in range(64):
+        place = cv2.resize(rng.integers(0, 200, (9, 12, 3)).astype(np.uint8), (192, 144))
         for side, light in (("a", 0), ("b", 30)):
             cv2.imwrite(str(folder / f"{k}_{side}.png"), place + light)
         rows.append(f"{k}_a.png {k}_b.png 1\n")
-    (folder / "views.txt").write_text("# six pairs\n" + "".join(rows))
+    (folder / "views.txt").write_text("# 64 pairs\n" + "".join(rows))
     return folder / "views.txt"
 
 
@@ -126,9 +129,22 @@ def check_validation_set(said: str, folder: Path) -> None:
 
 
 def check_trained_head(said: str, folder: Path) -> None:
-    assert "a head of 6 pairs of views" in said
-    assert read_net(folder / "places.prototxt").layer[-1].name == "feat"
-    assert (folder / "places.caffemodel").stat().st_size < 10.5e6
+    (loss,) = numbers(said, r"1 batches, loss ([\d.]+)")
+    assert loss < 4  # two losses of 128 views each: 2 ln 127 = 9.7 by chance
+    assert (folder / "places.caffemodel").stat().st_size < 10e6
+    files = str(folder / "places.prototxt"), str(folder / "places.caffemodel")
+    images = [read_bgr(folder / f"{k}_{side}.png") for k in range(8) for side in "ab"]
+    feats = np.stack([Describer(*files)(image) for image in images])
+    head, small = (Describer(*files, blob=blob)(images[0]) for blob in ("head_feat", "small"))
+    np.testing.assert_allclose(feats[0, 1856:], 0.7 / 1.49**0.5 * head, atol=1e-6)
+    resized = cv2.resize(images[0].astype(np.float32), (160, 120))
+    np.testing.assert_allclose(small.reshape(3, 120, 160), resized.transpose(2, 0, 1), atol=1e-3)
+    words = Describer(WORDS / "deploy.prototxt", WORDS / "siamese_words_256.caffemodel")(
+        resized.round().astype(np.uint8)
+    )
+    assert feats[0, :1856] @ words > 0.99 / 1.49**0.5
+    likest = np.argmax(feats @ feats.T - 2 * np.eye(16), axis=1)
+    assert likest.tolist() == [k ^ 1 for k in range(16)]
 
 
 def check_efficientnet_lite0(said: str, folder: Path) -> None:
