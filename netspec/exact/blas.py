@@ -30,18 +30,20 @@ def _library(name: str) -> Any:
     """Return SciPy's BLAS, ``_fblas`` for arrays or ``cython_blas`` for addresses, with Caffe's kernels, for AVX-512.
 
     OpenBLAS chooses others on some newer CPUs. What the environment says stays; if SciPy's BLAS was loaded before, so
-    do its kernels. Only this module of ``scipy.linalg`` is loaded: all of it takes ten times as long.
+    do its kernels. Only this module of ``scipy.linalg`` is loaded: all of it takes ten times as long. It does not
+    stay in ``sys.modules``: who imports ``scipy.linalg`` afterwards would not find it there as an attribute.
     """
     name = f"scipy.linalg.{name}"
-    if name not in sys.modules:
-        spec = PathFinder.find_spec(name, [f"{folder}/linalg" for folder in scipy.__path__])
-        assert spec, f"this SciPy has no {name}"
-        assert spec.loader
-        with environment({CORE_TYPE: CAFFES} if torch.backends.cpu.get_cpu_capability() == "AVX512" else {}):
-            module = module_from_spec(spec)
-            spec.loader.exec_module(module)
-        sys.modules[name] = module
-    return sys.modules[name]
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = PathFinder.find_spec(name, [f"{folder}/linalg" for folder in scipy.__path__])
+    assert spec, f"this SciPy has no {name}"
+    assert spec.loader
+    with environment({CORE_TYPE: CAFFES} if torch.backends.cpu.get_cpu_capability() == "AVX512" else {}):
+        module = module_from_spec(spec)
+        spec.loader.exec_module(module)
+    sys.modules.pop(name, None)
+    return module
 
 
 _IN_DOUBLE = 32  # OpenBLAS' dot sums up fewer products than this in double, one by one

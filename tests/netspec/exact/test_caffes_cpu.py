@@ -37,6 +37,20 @@ def test_the_kernels_are_caffes_unless_the_user_chose_others(wanted: str | None,
     assert done.stdout.split() == expected
 
 
+AFTERWARDS = """
+from netspec.exact.blas import kernels
+kernels()
+import scipy.linalg.cython_blas
+print(scipy.linalg.cython_blas.__name__, scipy.linalg._fblas.__name__)
+"""
+
+
+@pytest.mark.slow
+def test_who_imports_scipys_linalg_afterwards_finds_all_of_it() -> None:
+    done = subprocess.run([sys.executable, "-c", AFTERWARDS], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["scipy.linalg.cython_blas", "scipy.linalg._fblas"]
+
+
 @pytest.mark.parametrize(
     ("kernels", "exact", "said"),
     [
