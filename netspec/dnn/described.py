@@ -17,7 +17,7 @@ from netspec.dnn.costs import operations
 from netspec.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, UNSPECIFIED, DnnError, as_dnn_error
 from netspec.dnn.table import INPUT, Entry, graph_of, make_table, nodes_of, unconnected
 from netspec.errors import Where, did_you_mean
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.layers.base import Layer as CaffeLayer
 from netspec.layers.base import Shape
 from netspec.net.net import Net as CaffeNet
@@ -92,8 +92,8 @@ class Described:
 
     def dumpToFile(self, path: str) -> None:
         """Write :meth:`dump` to a file."""
-        with as_dnn_error("dumpToFile"), whole_file(path) as unfinished:
-            unfinished.write_text(self.dump())
+        with as_dnn_error("dumpToFile"):
+            write_whole(path, self.dump())
 
     # Shapes and costs
 

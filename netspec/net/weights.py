@@ -19,7 +19,7 @@ import torch
 from netspec.data import blobs
 from netspec.errors import Report, SpecError, Where
 from netspec.files.hdf5 import layer_groups, new_hdf5, open_hdf5
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.layers.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.net.stamp import check_weights
@@ -132,8 +132,7 @@ def write_binary(net: Net, path: str | Path, diff: bool = False) -> None:
     """Do what :func:`save_weights` does in Caffe's binary form, whatever the file's name."""
     if (size := binary_bytes(net, diff)) > MOST_BYTES:
         raise SpecError(f"cannot be written: {too_large(size)}", Where(str(path)))
-    with whole_file(path) as unfinished:
-        unfinished.write_bytes(net_to_proto(net, diff).SerializeToString(deterministic=True))
+    write_whole(path, net_to_proto(net, diff).SerializeToString(deterministic=True))
 
 
 def binary_bytes(net: Net, diff: bool = False) -> int:

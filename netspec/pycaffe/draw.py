@@ -11,7 +11,7 @@ from typing import Any
 from google.protobuf import text_format
 
 from netspec.errors import SpecError
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.proto.schema import TEST, TRAIN, PhaseValue
 from netspec.proto.text import parse_net_text
 from netspec.pycaffe import extras
@@ -35,8 +35,7 @@ def draw_net_to_file(
     """Draw a net into a file, in the format of its ending; ``.raw``, ``.dot`` and ``.gv`` are Graphviz' own text."""
     extension = filename[filename.rfind(".") + 1 :]
     picture = draw_net(caffe_net, rankdir, extension, phase, display_lrm)
-    with whole_file(filename) as unfinished:
-        unfinished.write_bytes(picture)
+    write_whole(filename, picture)
 
 
 def draw_net(

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from netspec.errors import SpecError
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.scripts.finder import MARK, NAME, real_caffe
 
 _PACKAGE = f'''{MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
@@ -65,8 +65,7 @@ def install_caffe(replace: bool = False) -> list[Path]:
         if owner.exists() and not _is_ours(path):
             owner.rename(owner.with_name(owner.name + _ASIDE))
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as unfinished:
-            unfinished.write_text(text, "utf-8")
+        write_whole(path, text)
         if owner is path:
             path.chmod(0o755)
     return list(paths)
@@ -102,8 +101,7 @@ def make_build_folder(folder: Path) -> list[Path]:
         raise SpecError(f"{', '.join(there)}: is there already and not netspec's; name another folder")
     for path, (module, words) in paths.items():
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as unfinished:
-            unfinished.write_text(_command(module, words), "utf-8")
+        write_whole(path, _command(module, words))
         path.chmod(0o755)
     return list(paths)
 

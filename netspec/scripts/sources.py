@@ -21,7 +21,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from netspec.errors import SpecError, Where
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.scripts import python2
 
 MAIN = "__netspec_main__"  # by this name a worker imports the program
@@ -38,8 +38,7 @@ def write_translation(path: str, out: Path, always: bool) -> None:
     data = bytes_of(path)
     if not (always or python2.is_python2(data, path)):
         raise SpecError(f"is Python 3 already: there is no translation to write to {out}", Where(path))
-    with whole_file(out) as unfinished:
-        unfinished.write_text(python2.translated(data, path, alone=True), "utf-8", errors="surrogateescape")
+    write_whole(out, python2.translated(data, path, alone=True), "surrogateescape")
 
 
 def bytes_of(path: str) -> bytes:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from netspec.errors import SpecError, Where
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 from netspec.layers import reading
 from netspec.net.net import Net
 from netspec.net.stamp import FAULTS, Stamp, damaged, sealed, shown, unsealed, whole_number
@@ -68,8 +68,7 @@ def resume(net: Net, states: Remembered) -> None:
 
 def write_extra(path: str | Path, extra: Extra) -> None:
     """Write the file. Raises SpecError if it cannot be written."""
-    with whole_file(path) as unfinished:
-        unfinished.write_text(sealed(asdict(extra)), "utf-8")
+    write_whole(path, sealed(asdict(extra)))
 
 
 def read_extra(state: str | Path) -> Extra | None:
