@@ -244,7 +244,8 @@ class LoopDetector:
         frames, views = self._frames, self.settings.views
         before = self._last.size if frames.count else len(row)
         if len(row) != before:
-            raise InputError(f"frame {frames.count} has a descriptor of {len(row)} dimensions, those before {before}")
+            found = f"frame {frames.count} has a descriptor of {len(row)} dimensions, those before {before}"
+            raise InputError(f"{found}; take the net that described those, or begin anew")
         if len(row) % views:
             raise InputError(f"frame {frames.count} has a descriptor of {len(row)} dimensions, not of {views} views")
         row = row.reshape(views, -1)

@@ -187,7 +187,7 @@ def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "N").exists()
     with pytest.raises(InputError, match="ends at 65,504"):
         a_map.add(open_recording(drives / "b"), lambda image: np.full(768, 1e5, np.float32))
-    with pytest.raises(InputError, match="5 dimensions, those before 768"):
+    with pytest.raises(InputError, match="5 dimensions, those before 768; take the net that described those"):
         a_map.add(open_recording(drives / "b"), lambda image: np.ones(5))
     assert len(Map(tmp_path / "M")) == PLACES
     shutil.rmtree(tmp_path / "M" / "000000")
