@@ -14,13 +14,14 @@ SHIPPED = HERE / "netspec" / "features" / "shipped.py"
 
 
 def files():
-    """Return the files that travel: all prototxts, and of the weights those that have a name, with their source."""
+    """Return the files that travel: all prototxts, and of nets that have a name weights, source and license."""
     tree = ast.parse(SHIPPED.read_text(encoding="utf-8"))
     named = {ast.literal_eval(part.value) for part in tree.body if isinstance(part, ast.Assign)}
     found = sorted(NETS.rglob("*.prototxt"))
     for net in sorted(named):
         folder = NETS / net
-        found += [folder / f"{folder.name}.caffemodel", folder / "SOURCE.md"]
+        # SOURCE.md and LICENSE
+        found += [folder / f"{folder.name}.caffemodel", *sorted(folder.glob("[A-Z]*"))]
     return [path.relative_to(NETS) for path in found]
 
 

@@ -15,6 +15,7 @@ from netspec.check.check import ON_META, check_file
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.engines.net import load_net
+from netspec.layers import layer_class
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
 from netspec.proto.text import parse_net_text, read_net, read_solver
@@ -196,24 +197,12 @@ def test_one_iteration_and_back_into_the_deploy_net(
 
 
 WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
-MORE_WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_768"
+PLACES = ROOT / "prototxt" / "many_negatives" / "places"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("folder", "descriptors", "layers"),
-    [
-        (WORDS, ("whole", "parts"), ("conv1", "res6b", "words", "layout")),
-        (MORE_WORDS, ("view_whole",), ("view_conv1", "view_res6b", "view_words")),
-    ],
-    ids=["256", "768"],
-)
 def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    folder: Path,
-    descriptors: tuple[str, ...],
-    layers: tuple[str, ...],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
@@ -221,13 +210,13 @@ def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
         for k in range(48):
             pixels = rng.integers(0, 256, (6, 48, 64), dtype=np.uint8)
             writer.put(b"%08d" % k, array_to_datum(pixels, 1).SerializeToString())
-    text = re.sub(r'source: "[^"]*"', 'source: "pairs"', (folder / "train_val.prototxt").read_text())
+    text = re.sub(r'source: "[^"]*"', 'source: "pairs"', (WORDS / "train_val.prototxt").read_text())
     Path("net.prototxt").write_text(text)
     net = load_net("net.prototxt", phase="TRAIN")
     net.keep = "all"
     loss, _ = net.forward_loss()
     expected = 0.0
-    for kind in descriptors:
+    for kind in ("whole", "parts"):
         first, second = (net.blobs[name].detach().double() for name in (kind, f"{kind}_p"))
         np.testing.assert_allclose(first.square().sum(1), 1, rtol=1e-4)
         cosines, own = 15 * first @ second.T, torch.arange(48)
@@ -235,42 +224,36 @@ def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
         expected += np.mean(both_ways)
     np.testing.assert_allclose(loss.item(), expected, rtol=1e-4)
     loss.backward()
-    for name in layers:
+    for name in ("conv1", "res6b", "words", "layout"):
         grad = net.params[name][0].grad
         assert grad is not None, name
         assert grad.abs().max() > 0, name
 
 
-@pytest.mark.parametrize(
-    ("folder", "learned", "centering", "length"),
-    [
-        (WORDS, 3 * 9 + 2, ("bn_flat_whole", "bn_flat_parts"), 256 + 25 * 64),
-        (MORE_WORDS, 3 * 10 + 1, ("bn_view_flat",), 256 + 25 * 64 + 512),
-    ],
-    ids=["256", "768"],
-)
-def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too(
-    folder: Path, learned: int, centering: tuple[str, ...], length: int
-) -> None:
-    train, deploy = (layers_of(folder / f"{name}.prototxt") for name in ("train_val", "deploy"))
+def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
+    train, deploy = (layers_of(WORDS / f"{name}.prototxt") for name in ("train_val", "deploy"))
     names = [name for name, layer in train.items() if layer.param and not name.endswith("_p")]
-    assert len(names) == learned
+    assert len(names) == 3 * 9 + 2
     for name in names:
         assert [p.name for p in train[name].param] == [p.name for p in train[f"{name}_p"].param]
         assert all(p.name for p in train[name].param)
-        if name not in centering:  # they center the descriptors in training alone
+        if name not in ("bn_flat_whole", "bn_flat_parts"):  # they center the descriptors in training alone
             assert deploy[name] == train[name]
-    (checked,) = check_file(folder / "deploy.prototxt", TEST)
+    (checked,) = check_file(WORDS / "deploy.prototxt", TEST)
     assert checked.net is not None
     shapes = {name: checked.net.shapes[name] for name in checked.net.plan.outputs}
-    assert shapes == {"feat": (1, length)}
+    assert shapes == {"feat": (1, 256 + 25 * 64)}
 
 
-def test_the_net_of_768_words_contains_the_net_of_256() -> None:
-    small, large = (layers_of(folder / "deploy.prototxt") for folder in (WORDS, MORE_WORDS))
-    for name, layer in small.items():
-        if name not in ("joined", "feat"):
-            assert large[name] == layer
+def test_places_contains_the_net_of_256_words_and_has_layers_of_caffe_alone() -> None:
+    small, large = (layers_of(folder / "deploy.prototxt") for folder in (WORDS, PLACES))
+    for name in small.keys() - {"data", "input", "feat"}:
+        assert large[name] == small[name]
+    assert small["input"].mvn_param == large["input"].mvn_param
+    own, theirs = (load_net(f / "deploy.prototxt", weights=f / f"{f.name}.caffemodel").params for f in (PLACES, WORDS))
+    for name in ("conv1", "res6b", "words", "layout"):
+        assert torch.equal(own[name][0], theirs[name][0])
+    assert all(layer_class(layer.type).__module__.startswith("netspec.layers.") for layer in large.values())
 
 
 EDGES = ROOT / "prototxt" / "many_negatives" / "siamese_words_edges"

@@ -8,23 +8,19 @@ import pytest
 from lmdb_build.cli import main as lmdb_build
 from loopclosure.cli import main as loopclosure
 from netspec.cli import main as netspec
-from paths import ROOT
+from netspec.features import shipped
 
 pytestmark = pytest.mark.slow
 
-NETS = ROOT / "prototxt" / "many_negatives"
 
-
-@pytest.mark.parametrize(
-    ("name", "weights"),
-    [("siamese_words_256", ["siamese_words_256"]), ("siamese_words_768", ["siamese_words_256", "siamese_words_768"])],
-)
-def test_the_words_net_is_ahead_of_thumbnails_on_an_unseen_walk(tmp_path: Path, name: str, weights: list[str]) -> None:
+@pytest.mark.parametrize("name", [shipped.SMALL, shipped.DEFAULT])
+def test_a_shipped_net_is_ahead_of_thumbnails_on_an_unseen_walk(tmp_path: Path, name: str) -> None:
     walk, features, out = tmp_path / "walk_1", tmp_path / "features.npz", tmp_path / "report"
     command = ["walk", str(tmp_path), "--frames", "120", "--laps", "2", "--size", "160x120", "--seed", "77"]
     assert lmdb_build(command) == 0
-    files = ",".join(str(NETS / each / f"{each}.caffemodel") for each in weights)
-    net = ["--model", str(NETS / name / "deploy.prototxt"), "--weights", files, "--strict"]
+    folder = shipped.folder(name)
+    weights = folder / f"{folder.name}.caffemodel"
+    net = ["--model", str(folder / "deploy.prototxt"), "--weights", str(weights), "--strict"]
     assert netspec(["extract", *net, "--blob", "feat", "--images", str(walk), "--out", str(features)]) == 0
     methods = ["--method", "thumbnails", "--method", f"words=features:{features}"]
     assert loopclosure(["evaluate", str(walk), "--exclude-seconds", "5", *methods, "--out", str(out)]) == 0

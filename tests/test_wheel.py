@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from netspec.features import shipped
 from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow
@@ -65,9 +66,10 @@ def test_it_holds_every_file_of_the_packages_and_nothing_else(wheel: Path) -> No
     }
     with zipfile.ZipFile(wheel) as file:
         found = {name for name in file.namelist() if ".dist-info/" not in name}
-    expected |= {f"netspec/{name}" for name in NETS if name.endswith(".prototxt") or "words_256/" in name}
+    named = tuple(f"prototxt/{net}/" for net in (shipped.DEFAULT, shipped.SMALL))
+    expected |= {f"netspec/{name}" for name in NETS if name.endswith(".prototxt") or name.startswith(named)}
     assert found == expected
-    assert wheel.stat().st_size < 6e6
+    assert wheel.stat().st_size < 12e6
     assert {"netspec/proto/caffe.desc", "netspec/py.typed", "netspec/features/shipped.py"} < found
 
 
@@ -140,9 +142,8 @@ def test_an_editable_installation_has_the_nets_too(wheel: Path, tmp_path: Path) 
 
 
 def test_every_weight_has_its_source_and_license() -> None:
-    weights = list((ROOT / "prototxt" / "many_negatives").glob("*/siamese_words_???.caffemodel"))
-    assert len(weights) == 2
-    for path in weights:
-        said = (path.parent / "SOURCE.md").read_text()
-        assert path.name in said
+    for folder in (ROOT / "prototxt" / "many_negatives").iterdir():
+        assert (folder / f"{folder.name}.caffemodel").stat().st_size < 10e6
+        said = (folder / "SOURCE.md").read_text()
+        assert f"{folder.name}.caffemodel" in said
         assert "License: " in said

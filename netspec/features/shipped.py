@@ -13,8 +13,8 @@ from typing import Any
 
 from netspec.errors import SpecError
 
-# Folders of prototxt/ with deploy.prototxt and NAME.caffemodel, NAME that of the folder.
-DEFAULT = "many_negatives/siamese_words_256"
+# Folders of prototxt/ with deploy.prototxt and NAME.caffemodel, NAME that of the folder, SOURCE.md and perhaps LICENSE.
+DEFAULT = "many_negatives/places"
 SMALL = "many_negatives/siamese_words_256"
 
 
