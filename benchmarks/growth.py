@@ -159,14 +159,14 @@ def frames(size: int) -> Found:
 
 
 def described_walk(frames: int) -> np.ndarray:
-    """Return the descriptors of a synthetic walk by the default net, less their mean and at most 256 numbers long."""
+    """Return the descriptors of a synthetic walk by the small net, less their mean and at most 256 numbers long."""
     from lmdb_build.walk.sequence import Walk, write_walk
     from loopclosure.descriptors.whitening import learn_whitening
     from loopclosure.detector.map import COMPONENTS
     from loopclosure.places.frames import read_bgr
-    from netspec.features.shipped import default
+    from netspec.features.shipped import small
 
-    describe = default()
+    describe = small()
     with TemporaryDirectory(prefix="growth-") as folder:
         walk = Walk(frames=frames, width=160, height=120, laps=1)
         rows = np.array([describe(read_bgr(image)) for image in write_walk(Path(folder) / "walk", walk)])

@@ -7,6 +7,7 @@ or only what geometry verifies.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import pickle
 from collections.abc import Callable, Sequence
@@ -26,6 +27,7 @@ from loopclosure.methods.base import Images, MethodResult, earlier
 from loopclosure.methods.decoys import search, settings
 from loopclosure.places.frames import read_bgr, read_gray
 from loopclosure.progress import silent
+from netspec.features import shipped
 from netspec.files.whole_file import whole_file
 
 ENOUGH = 0.7  # of the best setting's recall
@@ -69,23 +71,26 @@ class Kept:
     """What is computed once for all drives of a family, and kept in a file between runs."""
 
     path: Path
-    rows: dict[Path, np.ndarray] = field(default_factory=dict)
+    rows: dict[tuple[str, Path], np.ndarray] = field(default_factory=dict)  # by the net and the image
     found: dict[Any, Agreement] = field(default_factory=dict)
-    best: dict[str, tuple[float, str]] = field(default_factory=dict)
+    best: dict[tuple[str, str], tuple[float, str]] = field(default_factory=dict)  # by the net and the drive
     describe: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         if self.path.exists():  # written below
             self.rows, self.found, self.best = pickle.loads(self.path.read_bytes())
         self.pairs = Pairs(read_gray, _found=self.found)
+        net = shipped.folder(shipped.DEFAULT)
+        weights = (net / f"{net.name}.caffemodel").read_bytes()
+        self.net = hashlib.sha256((net / "deploy.prototxt").read_bytes() + weights).hexdigest()
 
     def descriptors(self, images: Sequence[Path]) -> np.ndarray:
         """Return the descriptors (N, D) of images by the net that comes with the package."""
         for image in images:
-            if image not in self.rows:
+            if (self.net, image) not in self.rows:
                 self.describe = self.describe or load_describe("default")
-                self.rows[image] = np.asarray(self.describe(read_bgr(image)), np.float32).reshape(-1)
-        return np.array([self.rows[image] for image in images])
+                self.rows[self.net, image] = np.asarray(self.describe(read_bgr(image)), np.float32).reshape(-1)
+        return np.array([self.rows[self.net, image] for image in images])
 
     def save(self) -> None:
         """Write the file."""
@@ -117,9 +122,10 @@ def measure(drive: Drive, kept: Kept) -> Result:
     found = auto.score(Images(data.query_images, data.reference_images), silent)
     accepted = int(np.count_nonzero(np.isfinite(found.scores)))
     judged = Judgment.of(found.scores, truth).best
-    if drive.kind not in kept.best:
-        kept.best[drive.kind] = _best(scores, drive, kept.pairs)
-    best, setting = kept.best[drive.kind]
+    key = kept.net, drive.kind
+    if key not in kept.best:
+        kept.best[key] = _best(scores, drive, kept.pairs)
+    best, setting = kept.best[key]
     return Result(
         family=drive.family,
         kind=drive.kind,

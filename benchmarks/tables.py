@@ -44,6 +44,7 @@ METHODS = {
     "HOG, 256x256": "hog",
     "like CoHOG, 256x256": "cohog",
     "the net": "features:F",
+    "the small net": "describe:small",
     "verified+net": "verified+features:F",
     "SeqSLAM on the net": "seqslam+features:F",
     "verified, SeqSLAM on the net": "verified+seqslam+features:F",
