@@ -60,7 +60,7 @@ SCRIPT = """import caffe
 net = caffe.Net("deploy.prototxt", "x.caffemodel", caffe.TEST)
 print(net.forward()["prob"].shape)
 """
-# Sequences that siamese_words_256 is trained on.
+# Sequences that the trained nets are trained on.
 SEQUENCES = (
     "bridge_highway",
     "city_drive",
@@ -180,10 +180,10 @@ def _net(folder: Path) -> None:
         shutil.copy(folder / f"x_iter_{iteration}.caffemodel", folder / f"{name}.caffemodel")
     for made in (*folder.glob("x_iter_*"), folder / "list.txt"):
         made.unlink()
-    words = "prototxt/many_negatives/siamese_words_256"
+    places = "prototxt/many_negatives/places"
     _run(
         folder,
-        f"netspec extract --model {words}/deploy.prototxt --weights {words}/siamese_words_256.caffemodel "
+        f"netspec extract --model {places}/deploy.prototxt --weights {places}/places.caffemodel "
         "--blob feat --images OTHER_IMAGES --out others.npz",
     )
     _run(folder, "loopclosure evaluate SEQUENCE --method thumbnails --out A")
