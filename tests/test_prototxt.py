@@ -256,32 +256,6 @@ def test_places_contains_the_net_of_256_words_and_has_layers_of_caffe_alone() ->
     assert all(layer_class(layer.type).__module__.startswith("netspec.layers.") for layer in large.values())
 
 
-EDGES = ROOT / "prototxt" / "many_negatives" / "siamese_words_edges"
-
-
-def test_the_net_with_edges_contains_the_net_of_256() -> None:
-    small, large = (layers_of(folder / "deploy.prototxt") for folder in (WORDS, EDGES))
-    for name, layer in small.items():
-        if name not in ("joined", "feat"):
-            assert large[name] == layer
-
-
-def test_edges_are_the_same_in_the_negative_of_an_image() -> None:
-    """Dark ground becomes bright under snow: the words change, the directions without sign do not."""
-    net = load_net(EDGES / "deploy.prototxt")
-    for folder in (WORDS, EDGES):
-        load_weights(net, folder / f"{folder.name}.caffemodel")
-    net.keep = ["edges", "whole"]
-    image = cv2.resize(np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8), (160, 120))
-    seen = []
-    for shown in (image, 255 - image):
-        (feat,) = net(data=shown.transpose(2, 0, 1)[None].astype(np.float32)).values()
-        np.testing.assert_allclose(feat.detach().square().sum().item(), 1, rtol=1e-4)
-        seen.append({name: net.blobs[name].detach().numpy().copy() for name in ("edges", "whole")})
-    np.testing.assert_allclose(seen[0]["edges"], seen[1]["edges"], atol=1e-5)
-    assert np.linalg.norm(seen[0]["whole"] - seen[1]["whole"]) > 0.1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
