@@ -75,6 +75,7 @@ def measure(
     data: Path, work: Path, sets: Sequence[str], methods: Sequence[str], say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Measure methods on sets, and add the figures to those that are kept."""
+    work.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Any] = json.loads(FIGURES.read_text(encoding="utf-8"))
     train = image_paths(data / "ie_tower")[::4] if any("W" in METHODS[name] for name in methods) else []
     for name in sets or SETS:
@@ -84,7 +85,7 @@ def measure(
         np.savez(work / f"{name}.npz", features=kept.descriptors(images), names=[str(image) for image in images])
         context = MethodContext(held.exclude_frames, stamps=held.stamps, pairs=kept.pairs)
         for label in methods or METHODS:
-            if name in PAIRS and label not in TABLES["average precision"]:
+            if name in PAIRS and (label not in TABLES["average precision"] or "SeqSLAM" in label):
                 continue
             file = work / {"F": f"{name}.npz", "W": "words.npz", "V": "vlad.npz"}.get(METHODS[label][-1], "")
             spec = re.sub(r"\b[FWV]$", str(file), METHODS[label])

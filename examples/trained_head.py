@@ -1,4 +1,4 @@
-"""Words for places on a trunk that stays as it is, trained on many negatives, and siamese_words_256 beside them.
+"""The net places: words on a trunk that stays as it is, trained on many negatives, and siamese_words_256 beside them.
 
 python trained_head.py FOLDER ITERATIONS LIST...: FOLDER has the files of efficientnet_lite0.py, a LIST batches of 64
 pairs of views (lmdb-build views --size 64 --view-size 192x144). It writes places.prototxt and places.caffemodel, with
@@ -25,25 +25,25 @@ many = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_word
 source, prototxt = folder / "efficientnet_lite0.caffemodel", folder / "places.prototxt"
 net, layers, words = (read_net(p) for p in (source.with_suffix(".prototxt"), example, many / "deploy.prototxt"))
 del net.layer[[layer.name for layer in net.layer].index("block10") + 1 :]
-net.layer[0].input_param.shape[0].dim[:] = [1, 3, 144, 192]
+net.layer[0].input_param.shape[0].dim[:], net.name = [1, 3, 144, 192], "places"
 words.layer[1].bottom[0] = "small"
 words.layer[-1].name = words.layer[-1].top[0] = "words_feat"
 words.layer[-1].power_param.scale *= 1.49**-0.5
 net.layer.extend([*layers.layer[1:-2], *words.layer[1:], *layers.layer[-2:]])
 prototxt.write_text(write_text(net))
-trunk, maps = Describer(prototxt, source, "block10").image_net, []
+trunk, maps = Describer(prototxt, source, "head_blocks").image_net, []
 for views in lists:
     if not views.with_suffix(".npy").exists():
         files = [views.parent / name for row in views.open() if row[0] != "#" for name in row.split()[:2]]
         batches = ([read_bgr(file) for file in files[k : k + VIEWS]] for k in range(0, len(files), VIEWS))
         np.save(views.with_suffix(".npy"), np.concatenate([trunk(batch).astype(np.float16) for batch in batches]))
-    maps.extend(np.load(views.with_suffix(".npy"), mmap_mode="r").reshape(-1, VIEWS, 112, 9, 12))
+    maps.extend(np.load(views.with_suffix(".npy"), mmap_mode="r").reshape(-1, VIEWS, 192, 9, 12))
 head, rng = netspec.load_net(example, "TRAIN", seed=1), np.random.default_rng(1)
 optimizer = torch.optim.AdamW(head.parameters())
 itself, partner = 1e4 * torch.eye(VIEWS), torch.arange(VIEWS) ^ 1  # views 0 and 1 are a pair, 2 and 3, ...
 for k in range(iterations):
     x = torch.from_numpy(maps[rng.integers(len(maps))].astype(np.float32))
-    units = head(block10=x.flip(3) if rng.random() < 0.5 else x)["head_feat"].split([256, 768], 1)
+    units = head(head_blocks=x.flip(3) if rng.random() < 0.5 else x)["head_feat"].split([512, 768], 1)
     loss = torch.stack([torch.nn.functional.cross_entropy(2 * SCALE * u @ u.T - itself, partner) for u in units]).sum()
     optimizer.param_groups[0]["lr"] = RATE * min(1, (k + 1) / WARM) * (0.55 + 0.45 * np.cos(np.pi * k / iterations))
     optimizer.zero_grad()
