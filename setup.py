@@ -20,7 +20,7 @@ def files():
     found = sorted(NETS.rglob("*.prototxt"))
     for net in sorted(named):
         folder = NETS / net
-        # SOURCE.md and LICENSE
+        # SOURCE.md, SOURCES.csv and LICENSE
         found += [folder / f"{folder.name}.caffemodel", *sorted(folder.glob("[A-Z]*"))]
     return [path.relative_to(NETS) for path in found]
 

@@ -30,7 +30,7 @@ words.layer[1].bottom[0] = "small"
 words.layer[-1].name = words.layer[-1].top[0] = "words_feat"
 words.layer[-1].power_param.scale *= 1.49**-0.5
 net.layer.extend([*layers.layer[1:-2], *words.layer[1:], *layers.layer[-2:]])
-prototxt.write_text(write_text(net))
+prototxt.write_text(write_text(net).replace("  include {\n    phase: TEST\n  }\n", ""))
 trunk, maps = Describer(prototxt, source, "head_blocks").image_net, []
 for views in lists:
     if not views.with_suffix(".npy").exists():
