@@ -1,8 +1,7 @@
 """The net places: words on a trunk that stays as it is, trained on many negatives, and siamese_words_256 beside them.
 
 python trained_head.py FOLDER ITERATIONS LIST...: FOLDER has the files of efficientnet_lite0.py, a LIST batches of 64
-pairs of views (lmdb-build views --size 64 --view-size 192x144). It writes places.prototxt and places.caffemodel, with
-blobs "head_feat", the trained words alone, and "feat", both: docs/trained.md. The loss is that of Sohn, NIPS 2016.
+pairs of views of 192x144 (docs/trained.md). It writes places.prototxt and places.caffemodel. Loss: Sohn, NIPS 2016.
 """
 
 import sys
@@ -14,6 +13,7 @@ import torch
 
 import netspec
 import netspec.pycaffe as caffe
+from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.places.frames import read_bgr
 from netspec.features.describer import Describer
 from netspec.proto.text import read_net, write_text
@@ -34,7 +34,7 @@ prototxt.write_text(write_text(net).replace("  include {\n    phase: TEST\n  }\n
 trunk, maps = Describer(prototxt, source, "head_blocks").image_net, []
 for views in lists:
     if not views.with_suffix(".npy").exists():
-        files = [views.parent / name for row in views.open() if row[0] != "#" for name in row.split()[:2]]
+        files = [views.parent / name for pair in read_pair_list(views) for name in (pair.first, pair.second)]
         batches = ([read_bgr(file) for file in files[k : k + VIEWS]] for k in range(0, len(files), VIEWS))
         np.save(views.with_suffix(".npy"), np.concatenate([trunk(batch).astype(np.float16) for batch in batches]))
     maps.extend(np.load(views.with_suffix(".npy"), mmap_mode="r").reshape(-1, VIEWS, 192, 9, 12))

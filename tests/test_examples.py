@@ -130,6 +130,7 @@ def check_validation_set(said: str, folder: Path) -> None:
 
 def check_trained_head(said: str, folder: Path) -> None:
     (loss,) = numbers(said, r"1 batches, loss ([\d.]+)")
+    assert not any(layer.include for layer in read_net(folder / "places.prototxt").layer)  # as a deploy net
     assert loss < 4  # two losses of 128 views each: 2 ln 127 = 9.7 by chance
     assert (folder / "places.caffemodel").stat().st_size < 10e6
     files = str(folder / "places.prototxt"), str(folder / "places.caffemodel")
