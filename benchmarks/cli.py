@@ -22,7 +22,10 @@ TRAINING = ("netspec", "netspec-bf16", "netspec-compile", "pytorch", "pycaffe")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit statuses are those of netspec."""
-    return run(parser(), list(sys.argv[1:] if argv is None else argv))
+    words = list(sys.argv[1:] if argv is None else argv)
+    made = parser()
+    made.set_defaults(words=words)
+    return run(made, words)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -62,11 +65,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("kind", choices=KINDS, help="what grows")
     p.add_argument("sizes", type=int, nargs="*", metavar="SIZE", help="how many of it, several times (default: usual)")
     p.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
-    p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
+    _add_json(p)
     p = commands.add("feeding", _feeding, "how long trainings wait for data from databases and image files")
     p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
     p.add_argument("--batch", type=int, default=4, help="items of a batch (default: 4)")
     p.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
+    _add_json(p)
     p = commands.add("settings", _settings, "judge loopclosure's auto on drives whose loops are known")
     _add_data(p)
     p.add_argument("families", nargs="*", metavar="FAMILY", help="only the drives made of these (default: all)")
@@ -107,6 +111,10 @@ def _add_ways(p: argparse.ArgumentParser, known: Sequence[str], default: Sequenc
         "--with", dest="ways", nargs="+", choices=known, default=list(default), help=f"default: {' '.join(default)}"
     )
     p.add_argument("--rounds", type=int, default=9, help="rounds, in each of which every way has its turn (default: 9)")
+    _add_json(p)
+
+
+def _add_json(p: argparse.ArgumentParser) -> None:
     p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
 
 
@@ -172,18 +180,24 @@ def _waiting(arguments: argparse.Namespace) -> None:
 def _feeding(arguments: argparse.Namespace) -> None:
     from benchmarks.feeding import measure
 
-    measure(arguments.nets, arguments.batch, arguments.threads, print)
+    _keep(arguments, measure(arguments.nets, arguments.batch, arguments.threads, partial(print, flush=True)))
 
 
 def _growth(arguments: argparse.Namespace) -> None:
-    from benchmarks import growth, report
+    from benchmarks import growth
 
     rows = growth.measure(arguments.kind, arguments.sizes or growth.KINDS[arguments.kind].sizes)
     print(growth.table(rows))
     if arguments.plot:
         growth.draw(arguments.plot, rows)
+    _keep(arguments, rows)
+
+
+def _keep(arguments: argparse.Namespace, rows: Sequence[Any], described: Any = None) -> None:
+    from benchmarks import results
+
     if arguments.json:
-        report.write_json(arguments.json, rows, report.machine(None))
+        results.write(arguments.json, rows, arguments.words, described)
 
 
 def _start(arguments: argparse.Namespace) -> None:
@@ -226,19 +240,18 @@ def _report(
 
     ``before`` was measured before, for the same files.
     """
-    from benchmarks import environment, report
+    from benchmarks import environment, report, results
     from benchmarks.compare import YARDSTICKS
 
     yardsticks = environment.python() if set(arguments.ways) & set(YARDSTICKS) else None
-    described, rows = report.machine(yardsticks), list(before)
+    described, rows = results.machine(yardsticks), list(before)
     for found in rows_of(yardsticks):
         rows += found
         print(report.table(found), flush=True)
         for row in found:
             if row.fault:
                 print(f"{row.name}: {row.fault}", file=sys.stderr)
-        if arguments.json:
-            report.write_json(arguments.json, rows, described)
+        _keep(arguments, [report.columns(row) for row in rows], described)
     if getattr(arguments, "plot", None):
         report.draw(arguments.plot, rows)
     return rows

@@ -36,11 +36,11 @@ def rows_of(
     contestants = [_worker(case, way, task, suffix, yardsticks) for way in ways]
     if caffe:
         contestants.append(CaffeProgram(caffe, task, training=bool(suffix)))
-    return _rows(case, threads, contestants, rounds, limit)
+    return _rows(case, threads, contestants, rounds, "training" if suffix else "forward", limit)
 
 
 def _rows(
-    case: Case, threads: int, contestants: Sequence[Contestant], rounds: int, limit: float = math.inf
+    case: Case, threads: int, contestants: Sequence[Contestant], rounds: int, what: str, limit: float = math.inf
 ) -> list[Row]:
     able = [one for one in contestants if not one.fault]
     try:
@@ -65,7 +65,7 @@ def _rows(
         }
         off = difference(one.outputs, expected) if expected and one.name != "netspec" and one.outputs else None
         rows.append(
-            Row(case.name, case.batch, threads, one.name, own, computing, ratios, off, one.fault, spent, one.peak)
+            Row(case.name, case.batch, threads, one.name, own, computing, ratios, off, one.fault, spent, one.peak, what)
         )
     return rows
 
@@ -117,7 +117,7 @@ def starts_of(case: Case, ways: Sequence[str], yardsticks: str | None, rounds: i
     for way in ways:
         name, options = parts(way)
         contestants.append(Starter(way, python_of(way, yardsticks), {**task, **options, "runs": name}))
-    return _rows(case, 0, contestants, rounds)
+    return _rows(case, 0, contestants, rounds, "start")
 
 
 class _Absent:

@@ -5,6 +5,7 @@ The records are pictures of noise, smoothed as photographs are: JPEG files take 
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,32 +20,55 @@ from netspec.errors import SpecError
 FILE_SIZE = (480, 640)  # height, width of the files that ImageData reads
 SECONDS = 5.0
 Say = Callable[[str], None]
+BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
 
 
-def measure(names: list[str], batch: int, threads: int, say: Say) -> None:
-    """Say a table of the share of an iteration that each net waits for its data, source by source."""
+def measure(names: list[str], batch: int, threads: int, say: Say) -> list[dict[str, Any]]:
+    """Say and return how long each net waits for its data, source by source, and how long a record takes by itself."""
     import torch
 
     import netspec
     from netspec.proto.text import write_text
 
     torch.set_num_threads(threads)
-    say("| net | data | ms per iteration | waiting for data |\n|---|---|---|---|")
+    say("| net | data | batch | ms per iteration | waiting for data | microseconds per record |")
+    say("|---|---|---|---|---|---|")
+    rows = []
     for name in names:
         if name not in CATALOG:
             raise SpecError(f'no training of "{name}"; there are: {", ".join(CATALOG)}')
-        channels = record(name)[0][0]
+        channels, height, _ = record(name)[0]
         for kind, prepare in SOURCES.items():
-            if kind != "LMDB of pixels" and channels != 3:
+            if kind in IMAGES and (channels != 3 or height < 16):
                 continue  # an encoded image has three channels, ImageData reads one image
             with TemporaryDirectory(prefix="feeding-") as folder:
                 net = training_net(name, "", batch)
-                prepare(net, Path(folder), record(name), 4 * batch)
+                prepare(net, Path(folder), record(name), max(256, 4 * batch) if height < 64 else 4 * batch)
                 (Path(folder) / "net.prototxt").write_text(write_text(net))
                 solver = netspec.load_solver(_solver(folder), device="cpu")
                 spent, waited = _run(solver)
+                each = _making(solver, batch)
                 solver.close()
-            say(f"| {name} | {kind} | {1e3 * spent:.0f} | {100 * waited / spent:.1f} % |")
+            say(f"| {name} | {kind} | {batch} | {1e3 * spent:.2f} | {100 * waited / spent:.1f} % | {1e6 * each:.1f} |")
+            found = {
+                "ms per iteration": 1e3 * spent,
+                "waiting, ms": 1e3 * waited,
+                "microseconds per record": 1e6 * each,
+            }
+            rows.append({"net": name, "data": kind, "batch": batch, "threads": threads, **found})
+    return rows
+
+
+def _making(solver: Any, batch: int) -> float:
+    """Return the seconds that reading and transforming take, by record: the median of batches, one after the other."""
+    make = next(layer.source.batch for layer in solver.net.layers if hasattr(layer, "source"))
+    times: list[float] = []
+    start = time.perf_counter()
+    while len(times) < 3 or time.perf_counter() - start < SECONDS / 10:
+        began = time.perf_counter()
+        make(len(times))
+        times.append(time.perf_counter() - began)
+    return statistics.median(times) / batch
 
 
 def _run(solver: Any) -> tuple[float, float]:
@@ -71,7 +95,7 @@ def _solver(folder: str) -> str:
 def _picture(random: np.random.Generator, channels: int, height: int, width: int) -> np.ndarray:
     import cv2
 
-    coarse = random.integers(0, 256, (height // 8, width // 8, channels), np.uint8)
+    coarse = random.integers(0, 256, (-(-height // 8), -(-width // 8), channels), np.uint8)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).reshape(height, width, channels)
 
 
@@ -79,6 +103,33 @@ def _pixels(net: Any, folder: Path, shape: Any, count: int) -> None:
     from netspec.data.datum import array_to_datum
 
     _write(net, folder, shape, count, lambda picture, label: array_to_datum(picture.transpose(2, 0, 1), label))
+
+
+def _leveldb(net: Any, folder: Path, shape: Any, count: int) -> None:
+    from netspec.data.datum import array_to_datum
+
+    def datum(picture: np.ndarray, label: int) -> Any:
+        return array_to_datum(picture.transpose(2, 0, 1), label)
+
+    _write(net, folder, shape, count, datum, "leveldb")
+
+
+def _hdf5(net: Any, folder: Path, shape: Any, count: int) -> None:
+    from netspec.files.hdf5 import new_hdf5
+
+    (channels, height, width), classes = shape
+    with new_hdf5(folder / "rows.h5") as file:
+        values = np.random.default_rng(0).standard_normal((count, channels, height, width), np.float32)
+        file.create_dataset("data", data=values)
+        file.create_dataset("label", data=(np.arange(count) % classes).astype(np.float32))
+    (folder / "files.txt").write_text(f"{folder / 'rows.h5'}\n")
+    for layer in net.layer:
+        if layer.type == "Data":
+            batch = layer.data_param.batch_size
+            layer.ClearField("data_param")
+            layer.ClearField("transform_param")
+            layer.type = "HDF5Data"
+            layer.hdf5_data_param.source, layer.hdf5_data_param.batch_size = str(folder / "files.txt"), batch
 
 
 def _encoded(net: Any, folder: Path, shape: Any, count: int) -> None:
@@ -92,19 +143,27 @@ def _encoded(net: Any, folder: Path, shape: Any, count: int) -> None:
     _write(net, folder, shape, count, datum)
 
 
-def _write(net: Any, folder: Path, shape: Any, count: int, datum: Callable[[np.ndarray, int], Any]) -> None:
+def _write(
+    net: Any,
+    folder: Path,
+    shape: Any,
+    count: int,
+    datum: Callable[[np.ndarray, int], Any],
+    backend: str = "lmdb",
+) -> None:
     from netspec.data.database import Writer
 
     (channels, height, width), classes = shape
     random = np.random.default_rng(0)
     source = str(folder / "records")
-    with Writer(source) as writer:
+    with Writer(source, backend) as writer:
         for k in range(count):
             picture = _picture(random, channels, height, width)
             writer.put(b"%08d" % k, datum(picture, k % classes).SerializeToString())
     for layer in net.layer:
         if layer.type == "Data":
             layer.data_param.source = source
+            layer.data_param.backend = BACKENDS.index(backend)
 
 
 def _files(net: Any, folder: Path, shape: Any, count: int) -> None:
@@ -128,8 +187,11 @@ def _files(net: Any, folder: Path, shape: Any, count: int) -> None:
             reads.new_height, reads.new_width = height, width
 
 
+IMAGES = ("LMDB of JPEG", "ImageData, JPEG of 640x480")
 SOURCES: dict[str, Callable[[Any, Path, Any, int], None]] = {
     "LMDB of pixels": _pixels,
+    "LevelDB of pixels": _leveldb,
+    "HDF5 of floats": _hdf5,
     "LMDB of JPEG": _encoded,
     "ImageData, JPEG of 640x480": _files,
 }

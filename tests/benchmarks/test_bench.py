@@ -102,10 +102,12 @@ def test_forward_passes_are_compared(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "lenet, batch 1" in plot.read_text()
     assert "| lenet | 1 | 1 | pytorch |" in capsys.readouterr().out
     told = json.loads(out.read_text())
-    assert [row["name"] for row in told["rows"]] == ["netspec", "pytorch", "pycaffe"]
-    assert all(len(row["seconds"]) == 1 and not row["fault"] for row in told["rows"])
-    assert told["rows"][1]["difference"] < 1e-5
+    assert [row["run by"] for row in told["rows"]] == ["netspec", "pytorch", "pycaffe"]
+    assert all(row["what"] == "forward" and row["ms"] > 0 for row in told["rows"])
+    assert told["rows"][1]["off by"] < 1e-5
     assert told["machine"]["cores"] > 0
+    assert told["date"] > "2026"
+    assert told["command"].startswith("tools/bench forward lenet --with netspec")
 
 
 @pytest.mark.slow
@@ -117,9 +119,9 @@ def test_trainings_are_compared_with_the_program_caffe_too(tmp_path: Path, capsy
     words = ["--batch", "4", "--rounds", "1", "--caffe", caffe, "--json", str(out)]
     assert main(["train", "lenet", "--with", "netspec", "pytorch", *words]) == 0
     rows = json.loads(out.read_text())["rows"]
-    assert [row["name"] for row in rows] == ["netspec", "pytorch", "caffe"]
-    assert all(min(row["seconds"]) > 0 for row in rows)
-    assert rows[1]["difference"] < 1e-5
+    assert [row["run by"] for row in rows] == ["netspec", "pytorch", "caffe"]
+    assert all(row["ms"] > 0 for row in rows)
+    assert rows[1]["off by"] < 1e-5
     assert "/ pytorch | / caffe" in capsys.readouterr().out
 
 
@@ -187,16 +189,20 @@ def test_what_keeps_growth_from_being_measured_is_said(capsys: pytest.CaptureFix
 
 @pytest.mark.slow
 def test_waiting_for_data_is_told_for_each_source(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    pytest.importorskip("plyvel")
     monkeypatch.setattr(feeding, "SECONDS", 0.0)
-    assert main(["feeding", "small/siamese_8", "squeezenet", "--batch", "1", "--threads", "1"]) == 0
+    words = ["--batch", "1", "--threads", "1", "--json", str(tmp_path / "feeding.json")]
+    assert main(["feeding", "tiny", "squeezenet", *words]) == 0
     rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    assert [row[:2] for row in rows] == [
-        ["small/siamese_8", "LMDB of pixels"],
-        *(["squeezenet", source] for source in feeding.SOURCES),
-    ]
-    assert all(0 <= float(row[3].removesuffix(" %")) < 100 for row in rows)
+    sources = [("tiny", source) for source in feeding.SOURCES if source not in feeding.IMAGES]
+    sources += [("squeezenet", source) for source in feeding.SOURCES]
+    assert [tuple(row[:2]) for row in rows] == sources
+    assert all(0 <= float(row[4].removesuffix(" %")) < 100 for row in rows)
+    kept = json.loads((tmp_path / "feeding.json").read_text())["rows"]
+    assert [(row["net"], row["data"]) for row in kept] == sources
+    assert all(row["microseconds per record"] > 0 for row in kept)
 
 
 def test_a_net_without_a_training_is_named(capsys: pytest.CaptureFixture[str]) -> None:
@@ -212,5 +218,5 @@ def test_starts_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["start", "squeezenet", *ways, "--rounds", "1", "--json", str(out)]) == 0
     assert "| squeezenet | 1 | 0 | netspec-onnxruntime |" in capsys.readouterr().out
     rows = json.loads(out.read_text())["rows"]
-    assert all(min(row["seconds"]) > 0 and min(row["computing"]) > 0 for row in rows)
-    assert rows[1]["difference"] < 1e-4
+    assert all(row["ms"] > 0 and row["CPU ms"] > 0 for row in rows)
+    assert rows[1]["off by"] < 1e-4
