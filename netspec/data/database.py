@@ -12,6 +12,7 @@ import shutil
 import threading
 import weakref
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from itertools import islice
 from multiprocessing.util import Finalize
@@ -45,8 +46,12 @@ class Reader(ABC):
         """Return the key of record ``i``."""
 
     @abstractmethod
+    def records(self, numbers: Sequence[int]) -> list[bytes]:
+        """Return the values of records; raises SpecError where the database is damaged or was changed."""
+
     def record(self, i: int) -> bytes:
-        """Return the value of record ``i``; raises SpecError where the database is damaged or was changed."""
+        """Return the value of record ``i``; see :meth:`records`."""
+        return self.records((i,))[0]
 
     @property
     @abstractmethod
@@ -126,10 +131,10 @@ class _LmdbReader(Reader):
     def key(self, i: int) -> bytes:
         return self._record(i).key
 
-    def record(self, i: int) -> bytes:
-        record = self._record(i)
+    def records(self, numbers: Sequence[int]) -> list[bytes]:
+        found = [self._record(i) for i in numbers]
         try:
-            return self._file.value(record)
+            return [value for run in _runs(numbers) for value in self._file.values(found[run])]
         except (ValueError, OSError) as fault:
             raise self._fault(fault) from None
 
@@ -181,12 +186,29 @@ class _LevelDbReader(Reader):
     def key(self, i: int) -> bytes:
         return self._keys[i]
 
-    def record(self, i: int) -> bytes:
-        return self._db.get(self._keys[i])
+    def records(self, numbers: Sequence[int]) -> list[bytes]:
+        values: list[bytes] = []
+        for run in _runs(numbers):
+            keys = [self._keys[i] for i in numbers[run]]
+            if len(keys) == 1:
+                values.append(self._db.get(keys[0]))
+                continue
+            with self._db.iterator(start=keys[0], stop=keys[-1], include_stop=True, include_key=False) as walk:
+                values += walk
+        return values
 
     @property
     def is_current(self) -> bool:
         return _names_and_sizes(self._source) == self._stamp
+
+
+def _runs(numbers: Sequence[int]) -> Iterator[slice]:
+    """Yield the parts of a line of numbers in which each is one more than that before."""
+    start = 0
+    for end in range(1, len(numbers) + 1):
+        if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
+            yield slice(start, end)
+            start = end
 
 
 def _names_and_sizes(folder: str) -> dict[str, int]:

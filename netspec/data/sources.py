@@ -16,6 +16,7 @@ from netspec.data.database import Reader
 from netspec.data.datum import parse_datum, times
 from netspec.data.images import ListedImage, read_image
 from netspec.data.random_words import permutation, words
+from netspec.data.stacked import Stacker
 from netspec.data.transformer import Shape, Transformer
 from netspec.errors import SpecError, Where
 
@@ -158,6 +159,18 @@ class DatabaseSource(_ImageSource):
     def __init__(self, reader: Reader, cursor: Cursor, transformer: Transformer, where: Where | None = None) -> None:
         self._reader, self._where = reader, where
         super().__init__(cursor, transformer)
+        self._stacked = Stacker()
+        self._small = self._stacked(reader.records((cursor.first(),))) is not None
+
+    def batch(self, iteration: int) -> Arrays:
+        """Return images (N, C, H, W) and labels (N,): of small records all at once."""
+        try:
+            found = self._stacked(self._reader.records(self.cursor.records(iteration))) if self._small else None
+        except SpecError:
+            found = None  # one by one they say which record it is
+        if found is None or (len(found[0]) > 1 and self._transform.output_shape(found[0].shape[1:]) != self._shape):
+            return super().batch(iteration)
+        return self._transform(found[0], self.cursor.positions(iteration)), found[1]
 
     def keys(self, iteration: int) -> list[str]:
         """Return the keys of the records of an iteration."""

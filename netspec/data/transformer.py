@@ -13,7 +13,7 @@ import numpy as np
 from netspec.data.blobs import Shape
 from netspec.data.datum import datum_to_array, times
 from netspec.data.mean import read_mean
-from netspec.data.random_words import words_at
+from netspec.data.random_words import WORDS, words_at
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import TRAIN
 from netspec.terminal import log
@@ -78,35 +78,52 @@ class Transformer:
             raise self._error(message, "mean_value")
         return (channels, self.crop_size, self.crop_size) if self.crop_size else shape
 
-    def __call__(self, images: Sequence[np.ndarray], positions: range) -> np.ndarray:
+    def __call__(self, images: Sequence[np.ndarray] | np.ndarray, positions: range) -> np.ndarray:
         """Return the images, uint8 or float32 (C, H, W), as one batch: float32 (N, C, H', W').
 
-        ``positions`` are the images' numbers in the sequence of all records read; they determine the random numbers.
+        Images in one array (N, C, H, W) are transformed all at once. ``positions`` are the images' numbers in the
+        sequence of all records read; they determine the random numbers.
         """
         batch = np.empty((len(images), *self.output_shape(images[0].shape)), np.float32)
-        draws = words_at(self._seed, self._stream, positions).tolist()
-        for image, out, (mirror, h_off, w_off, _) in zip(images, batch, draws, strict=True):
-            self._transform(image, out, mirror, h_off, w_off)
+        drawn = self.mirror or self._random_crop
+        draws = words_at(self._seed, self._stream, positions) if drawn else np.zeros((len(images), WORDS), np.uint64)
+        if isinstance(images, np.ndarray):
+            self._transform(images, batch, draws)
+        else:
+            for k, image in enumerate(images):
+                self._transform(image[None], batch[k : k + 1], draws[k : k + 1])
         if self.scale != 1:
             batch *= self.scale
         return batch
 
-    def _transform(self, image: np.ndarray, out: np.ndarray, mirror: int, h_off: int, w_off: int) -> None:
+    def _transform(self, images: np.ndarray, out: np.ndarray, draws: np.ndarray) -> None:
+        """Write images of one size, but for the scale; ``draws`` (N, 4) are their random numbers."""
         mean = self.mean_values[:, None, None] if len(self.mean_values) else self._mean
         if self.crop_size:
-            spare_h, spare_w = image.shape[1] - self.crop_size, image.shape[2] - self.crop_size
-            top = h_off % (spare_h + 1) if self._random_crop else spare_h // 2
-            left = w_off % (spare_w + 1) if self._random_crop else spare_w // 2
-            window = np.s_[:, top : top + self.crop_size, left : left + self.crop_size]
-            image = image[window]
+            spare = np.array(images.shape[2:], np.uint64) - np.uint64(self.crop_size)
+            corners = draws[:, 1:3] % (spare + np.uint64(1)) if self._random_crop else (spare // np.uint64(2))[None]
+            images = _windows(images, corners, self.crop_size)
             if self._mean is not None:
-                mean = self._mean[window]
-        if self.mirror and mirror % 2:
-            out = out[:, :, ::-1]
-        if mean is None:
-            out[...] = image
-        else:
-            np.subtract(image, mean, out=out, dtype=np.float32)
+                mean = _windows(self._mean[None], corners, self.crop_size)
+        out[...] = images
+        if mean is not None:
+            out -= mean
+        if self.mirror:
+            mirrored = np.flatnonzero(draws[:, 0] % np.uint64(2))
+            out[mirrored] = out[mirrored, :, :, ::-1]
 
     def _error(self, message: str, field: str) -> SpecError:
         return SpecError(message, self._at("transform_param", field))
+
+
+def _windows(images: np.ndarray, corners: np.ndarray, size: int) -> np.ndarray:
+    """Return the square window of each of N images, or N windows of one image: (N, C, size, size).
+
+    ``corners`` (N, 2) are their upper left corners; a single one is that of all.
+    """
+    if len(corners) == 1:
+        top, left = map(int, corners[0])
+        return images[:, :, top : top + size, left : left + size]
+    windows = np.lib.stride_tricks.sliding_window_view(images, (size, size), axis=(2, 3))
+    each = np.arange(len(images)) if len(images) > 1 else 0
+    return windows[each, :, corners[:, 0], corners[:, 1]]

@@ -82,7 +82,11 @@ class Windows(Transformer):
         return super().output_shape(shape)
 
     @override
-    def _transform(self, image: Array, out: Array, mirror: int, h_off: int, w_off: int) -> None:
+    def _transform(self, images: Array, out: Array, draws: Array) -> None:
+        for image, cut, (mirror, h_off, w_off, _) in zip(images, out, draws.tolist(), strict=True):
+            self._transform_one(image, cut, mirror, h_off, w_off)
+
+    def _transform_one(self, image: Array, out: Array, mirror: int, h_off: int, w_off: int) -> None:
         """Cut a window, in training of one of the sizes and at one of the places; bring it to crop_size."""
         p = self._param
         flipped = self.mirror and mirror % 2 == 1

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from netspec.data.database import Writer, open_reader
-from netspec.data.datum import array_to_datum
+from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
 from netspec.data.sources import Cursor, DatabaseSource, Draws, draw_skip
+from netspec.data.stacked import Stacker
 from netspec.data.transformer import Transformer
 from netspec.errors import SpecError, Where
-from netspec.proto.schema import TransformationParameter
+from netspec.proto.schema import Datum, TransformationParameter
 
 PLACE = Where("net.prototxt", 9, 5)
 
@@ -95,3 +96,76 @@ def test_a_record_that_is_no_datum_is_named(tmp_path: Path) -> None:
     found = DatabaseSource(reader, Cursor(2, 1), transformer, PLACE)
     with pytest.raises(SpecError, match=r'^net.prototxt:9:5: record "second" is not a Datum \(3 bytes\)$'):
         found.batch(1)
+
+
+def datums(*labels: int, shape: tuple[int, int, int] = (2, 3, 4), floats: bool = False) -> list[bytes]:
+    values = np.random.default_rng(len(labels)).integers(0, 256, (len(labels), *shape))
+    typed = values.astype(np.float32) / 7 if floats else values.astype(np.uint8)
+    return [array_to_datum(*each).SerializeToString() for each in zip(typed, labels, strict=True)]
+
+
+def packed(record: bytes) -> bytes:
+    """The same Datum with its floats packed, and a field that nobody knows in front."""
+    datum = Datum.FromString(record)
+    numbers = np.array(datum.float_data, "<f4").tobytes()
+    datum.ClearField("float_data")
+    return b"\x78\x05" + datum.SerializeToString() + b"\x32" + bytes([len(numbers)]) + numbers
+
+
+@pytest.mark.parametrize(
+    ("records", "at_once"),
+    [
+        pytest.param(datums(0, 127, 128, 5, 300, 2**31 - 1, 70000), True, id="labels of one to five bytes"),
+        pytest.param(datums(-1, -(2**31), 7), True, id="labels below zero"),
+        pytest.param([bytes([8, 1, 16, 1, 24, 1, 34, 1, k]) for k in range(3)], True, id="no label"),
+        pytest.param([bytes([40, k, 8, 1, 34, 1, k, 16, 1, 24, 1]) for k in range(3)], True, id="another order"),
+        pytest.param(datums(1, 2, 3, 200, floats=True), True, id="floats"),
+        pytest.param([packed(record) for record in datums(1, 2, 300, floats=True)], True, id="packed floats"),
+        pytest.param(datums(3), True, id="one record"),
+        pytest.param([record + b"\x28\x09" for record in datums(1, 2)], False, id="two labels, the last one counts"),
+        pytest.param([record + b"\x35abcd" for record in datums(1, 2)], False, id="bytes before floats"),
+        pytest.param([*datums(1), *datums(2, floats=True)], False, id="bytes and floats"),
+        pytest.param([*datums(1, shape=(2, 3, 4)), *datums(1, shape=(2, 4, 3))], False, id="other shapes, equal sizes"),
+        pytest.param([*datums(1, 2), *datums(300, shape=(2, 1, 12))], False, id="other shapes, other sizes"),
+        pytest.param(datums(1, 2, shape=(1, 257, 256)), False, id="large"),
+    ],
+)
+@pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
+def test_small_records_are_read_at_once_as_one_by_one(
+    tmp_path: Path, records: list[bytes], at_once: bool, backend: str
+) -> None:
+    if backend == "leveldb":
+        pytest.importorskip("plyvel")
+    one_by_one = [parse_datum(record) for record in records]
+    found = Stacker()(records)
+    assert (found is not None) == at_once
+    if found is not None:
+        assert found[1].tolist() == [np.float32(datum.label) for datum in one_by_one]
+        expected = np.stack([datum_to_array(datum) for datum in one_by_one])
+        assert found[0].dtype == expected.dtype
+        assert (found[0] == expected).all()
+    with Writer(str(tmp_path / "db"), backend) as writer:
+        for i, record in enumerate(records):
+            writer.put(b"%08d" % i, record)
+    reader = open_reader(str(tmp_path / "db"), backend)
+    transformer = Transformer(TransformationParameter(mean_value=[2.5], scale=0.3, mirror=True), 0, lambda *path: PLACE)
+    read = DatabaseSource(reader, Cursor(len(reader), len(records) + 1), transformer, PLACE)  # which wraps
+    if len({datum_to_array(datum).shape for datum in one_by_one}) > 1:
+        with pytest.raises(SpecError, match="but the first record"):
+            read.batch(0)
+        return
+    arrays = [datum_to_array(datum) for datum in (*one_by_one, one_by_one[0])]
+    data, labels = read.batch(0)
+    assert (data == transformer(arrays, range(len(arrays)))).all()
+    assert labels.tolist() == [np.float32(datum.label) for datum in (*one_by_one, one_by_one[0])]
+
+
+def test_records_of_another_form_than_those_before_are_read_too() -> None:
+    read = Stacker()
+    for shape in ((2, 3, 4), (2, 4, 3), (24, 1, 1)):  # of one size
+        found = read(datums(1, 2, shape=shape))
+        assert found is not None
+        assert found[0].shape == (2, *shape)
+    assert read([b"\xff\xff\xff"] * 2) is None
+    assert read([record[:-3] for record in datums(1, 2)]) is None
+    assert read([b""]) is None

@@ -67,6 +67,7 @@ def test_training_does_what_caffes_loops_do_with_the_same_draws(tmp_path: Path, 
     found = transformer(TRAIN, **settings)(images, range(1000, 1040))
     draws = words(5, "data", 1000, len(images)).tolist()
     assert len({(m % 2, h % 4, w % 7) for m, h, w, _ in draws}) > 20
+    assert (found == transformer(TRAIN, **settings)(np.stack(images), range(1000, 1040))).all()
     for image, top, (m, h, w, _) in zip(images, found, draws, strict=True):  # drawn in the order mirror, h_off, w_off
         assert (top == caffe(image, mean, 0.0039, 6, h % 4, w % 7, m % 2 == 1)).all()
 
@@ -82,6 +83,7 @@ def test_records_are_transformed_alike_in_any_batch() -> None:
     whole = train(list(IMAGES), range(40))
     parts = np.concatenate([train(list(IMAGES[i : i + 8]), range(i, i + 8)) for i in range(0, 40, 8)])
     assert (whole == parts).all()
+    assert (whole == train(IMAGES, range(40))).all()
     assert (whole[1::3] == train(list(IMAGES[1::3]), range(1, 40, 3))).all()
 
 
