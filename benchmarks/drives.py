@@ -64,9 +64,14 @@ def drives(data: Path, work: Path, only: Sequence[str] = ()) -> Iterator[Drive]:
             if not only or f"walk_{seed}" in only:
                 yield from _of_walk(seed, size, work)
     for name in ("xyz", "rpy") if not only or "fr1" in only else ():
-        folder = data / "tum_fr1" / f"rgbd_dataset_freiburg1_{name}"
+        desk = {
+            name: read_sequence(data / "tum_fr1" / f"rgbd_dataset_freiburg1_{name}", "tum") for name in ("xyz", "rpy")
+        }
         exclusion = Exclusion(seconds=3.0)
-        yield Drive("fr1", name, load_sequence(read_sequence(folder, "tum"), Selection(stride=2), exclusion))
+        yield Drive("fr1", name, load_sequence(desk[name], Selection(stride=2), exclusion))
+        yield Drive("fr1", f"{name}, keyframes", load_sequence(desk[name], Selection(stride=8), exclusion))
+        other = desk["xyz" if name == "rpy" else "rpy"].taken(Selection(stride=2))
+        yield Drive("fr1", f"{name} from elsewhere", load_sequence(desk[name], Selection(stride=2), references=other))
     corridor = data / "corridor_loop"
     if not only or "corridor" in only:
         yield Drive("corridor", "loop", load_folder(corridor / "samples", corridor / "samples_GT.bmp"))
@@ -97,7 +102,21 @@ def _of_route(name: str, route: list[Path], other: list[Path], work: Path) -> It
     once = [*route, *between, *second[half]]
     where = np.concatenate([every, np.full(len(between), np.nan), every[half]])
     yield Drive(name, "comes back", _one_drive(once, where))
+    yield Drive(name, "once", _one_drive(route, every))
+    yield Drive(name, "twice", _one_drive([*route, *second], np.tile(every, 2)))
+    yield Drive(name, "twice, small", _one_drive([*small[0], *small[1]], np.tile(every, 2)))
+    standing = _standing(len(route))
+    yield Drive(name, "stands", _traverses([second[i] for i in standing], every[standing], route, every))
+    yield Drive(name, "stood", _traverses(second, every, [route[i] for i in standing], every[standing]))
     yield Drive(name, "shares nothing", _traverses(foreign, np.full(len(foreign), np.nan), route, every))
+
+
+def _standing(frames: int) -> np.ndarray:
+    """Return the places of a drive that stands at three places of the route, and drives on."""
+    rng = np.random.default_rng(frames)
+    times = np.ones(frames, int)
+    times[rng.integers(0, frames, 3)] = rng.integers(10, 40, 3)
+    return np.repeat(np.arange(frames), times)
 
 
 def _of_walk(seed: int, size: tuple[int, int], work: Path) -> Iterator[Drive]:

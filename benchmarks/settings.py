@@ -24,6 +24,7 @@ from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
 from loopclosure.evaluate import Judgment
 from loopclosure.methods.auto import PRECISION, Auto
 from loopclosure.methods.base import Images, MethodResult, earlier
+from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.decoys import search, settings
 from loopclosure.places.frames import read_bgr, read_gray
 from loopclosure.progress import silent
@@ -149,7 +150,8 @@ def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
     if not two:
         allowed &= earlier(len(scores), data.exclude_frames)
     tried = {"single images": np.where(allowed, scores, np.nan)}
-    tried |= {str(s): search(scores, allowed, s, two).scores for s in settings(scores.shape[0], scores.shape[1], two)}
+    given = Candidates(scores, allowed, two)
+    tried |= {str(s): search(given, s).scores for s in settings(scores.shape[0], scores.shape[1], two)}
     recalls = {name: _recall(matrix, truth) for name, matrix in tried.items()}
     check = GeometricCheck()
     for name in ("single images", max(recalls, key=lambda name: recalls[name])):

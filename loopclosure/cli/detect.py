@@ -121,8 +121,9 @@ def _detect(a: argparse.Namespace) -> None:
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.precision is None else a.precision
         odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None
-        results, found = whole_drive(detector, recording, features, precision, bar, odometry)
-        said = [*found.reasons, found.counts()]
+        found = whole_drive(detector, recording, features, precision, bar, odometry)
+        results = found.results
+        said = [*found.reasons, run.verdicts_said(results)]
     else:
         results = run.run_detector(detector, recording, features, bar)
         said = [run.verdicts_said(results)]

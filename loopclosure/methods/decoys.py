@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.seqslam import SequenceSettings, standardize, trajectory_costs
 
 LENGTHS = (10, 30, 60)
@@ -55,7 +56,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Found:
+class Lines:
     """What a search found.
 
     scores   (Q, R) of the line through each pair, higher = more alike; NaN where a pair is not a candidate
@@ -81,6 +82,43 @@ class Found:
         """Return which best matches (Q,) are loops; none if they are too few to tell."""
         accepted = (self.targets >= self.threshold(precision)) & self.near
         return accepted if np.count_nonzero(accepted) >= LEAST_ACCEPTED else np.zeros_like(accepted)
+
+
+@dataclass
+class Matches:
+    """The match of each query, as one step after the other sees it: (Q,) arrays.
+
+    match     the best reference, -1 without one
+    score     of the match, that of a line where lines are used; -inf without one
+    accepted  whether lines, or the score, make it a loop
+    inliers   of the match, 0 if chance explains them, -1 where it was not verified
+    evidence  its inliers as a share of those that rule out chance
+    few       whether it had too few points to be verified or rejected
+    """
+
+    match: np.ndarray
+    score: np.ndarray
+    accepted: np.ndarray
+    inliers: np.ndarray
+    evidence: np.ndarray
+    few: np.ndarray
+
+    @classmethod
+    def of(cls, given: Candidates, lines: Lines | None, precision: float) -> Matches:
+        """Return the matches that the lines find, or else each query's best candidate."""
+        if lines is not None:
+            match, score, accepted = lines.match.copy(), lines.targets, lines.accepted(precision)
+        else:
+            known = given.known
+            score = known.max(axis=1)
+            match = np.where(np.isfinite(score), known.argmax(axis=1), -1)
+            accepted = np.zeros(len(match), bool)
+        return cls(match, score, accepted, np.full(len(match), -1), np.zeros(len(match)), np.zeros(len(match), bool))
+
+    @property
+    def there(self) -> np.ndarray:
+        """Which queries have a match."""
+        return self.match >= 0
 
 
 def threshold(targets: np.ndarray, decoys: np.ndarray, precision: float, together: float = 1.0) -> float:
@@ -113,13 +151,9 @@ def settings(queries: int, references: int, two: bool) -> Iterator[Setting]:
                 yield Setting(sequence, standardized)
 
 
-def search(
-    scores: np.ndarray, allowed: np.ndarray, setting: Setting, two: bool, different: np.ndarray | None = None
-) -> Found:
-    """Search scores (Q, R), higher = more alike, for lines through ``allowed`` (Q, R) pairs.
-
-    different  (Q, R) bool: pairs that are known to show different places, the decoys; None: the lines backwards are
-    """
+def search(given: Candidates, setting: Setting) -> Lines:
+    """Search for lines through candidates; decoys are the lines backwards, or pairs known to be different."""
+    scores, allowed, different = given.scores, given.allowed, given.different
 
     def along(distances: np.ndarray) -> np.ndarray:
         return distances if setting.sequence is None else trajectory_costs(distances, setting.sequence)
@@ -135,10 +169,10 @@ def search(
     best = np.where(np.isnan(forward), -np.inf, forward)
     match, targets = best.argmax(axis=1), best.max(axis=1)
     decoys = np.where(np.isnan(reverse), -np.inf, reverse).max(axis=1)
-    ratio = len(best[0]) / len(best) if two else 1.0
+    ratio = len(best[0]) / len(best) if given.two else 1.0
     owner = _owner(best, match, setting.length)
     near = np.abs(owner - np.arange(len(best))) <= max(REACH, 1 / ratio)
-    return Found(setting, forward, np.where(np.isneginf(targets), -1, match), targets, decoys, near)
+    return Lines(setting, forward, np.where(np.isneginf(targets), -1, match), targets, decoys, near)
 
 
 def _owner(best: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
@@ -154,14 +188,12 @@ def _owner(best: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
     return owner
 
 
-def best_setting(
-    scores: np.ndarray, allowed: np.ndarray, two: bool, precision: float, different: np.ndarray | None = None
-) -> Found | None:
+def best_setting(given: Candidates, precision: float) -> Lines | None:
     """Return the search that finds the most loops at this precision; None if none finds any."""
     chosen, most = None, 0
-    alone = [] if different is None else [Setting(None)]
-    for setting in (*alone, *settings(scores.shape[0], scores.shape[1], two)):
-        found = search(scores, allowed, setting, two, different)
+    alone = [] if given.different is None else [Setting(None)]
+    for setting in (*alone, *settings(*given.scores.shape, given.two)):
+        found = search(given, setting)
         count = np.count_nonzero(found.accepted(precision))
         if count * NEARLY > most:
             chosen, most = found, count

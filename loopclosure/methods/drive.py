@@ -6,12 +6,11 @@ import numpy as np
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.similarity import similarity_matrix
-from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import Recording, run_detector
 from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
 from loopclosure.methods.auto import PRECISION, Answer, answer
-from loopclosure.methods.odometry import far_apart
+from loopclosure.methods.candidates import far_apart
 from loopclosure.places.frames import gray, read_gray
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
@@ -24,7 +23,7 @@ def whole_drive(
     precision: float = PRECISION,
     progress: Progress = silent,
     odometry: np.ndarray | None = None,
-) -> tuple[list[LoopResult], Answer]:
+) -> Answer:
     """Add every frame of a recording to a new detector, then decide with all of them in view which close loops.
 
     ``odometry`` are poses (frames, 7), NaN where not known. The detector gets these loops, and for frames to come the
@@ -46,23 +45,9 @@ def whole_drive(
         return pairs.agreement(check, query, reference)
 
     far = None if odometry is None else far_apart(odometry)
-    found = answer(scores, allowed, False, precision, check, agree, progress, far)
+    found = answer(scores, allowed, False, precision, check, agree, progress, far, detector.stamps)
     single = np.where(allowed, scores, -np.inf).max(axis=1)
     others = float(np.max(single[~found.accepted], initial=-np.inf))
     above = single[found.accepted & (single > others)]
-    results = [_result(found, i, float(stamp)) for i, stamp in enumerate(detector.stamps)]
-    detector.decided([result for result in results if result.accepted is not None], above.min() if len(above) else None)
-    return results, found
-
-
-def _result(found: Answer, query: int, stamp: float) -> LoopResult:
-    match, score, inliers = int(found.match[query]), float(found.score[query]), int(found.inliers[query])
-    return LoopResult(
-        query,
-        [(match, score)] if match >= 0 else [],
-        match if found.accepted[query] else None,
-        found.verdicts[query],
-        score,
-        inliers if inliers >= 0 else None,
-        None if np.isnan(stamp) else stamp,
-    )
+    detector.decided([result for result in found.results if result], above.min() if len(above) else None)
+    return found

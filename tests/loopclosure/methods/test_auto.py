@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Agreement, GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.methods.auto import answer
 from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
+from loopclosure.methods.candidates import far_apart
 from loopclosure.methods.decoys import threshold
-from loopclosure.methods.odometry import far_apart
 from loopclosure.progress import silent
 
 SIZE = 64
@@ -47,8 +48,8 @@ def test_two_traverses_of_one_road_are_matched(seed):
     assert np.all(np.abs(found.match - np.arange(150))[found.accepted] <= 3)
     assert len(found.reasons) == 3
     assert found.reasons[0].startswith("sequences of ")
-    assert "accepted" in found.counts()
-    assert "best score" in found.counts()
+    assert "accepted" in verdicts_said(found.results)
+    assert "best score" in verdicts_said(found.results)
 
 
 @pytest.mark.slow
@@ -58,7 +59,7 @@ def test_roads_that_share_no_place_have_no_loop(seed):
     found = answer(scores, everything(scores), two=True)
     assert not found.accepted.any()
     assert "none is accepted" in found.reasons[2]
-    assert found.counts().startswith("queries: 150 below threshold; 0 could not be verified; best score ")
+    assert verdicts_said(found.results).startswith("frames: 150 below threshold; best score ")
 
 
 def test_a_drive_against_keyframes():
@@ -100,7 +101,7 @@ def test_what_is_verified_is_a_loop_and_a_sequence_without_it_is_none():
     found = answer(scores, everything(scores), True, 0.99, check, first_half)
     assert found.accepted[:70].all()
     assert not found.accepted[90:].any()
-    assert set(found.verdicts[90:]) <= {"not verified", "below threshold"}
+    assert {result.verdict for result in found.results[90:]} <= {"not verified", "below threshold"}
     assert found.reasons[1].startswith("verification: ")
 
     nothing = answer(scores, everything(scores), True, 0.99, check, lambda *_: bad)
@@ -250,7 +251,7 @@ def test_single_images_are_verified_where_sequences_tell_nothing():
     right = seen[found.match] == seen
     assert right[found.accepted].all()
     assert np.count_nonzero(found.accepted) > 150
-    assert found.unverifiable > 0
+    assert "cannot be" in found.reasons[1]
 
 
 def test_a_threshold_counts_decoys():
@@ -286,7 +287,7 @@ def test_as_a_method(tmp_path, monkeypatch):
     result = method.score(Images(paths, paths), silent)
     assert np.count_nonzero(np.isfinite(result.scores)) > 0.9 * 150
     assert any(note.startswith("sequences of") for note in result.notes)
-    assert result.answer.startswith("queries: ")
+    assert result.answer.startswith("frames: ")
 
 
 @pytest.mark.parametrize(

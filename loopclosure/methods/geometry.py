@@ -1,0 +1,154 @@
+"""Which matches geometry makes loops, where it can tell: the verification of :mod:`loopclosure.methods.auto`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopclosure.detector.verification import DOUBTLESS, LEAST_MATCHES, SURE, Agreement, GeometricCheck
+from loopclosure.methods.candidates import Candidates
+from loopclosure.methods.decoys import UNEVEN, Lines, Matches, threshold
+from loopclosure.methods.seqslam import SequenceSettings
+from loopclosure.progress import Progress
+
+SAMPLE = 40  # matches, and unlike pairs, that tell whether verification works
+# The share of what sequences accept, or without sequences the number of matches, that verification must find.
+LEAST_SHARE, LEAST_FOUND = 0.5, 3
+# Where at most this share of unlike pairs are verified, a verified match beside a loop is one as well.
+RARELY = 0.05
+WINDOW = 5  # references beside a line, and at least so many queries along it, that a verified pair vouches for
+BESIDE = SequenceSettings(2 * WINDOW, *UNEVEN)  # the line through a single image that is a loop by itself
+
+Agree = Callable[[int, int], Agreement]
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Verification, and how it does here.
+
+    check, agree  of a query and a reference, by number
+    unlike  the evidence of pairs that the scores call unlike; None where nothing can be verified
+    keeps   whether matches of sequences are loops where unlike pairs are verified too
+    said    what was tried, in a sentence
+    """
+
+    check: GeometricCheck
+    agree: Agree
+    unlike: np.ndarray | None
+    keeps: bool
+    said: str
+
+    def common(self, evidence: float) -> bool:
+        """Whether more than half of the unlike pairs have this evidence."""
+        assert self.unlike is not None
+        return bool(np.count_nonzero(self.unlike >= evidence) > LEAST_SHARE * len(self.unlike))
+
+
+def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agree: Agree) -> Geometry:
+    """Verify some matches and some unlike pairs."""
+    accepted, match = matches.accepted, matches.match
+    likely = np.flatnonzero(accepted) if accepted.any() else np.argsort(-matches.score, kind="stable")[:SAMPLE]
+    likely = _sample(likely[match[likely] >= 0])
+    if not len(likely):
+        return Geometry(check, agree, None, True, "verification: not tried, no query has a candidate")
+    same = sum(check.enough(agree(int(query), int(match[query]))) > 0 for query in likely)
+    against = _unlike(given.known, check, agree)
+    unlike = np.count_nonzero(against >= 1)
+    tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(against)} unlike pairs"
+    if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
+        following = (
+            []
+            if given.two
+            else [check.evidence(agree(int(query), int(query) - 1)) >= SURE for query in likely if query]
+        )
+        if accepted.any() and following and np.mean(following) >= LEAST_SHARE:
+            said = f"{tried}: consecutive frames are verified, so that these are no loops"
+            return Geometry(check, agree, np.full(SAMPLE, SURE), False, said)
+        said = f"{tried}: these images cannot be verified, so that nothing is rejected for it"
+        return Geometry(check, agree, None, True, said)
+    # Unlike pairs of a small place, a desk, do show the same things, and so does a dashboard in all images.
+    if unlike > LEAST_SHARE * len(against):
+        what = "something is the same in all images, so that only what has far more in common is verified"
+    else:
+        what = "what is verified is a loop, and what has no verified pair near it is none"
+    return Geometry(check, agree, against, True, f"{tried}: {what}")
+
+
+def _sample(numbers: np.ndarray) -> np.ndarray:
+    """Return at most ``SAMPLE`` of some numbers, evenly spread."""
+    if not len(numbers):
+        return numbers
+    return numbers[np.unique(np.linspace(0, len(numbers) - 1, SAMPLE).round().astype(int))]
+
+
+def _unlike(known: np.ndarray, check: GeometricCheck, agree: Agree) -> np.ndarray:
+    """Return the evidence of pairs that the scores (Q, R), -inf for no candidate, call unlike."""
+    against = []
+    for query in _sample(np.flatnonzero(np.count_nonzero(np.isfinite(known), axis=1) >= 8)):
+        order = np.argsort(known[query], kind="stable")
+        candidates = order[np.isfinite(known[query, order])]
+        # One of the least alike quarter, another quarter of them each time.
+        reference = candidates[int(query) % max(1, len(candidates) // 4)]
+        against.append(check.evidence(agree(int(query), int(reference))))
+    return np.array(against)
+
+
+def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
+    """Verify each query's match, or its best single image, which then becomes its match."""
+    check, single, there = geometry.check, given.known.argmax(axis=1), matches.there
+    for query in progress(np.flatnonzero(there), "verification", int(np.count_nonzero(there))):
+        # Lamps of a tunnel repeat: one image that is verified does not overrule a sequence that is accepted.
+        other = matches.match if matches.accepted[query] else single
+        for reference in dict.fromkeys((int(matches.match[query]), int(other[query]))):
+            agreement = geometry.agree(int(query), reference)
+            matches.inliers[query] = check.enough(agreement)
+            matches.evidence[query] = check.evidence(agreement)
+            matches.few[query] = agreement.matches < LEAST_MATCHES
+            if matches.inliers[query]:
+                matches.match[query] = reference
+                break
+    if lines is not None:
+        score = lines.scores[np.arange(len(there)), matches.match]
+        matches.score = np.where(there & ~np.isnan(score), score, -np.inf)
+
+
+def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: float) -> np.ndarray:
+    """Return the queries (Q,) whose matches, which were verified, are loops."""
+    unlike, evidence, accepted = geometry.unlike, matches.evidence, matches.accepted
+    assert unlike is not None
+    # What verification alone finds must be better than what it finds in pairs that are no loop.
+    least = max(SURE, threshold(evidence, unlike, precision))
+    if not geometry.common(DOUBTLESS):
+        least = min(least, DOUBTLESS)
+    # From afar a place is seen before the camera is there: other queries fit it better.
+    near = np.ones(len(accepted), bool) if lines is None else lines.near
+    sure = near & (evidence >= least)
+    verified = sure | (accepted & geometry.keeps) if geometry.common(1) else matches.inliers > 0
+    before, after = _beside(matches.match, verified, lines)
+    # Past the last verified match a loop has ended, though the line through it goes on.
+    loops = sure | (accepted & (verified | (before & after)))
+    rare = np.count_nonzero(unlike >= 1) <= RARELY * len(unlike)
+    while rare and np.any(more := verified & near & np.any(_beside(matches.match, loops, lines), axis=0) & ~loops):
+        loops |= more
+    return loops
+
+
+def _beside(match: np.ndarray, which: np.ndarray, lines: Lines | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the queries that have one of ``which`` (Q,) before them, and after, on the line through their match.
+
+    The line has the length and the velocities of the sequences, and is ``WINDOW`` references wide to each side.
+    """
+    before, after = np.zeros_like(which), np.zeros_like(which)
+    if lines is None:
+        return before, after
+    sequence, numbers = lines.setting.sequence or BESIDE, np.arange(len(match))
+    for step in range(1, max(WINDOW, sequence.length // 2) + 1):
+        for sign, side in ((-1, before), (1, after)):
+            other = numbers + sign * step
+            inside = np.flatnonzero((other >= 0) & (other < len(match)))
+            moved = (match[other[inside]] - match[inside]) * sign
+            low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW
+            side[inside[(moved >= low) & (moved <= high) & which[other[inside]]]] = True
+    return before, after
