@@ -53,6 +53,38 @@ def parameters(net: Net, arrays: Arrays, prefix: str) -> dict[str, np.ndarray]:
     return found
 
 
+def assert_arrays(found: Arrays, golden: Arrays, tolerance: float, what: str = "") -> float:
+    """Compare each array to ``tolerance`` of the largest element, 0 being equal bits; return the largest difference."""
+    most = 0.0
+    for key, value in found.items():
+        expected = golden[key]
+        assert value.shape == expected.shape, f"{what}: {key}"
+        if not tolerance:
+            np.testing.assert_array_equal(value, expected, f"{what}: {key}")
+        scale = max(float(np.abs(expected).max(initial=0)), 1e-30)
+        worst = float(np.abs(value.astype(np.float64) - expected).max(initial=0)) / scale
+        assert worst <= tolerance, f"{what}: {key}: off by {worst:.2e} of the largest element"
+        most = max(most, worst)
+    return most
+
+
+def assert_training(found: Arrays, golden: Arrays, bits: bool, drift: float) -> None:
+    """Compare what a training put out: numbers for each iteration, ``test/...`` after it, ``final/LAYER/INDEX``.
+
+    Without ``bits``, for a CPU that rounds in another way than Caffe's: those of the first ten iterations to 1e-4 of
+    the largest, everything to ``drift``.
+    """
+    weights = {key: value for key, value in found.items() if key.startswith("final/")}
+    numbers = {key: np.asarray(value, np.float32) for key, value in found.items() if key not in weights}
+    assert_arrays(numbers, golden, 0 if bits else drift)
+    if bits:
+        assert_arrays(weights, golden, 0)
+    else:
+        begun = {key: value[:10] for key, value in numbers.items() if not key.startswith("test/")}
+        assert_arrays(begun, {key: golden[key][:10] for key in begun}, 1e-4)
+        assert_same_layers(weights, golden, drift)
+
+
 def assert_same_layers(found: Arrays, expected: Arrays, tolerance: float) -> None:
     """Compare parameters named ``.../layer/index``: each layer's to a share of its norm.
 
