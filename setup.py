@@ -10,7 +10,7 @@ from setuptools.command.build_py import build_py
 
 HERE = Path(__file__).parent
 NETS = HERE / "prototxt"
-SHIPPED = HERE / "netspec" / "features" / "shipped.py"
+SHIPPED = HERE / "netspec" / "inspect" / "features" / "shipped.py"
 
 
 def files():

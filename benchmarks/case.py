@@ -65,7 +65,7 @@ def forward_case(
     Without ``weights`` they are random. Raises SpecError for faults of the files.
     """
     import netspec
-    from netspec.export.onnx import export_onnx
+    from netspec.export.formats.onnx import export_onnx
     from netspec.proto.text import write_text
 
     with TemporaryDirectory(prefix="bench-") as folder:

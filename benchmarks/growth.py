@@ -164,7 +164,7 @@ def described_walk(frames: int) -> np.ndarray:
     from loopclosure.descriptors.whitening import learn_whitening
     from loopclosure.detector.map import COMPONENTS
     from loopclosure.places.frames import read_bgr
-    from netspec.features.shipped import small
+    from netspec.inspect.features.shipped import small
 
     describe = small()
     with TemporaryDirectory(prefix="growth-") as folder:

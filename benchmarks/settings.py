@@ -28,8 +28,8 @@ from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.decoys import search, settings
 from loopclosure.places.frames import read_bgr, read_gray
 from loopclosure.progress import silent
-from netspec.features import shipped
 from netspec.files.whole_file import whole_file
+from netspec.inspect.features import shipped
 
 ENOUGH = 0.7  # of the best setting's recall
 

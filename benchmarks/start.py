@@ -21,7 +21,7 @@ def netspec(task: Task) -> tuple[Seconds, Any]:
     seconds = _import_torch() if task["engine"] == "torch" else (0.0, 0.0)
     import cv2
 
-    from netspec.features.describer import Describer
+    from netspec.inspect.features.describer import Describer
 
     engine, precision, cache = task["engine"], task["precision"], task["cache"]
     describe = Describer(

@@ -42,7 +42,7 @@ def examples() -> dict[str, Example]:
 
 
 def _example(found: re.Match[str]) -> tuple[str, Example]:
-    from netspec.check.check import ON_META, check_file
+    from netspec.inspect.check.check import ON_META, check_file
 
     bottoms, given = (_shapes(found[part] or "") for part in ("bottoms", "tops"))
     inputs = [

@@ -15,7 +15,7 @@ import netspec
 import netspec.pycaffe as caffe
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.places.frames import read_bgr
-from netspec.features.describer import Describer
+from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net, write_text
 
 RATE, WARM, SCALE, VIEWS = 2e-3, 30, 20, 128  # rate of learning, and iterations until it is reached; views of a batch

@@ -23,13 +23,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from loopclosure.report.table_one import read_runs, text_table, write_report
+from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.files.whole_file import write_whole
 from netspec.graph.filter import filter_net, with_state
+from netspec.inspect.logs.scores import Score, read_scores
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, read_solver
-from netspec.runs.scores import Score, read_scores
-from netspec.terminal import log
 
 PHASES = {"train": TRAIN, "validation": TEST}
 TESTING = re.compile(r"\] Iteration \d+, Testing net")

@@ -27,13 +27,13 @@ import numpy as np
 
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.progress import Progress, silent
+from netspec import log
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum, decode_image, encoded_datum, times
 from netspec.data.images import read_image, read_image_list
 from netspec.data.random_words import permutation
 from netspec.errors import SpecError, Where
 from netspec.files.opencv import cv2
-from netspec.terminal import log
 
 S = TypeVar("S")
 T = TypeVar("T")

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.progress import Progress, silent
+from netspec import log
 from netspec.data.database import Writer
 from netspec.data.random_words import words
 from netspec.errors import SpecError, Where
 from netspec.files.lfs import pointer_fault
 from netspec.proto.schema import Datum
-from netspec.terminal import log
 
 IMAGES, LABELS = 2051, 2049  # the first number of a file of MNIST
 CIFAR_SHAPE = (3, 32, 32)

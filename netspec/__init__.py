@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from typing import Any
 
     from netspec.dialects import use_dialect
-    from netspec.engines.net import load_net
     from netspec.errors import SpecError
     from netspec.net.net import Net
     from netspec.net.one_layer import layer
@@ -22,7 +21,7 @@ _HOMES = {
     "use_dialect": "netspec.dialects",
     "Net": "netspec.net.net",
     "layer": "netspec.net.one_layer",
-    "load_net": "netspec.engines.net",
+    "load_net": "netspec.load",
     "Solver": "netspec.solver.solver",
     "load_solver": "netspec.solver.solver",
     "load_weights": "netspec.net.weights",
@@ -44,14 +43,14 @@ __all__ = [
 
 def load_ipython_extension(ipython: object) -> None:
     """Let ``import caffe`` find netspec in a notebook: ``%load_ext netspec``."""
-    from netspec.scripts import finder
+    from netspec.compat.scripts import finder
 
     finder.install()
 
 
 def unload_ipython_extension(ipython: object) -> None:
     """Undo :func:`load_ipython_extension`."""
-    from netspec.scripts import finder
+    from netspec.compat.scripts import finder
 
     finder.uninstall()
 

@@ -23,7 +23,7 @@ def pytest_collection_finish() -> None:
     import torch
 
     import fake_gpu  # noqa: F401  autograd counts the devices at its first backward pass
-    from netspec.pycaffe import logs
+    from netspec.compat.pycaffe import logs
 
     torch.set_num_threads(1)
     logs.stop()  # importing pycaffe shows Caffe's log from then on; here pytest keeps it

@@ -4,7 +4,7 @@ from dataclasses import fields
 from typing import Any
 
 from netspec.graph.options import BuildOptions
-from netspec.layers.context import Context
+from netspec.layers.contract.context import Context
 
 _OPTIONS = frozenset(field.name for field in fields(BuildOptions))
 

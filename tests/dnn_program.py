@@ -1,6 +1,6 @@
 """One program for cv2.dnn of OpenCV 4 and for netspec.dnn: what it does with the nets in tests/golden/dnn.
 
-tests/golden/dnn/make.py records what OpenCV 4.12 gives; tests/netspec/dnn/test_golden.py compares.
+tests/golden/dnn/make.py records what OpenCV 4.12 gives; tests/netspec/compat/dnn/test_golden.py compares.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from itertools import combinations, pairwise
 
-from netspec.draw.marks import Curve, Rect, Text
-from netspec.draw.picture import Drawing, Picture
+from netspec.inspect.draw.marks import Curve, Rect, Text
+from netspec.inspect.draw.picture import Drawing, Picture
 
 Area = tuple[float, float, float, float]  # left, top, right, bottom
 LEAST_TEXT = 9  # pixels

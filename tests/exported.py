@@ -14,9 +14,9 @@ import torch
 
 import netspec
 from golden_cases import set_parameters
-from netspec.export.shapes import NetShapes
-from netspec.export.source import class_name
-from netspec.export.torch import torch_source
+from netspec.export.formats.shapes import NetShapes
+from netspec.export.formats.source import class_name
+from netspec.export.formats.torch import torch_source
 from netspec.net.net import Net
 from netspec.run.walk import Step, walk
 

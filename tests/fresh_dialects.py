@@ -6,7 +6,7 @@ from copy import copy
 
 import pytest
 
-from netspec.layers import registry
+from netspec.layers.contract import registry
 from netspec.proto.dialect import files
 from netspec.proto.dialect import registry as dialect
 

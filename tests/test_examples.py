@@ -12,7 +12,7 @@ from loopclosure.evaluate import judge
 from loopclosure.methods.base import MethodContext, make_method
 from loopclosure.places.datasets import load_traverses
 from loopclosure.places.frames import read_bgr
-from netspec.features.describer import Describer
+from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net
 from paths import ROOT, shared
 

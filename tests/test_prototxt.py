@@ -11,11 +11,11 @@ import pytest
 import torch
 
 import netspec
-from netspec.check.check import ON_META, check_file
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
-from netspec.engines.net import load_net
+from netspec.inspect.check.check import ON_META, check_file
 from netspec.layers import layer_class
+from netspec.load import load_net
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
 from netspec.proto.text import parse_net_text, read_net, read_solver

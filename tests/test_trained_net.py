@@ -8,7 +8,7 @@ import pytest
 from lmdb_build.cli import main as lmdb_build
 from loopclosure.cli import main as loopclosure
 from netspec.cli import main as netspec
-from netspec.features import shipped
+from netspec.inspect.features import shipped
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from netspec.features import shipped
+from netspec.inspect.features import shipped
 from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow
@@ -70,7 +70,7 @@ def test_it_holds_every_file_of_the_packages_and_nothing_else(wheel: Path) -> No
     expected |= {f"netspec/{name}" for name in NETS if name.endswith(".prototxt") or name.startswith(named)}
     assert found == expected
     assert wheel.stat().st_size < 12e6
-    assert {"netspec/proto/caffe.desc", "netspec/py.typed", "netspec/features/shipped.py"} < found
+    assert {"netspec/proto/caffe.desc", "netspec/py.typed", "netspec/inspect/features/shipped.py"} < found
 
 
 def test_it_says_what_it_is(wheel: Path) -> None:
@@ -120,7 +120,7 @@ def test_loops_are_detected_with_no_option(commands: Path, tmp_path: Path) -> No
     run(commands / "lmdb-build", "walk", "w", "--frames", "40", "--size", "80x60", "--laps", "2", cwd=tmp_path)
     run(commands / "loopclosure", "detect", "w/walk_1", "--out", "found", cwd=tmp_path)
     assert (tmp_path / "found" / "loops.csv").is_file()
-    code = "from netspec.features.shipped import folder; print(folder('siamese_8'))"
+    code = "from netspec.inspect.features.shipped import folder; print(folder('siamese_8'))"
     paper = Path(run(commands / "python", "-c", code, cwd=tmp_path).stdout.strip())
     assert paper.is_relative_to(commands.parent)
     assert (paper / "train_val.prototxt").read_bytes() == (ROOT / "prototxt/siamese_8/train_val.prototxt").read_bytes()

@@ -72,11 +72,10 @@ def main(golden: Path) -> None:
     run("netspec", "bug-report", "sgd_step/solver.prototxt", "--out", "report.md")
     run("lmdb-build", "walk", "walk", "--frames", "12", "--size", "48x36")
     run("loopclosure", "evaluate", "--help")
-    import netspec.dialects
+    from netspec.proto.dialect.files import known_files
 
-    for dialect in pkgutil.iter_modules(netspec.dialects.__path__):
-        if not dialect.name.startswith("_"):
-            run("netspec", "layers", "--plugin", dialect.name)
+    for dialect in known_files():
+        run("netspec", "layers", "--plugin", dialect)
     without = f", without {', '.join(sorted(map(str, missing)))}" if missing else ""
     print(f"Python {platform.python_version()}: {count} modules, and the commands of a training{without}")
 

@@ -19,10 +19,10 @@ from lmdb_build.databases import (
     write_databases,
 )
 from lmdb_build.datasets import convert_cifar, convert_mnist
+from netspec import log
 from netspec.data.database import BACKENDS, open_reader
 from netspec.data.mean import channel_means, compute_mean, write_mean
 from netspec.errors import Where
-from netspec.terminal import log
 from netspec.terminal.commands import Commands, WrongUsage, refuse
 from netspec.terminal.progress import bar
 

@@ -6,14 +6,14 @@ import argparse
 import re
 from typing import Any
 
-from netspec.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
+from netspec import log
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
+from netspec.export.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
 from netspec.graph.options import BuildOptions
 from netspec.graph.steps import PASSES
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
-from netspec.terminal import log
 from netspec.terminal.commands import WrongUsage, refuse
 
 
@@ -229,6 +229,6 @@ def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:
     chosen = choice(arguments)
     if (chosen.engine, chosen.precision) == (TORCH, FP32):
         return net
-    from netspec.engines.net import with_engine
+    from netspec.export.engines.net import with_engine
 
     return with_engine(net, chosen, model(arguments), split_paths(weights) if weights else [])

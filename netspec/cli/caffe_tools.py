@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import logging
 
+from netspec import log
 from netspec.cli.arguments import add_shapes, device, options, positive
 from netspec.cli.run import BUILT, READ, Commands
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
-from netspec.terminal import log
 from netspec.terminal.commands import WrongUsage
 
 
@@ -45,7 +45,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _extract_features(arguments: argparse.Namespace) -> None:
-    from netspec.features.databases import extract_features as write_features
+    from netspec.inspect.features.databases import extract_features as write_features
     from netspec.net.build import load_net
 
     number = arguments.device.rpartition("=")[2]

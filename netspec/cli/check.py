@@ -54,9 +54,9 @@ def add_to(commands: Commands) -> None:
 
 @no_collection()  # of the whole command: of the text and the table too
 def _check(arguments: argparse.Namespace) -> int:
-    from netspec.check.check import as_json, check_file
-    from netspec.check.findings import said_as_json, said_once
-    from netspec.check.plan import plan_text
+    from netspec.inspect.check.check import as_json, check_file
+    from netspec.inspect.check.findings import said_as_json, said_once
+    from netspec.inspect.check.plan import plan_text
     from netspec.net.table import table
 
     if not arguments.plan:
@@ -106,8 +106,8 @@ def _lint(arguments: argparse.Namespace) -> int:
         refuse(
             arguments, ("json", "level", "stage", "shape", "data", "allow_python_layers"), "is for files, not --rules"
         )
-    from netspec.check.findings import RULES, said_as_json, said_once
-    from netspec.check.lint import lint_file
+    from netspec.inspect.check.findings import RULES, said_as_json, said_once
+    from netspec.inspect.check.lint import lint_file
 
     for rule in sorted(RULES.values(), key=lambda rule: rule.name) if arguments.rules else ():
         print(f"{rule.name}: {rule.reason}")

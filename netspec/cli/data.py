@@ -76,8 +76,8 @@ def _tell(arguments: argparse.Namespace, found: Survey) -> int:
 
 def _show(arguments: argparse.Namespace, records: Records, found: Survey) -> None:
     from netspec.data.records import spread
-    from netspec.draw.sheet import sheet
-    from netspec.draw.style import ending_of, write_figure
+    from netspec.inspect.draw.sheet import sheet
+    from netspec.inspect.draw.style import ending_of, write_figure
 
     ending_of(arguments.out, ("png", "svg"))
     if arguments.start is None:

@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from netspec import log
 from netspec.cli.arguments import add_python, add_shapes, add_state, options
 from netspec.cli.run import BUILT, Commands
 from netspec.files.limits import amount
 from netspec.proto.binary import split_paths
-from netspec.terminal import log
 from netspec.terminal.commands import refuse
 
 EXPORT = """Write a net in another form, with its weights.
@@ -69,7 +69,7 @@ def _add_source(p: argparse.ArgumentParser) -> None:
 
 
 def _source(arguments: argparse.Namespace, labels: bool) -> Any:
-    from netspec.export.convert import Source
+    from netspec.export.formats.convert import Source
 
     weights = [Path(path) for path in split_paths(arguments.weights)] if arguments.weights else []
     if not weights:
@@ -86,8 +86,8 @@ def _source(arguments: argparse.Namespace, labels: bool) -> Any:
 
 def _export(arguments: argparse.Namespace) -> None:
     from netspec.data.mean import read_mean_option
-    from netspec.export.convert import export_net
-    from netspec.export.preprocess import Preprocess
+    from netspec.export.formats.convert import export_net
+    from netspec.export.formats.preprocess import Preprocess
 
     steps = Preprocess(
         arguments.input,
@@ -111,7 +111,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _fold(arguments: argparse.Namespace) -> None:
-    from netspec.export.convert import fold_files
+    from netspec.export.formats.convert import fold_files
 
     before, after = fold_files(_source(arguments, labels=False), arguments.out)
     print(f"{arguments.out}.prototxt and {arguments.out}.caffemodel: {after} layers of {before}")

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from netspec import log
 from netspec.cli.arguments import (
     add_device,
     add_engine,
@@ -31,11 +32,10 @@ from netspec.cli.arguments import (
 )
 from netspec.cli.run import BUILT, Commands
 from netspec.errors import SpecError
-from netspec.features.views import read_zooms
 from netspec.files.whole_file import whole_file, why_unwritable
+from netspec.inspect.features.views import read_zooms
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
-from netspec.terminal import log
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.progress import bar
 
@@ -76,7 +76,7 @@ def add_to(commands: Commands) -> None:
 def _extract(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from netspec.features.finite import rows_not_finite
+    from netspec.inspect.features.finite import rows_not_finite
 
     model(arguments)
     out = Path(arguments.out)
@@ -97,9 +97,9 @@ def _extract(arguments: argparse.Namespace) -> None:
 
 
 def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
-    from netspec.features.images import ImageNet, extract_images
-    from netspec.features.scaling import Steps
     from netspec.files.image_list import list_images
+    from netspec.inspect.features.images import ImageNet, extract_images
+    from netspec.inspect.features.scaling import Steps
 
     records = ("source", "iterations", "phase", "level", "stage", "allow_python_layers")
     refuse(arguments, records, "is for records; --images are read, and run in phase TEST")
@@ -131,8 +131,8 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
-    from netspec.features.records import extract_records, with_sources
     from netspec.graph.filter import with_state
+    from netspec.inspect.features.records import extract_records, with_sources
     from netspec.net.build import build_net
     from netspec.proto.text import parse_net
 

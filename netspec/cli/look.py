@@ -13,7 +13,7 @@ from netspec.proto.binary import split_paths
 from netspec.terminal.commands import WrongUsage, refuse
 
 if TYPE_CHECKING:
-    from netspec.features.images import ImageNet
+    from netspec.inspect.features.images import ImageNet
 
 PICTURES = ("png", "svg")
 
@@ -67,8 +67,8 @@ def _add_net(parser: argparse.ArgumentParser) -> None:
 
 def _filters(arguments: argparse.Namespace) -> None:
     from netspec.data.stored_weights import stored_layers
-    from netspec.draw.learned import filters_figure
-    from netspec.draw.style import ending_of, write_figure
+    from netspec.inspect.draw.learned import filters_figure
+    from netspec.inspect.draw.style import ending_of, write_figure
 
     ending_of(arguments.out, PICTURES)
     layers = [layer for layer in stored_layers(arguments.weights) if layer.has_filters]
@@ -88,8 +88,8 @@ def _filters(arguments: argparse.Namespace) -> None:
 
 
 def _maps(arguments: argparse.Namespace) -> None:
-    from netspec.draw.learned import maps_figure
-    from netspec.draw.style import ending_of, write_figure
+    from netspec.inspect.draw.learned import maps_figure
+    from netspec.inspect.draw.style import ending_of, write_figure
 
     ending_of(arguments.out, PICTURES)
     net = _net(arguments)
@@ -100,10 +100,10 @@ def _maps(arguments: argparse.Namespace) -> None:
 
 
 def _saliency(arguments: argparse.Namespace) -> None:
-    from netspec.draw.learned import saliency_figure
-    from netspec.draw.style import ending_of, write_figure
-    from netspec.features.saliency import of_distance, of_unit
-    from netspec.terminal.log import number
+    from netspec.inspect.draw.learned import saliency_figure
+    from netspec.inspect.draw.style import ending_of, write_figure
+    from netspec.inspect.features.saliency import of_distance, of_unit
+    from netspec.log import number
 
     if arguments.to:
         refuse(arguments, ("unit",), "and --to exclude each other: a number of the blob, or a distance")
@@ -122,10 +122,10 @@ def _saliency(arguments: argparse.Namespace) -> None:
 
 
 def _embedding(arguments: argparse.Namespace) -> None:
-    from netspec.draw.learned import embedding_figure
-    from netspec.draw.style import ending_of, write_figure
-    from netspec.features.embedding import in_plane, read_features
-    from netspec.features.thumbnails import thumbnails
+    from netspec.inspect.draw.learned import embedding_figure
+    from netspec.inspect.draw.style import ending_of, write_figure
+    from netspec.inspect.features.embedding import in_plane, read_features
+    from netspec.inspect.features.thumbnails import thumbnails
 
     ending_of(arguments.out, PICTURES)
     features = read_features(arguments.features, arguments.array)
@@ -138,8 +138,8 @@ def _embedding(arguments: argparse.Namespace) -> None:
 
 
 def _net(arguments: argparse.Namespace) -> ImageNet:
-    from netspec.features.images import ImageNet
-    from netspec.features.scaling import Steps
+    from netspec.inspect.features.images import ImageNet
+    from netspec.inspect.features.scaling import Steps
 
     if arguments.shape and arguments.shape[0] != arguments.input:
         raise WrongUsage(f"--shape names {arguments.shape[0]}, expected the input blob {arguments.input}")
@@ -157,6 +157,6 @@ def _net(arguments: argparse.Namespace) -> ImageNet:
 
 
 def _image(net: ImageNet, path: str) -> Any:
-    from netspec.features.images import read_pixels
+    from netspec.inspect.features.images import read_pixels
 
     return read_pixels(Path(path), net.shape[0])

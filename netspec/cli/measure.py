@@ -19,8 +19,8 @@ from netspec.cli.arguments import (
     run_by,
 )
 from netspec.cli.run import BUILT, Commands
+from netspec.inspect.logs.scores import Score, Scores
 from netspec.proto.binary import check_readable, split_paths
-from netspec.runs.scores import Score, Scores
 
 
 def add_to(commands: Commands) -> None:
@@ -50,7 +50,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _test(arguments: argparse.Namespace) -> None:
-    from netspec.check.measure import test_net
+    from netspec.inspect.check.measure import test_net
 
     check_readable(split_paths(arguments.weights))
     net = load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
@@ -63,7 +63,7 @@ def _test(arguments: argparse.Namespace) -> None:
 
 
 def _time(arguments: argparse.Namespace) -> None:
-    from netspec.check.measure import time_forward, time_net
+    from netspec.inspect.check.measure import time_forward, time_net
 
     net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343", write_files=False)
     run_by(net, arguments, None)

@@ -55,7 +55,7 @@ def _draw(arguments: argparse.Namespace) -> None:
         raise WrongUsage(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
     if arguments.out.suffix == ".html":
         refuse(arguments, ("unfold",), "is for .svg and .png; a page shows both")
-    from netspec.draw.files import write_picture
+    from netspec.inspect.draw.files import write_picture
 
     drawn = write_picture(
         arguments.file,
@@ -78,7 +78,7 @@ def _tolerance(text: str) -> float:
 
 
 def _diff(arguments: argparse.Namespace) -> int:
-    from netspec.check.compare import compare_files
+    from netspec.inspect.check.compare import compare_files
 
     status = DONE
     for each in compare_files(arguments.first, arguments.second, arguments.tolerance):

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from netspec import log
 from netspec.dialects import use_dialect
 from netspec.files.limits import read_amount
-from netspec.terminal import commands, log
+from netspec.terminal import commands
 
 READ, BUILT = 1, 2  # what a command does with nets: it reads their files, or makes them, which takes memory
 

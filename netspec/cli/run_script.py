@@ -46,9 +46,9 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from netspec.compat.scripts.program import Options, run_module, run_script
+    from netspec.compat.scripts.sources import write_translation
     from netspec.process.heap import keep_freed_memory
-    from netspec.scripts.program import Options, run_module, run_script
-    from netspec.scripts.sources import write_translation
 
     keep_freed_memory()  # most scripts train
 
@@ -69,7 +69,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _install(arguments: argparse.Namespace) -> None:
-    from netspec.scripts.environment import install_caffe, make_build_folder
+    from netspec.compat.scripts.environment import install_caffe, make_build_folder
 
     if arguments.build:
         refuse(arguments, ("replace",), "is for this Python environment, not for --build")
@@ -83,7 +83,7 @@ def _install(arguments: argparse.Namespace) -> None:
 
 
 def _remove(arguments: argparse.Namespace) -> None:
-    from netspec.scripts.environment import remove_build_folder, remove_caffe
+    from netspec.compat.scripts.environment import remove_build_folder, remove_caffe
 
     removed = remove_build_folder(arguments.build) if arguments.build else remove_caffe()
     for path in removed:

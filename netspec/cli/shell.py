@@ -36,14 +36,14 @@ def add_to(commands: Commands) -> None:
 
 def _serve(arguments: argparse.Namespace) -> None:
     try:
-        from netspec.editor.server import make_server
+        from netspec.inspect.editor.server import make_server
     except ImportError as fault:
         if not (fault.name or "").startswith(("pygls", "lsprotocol")):
             raise
         raise SpecError("the language server needs pygls: pip install pygls, or 'netspec-caffe[lsp]'") from None
     from importlib.metadata import version
 
-    from netspec.editor.messages import Messages
+    from netspec.inspect.editor.messages import Messages
 
     make_server(version("netspec-caffe")).start_io(Messages(sys.stdin.buffer))  # type: ignore[arg-type]
 
@@ -72,7 +72,7 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 
 def _bug_report(arguments: argparse.Namespace) -> None:
-    from netspec.check.bug_report import bug_report
+    from netspec.inspect.check.bug_report import bug_report
 
     text = bug_report(arguments.files)
     if not arguments.out:

@@ -11,10 +11,10 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from netspec import log
 from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, devices, options
 from netspec.cli.run import BUILT, Commands, signals
-from netspec.runs.scores import Score, Scores, Snapshot, read_scores
-from netspec.terminal import log
+from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
 from netspec.terminal.commands import DONE, FAULT, WrongUsage
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from netspec.cli.run import READ, Commands
 from netspec.terminal.commands import DONE, WrongUsage, refuse
 
 if TYPE_CHECKING:
-    from netspec.runs.run import Follower
+    from netspec.inspect.logs.run import Follower
 
 QUIET = 60.0  # seconds without a line after which a process that is not here counts as gone
 _HOME, _CLEAR_LINE, _CLEAR_REST = "\x1b[H", "\x1b[K", "\x1b[J"
@@ -35,7 +35,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _watch(arguments: argparse.Namespace) -> int:
-    from netspec.runs.run import Follower
+    from netspec.inspect.logs.run import Follower
 
     if bool(arguments.log) == bool(arguments.solver):
         raise WrongUsage("give the log of a training, or --solver to start one")
@@ -57,8 +57,8 @@ def _watch(arguments: argparse.Namespace) -> int:
 
 def _train(arguments: argparse.Namespace) -> int:
     """Train in a process of its own, whose log goes to a file, and watch that."""
+    from netspec.inspect.logs.run import Follower
     from netspec.proto.text import read_solver
-    from netspec.runs.run import Follower
 
     prefix = read_solver(arguments.solver).snapshot_prefix or str(Path(arguments.solver).with_suffix(""))
     log = Path(f"{prefix}.{time.strftime('%Y%m%d-%H%M%S')}.log")
@@ -86,7 +86,7 @@ def _plugins(arguments: argparse.Namespace) -> list[str]:
 
 def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] | None = None) -> None:
     """Show a log as it grows, until the training ends, on a screen that is given back then."""
-    from netspec.runs.run import RUNNING
+    from netspec.inspect.logs.run import RUNNING
 
     shown = sys.stdout.isatty()
     if shown:
@@ -109,8 +109,8 @@ def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] 
 
 
 def _lines(follower: Follower) -> list[str]:
-    from netspec.runs.process import is_alive, memory_of
-    from netspec.runs.screen import screen
+    from netspec.inspect.logs.process import is_alive, memory_of
+    from netspec.inspect.logs.screen import screen
 
     run, now = follower.run, time.time()
     alive = is_alive(run.process) if run.process is not None else None

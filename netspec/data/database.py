@@ -22,11 +22,11 @@ from types import ModuleType, TracebackType
 
 import lmdb
 
+from netspec import log
 from netspec.data.lmdb_file import LmdbFile, Record
 from netspec.errors import SpecError, Where
 from netspec.files.lfs import pointer_fault_at
 from netspec.files.whole_file import whole_folder
-from netspec.terminal import log
 
 BACKENDS = ("lmdb", "leveldb")
 _SCAN = 4096  # keys listed ahead of the requested one

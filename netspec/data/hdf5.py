@@ -15,12 +15,12 @@ from typing import Any
 import h5py
 import numpy as np
 
+from netspec import log
 from netspec.data.images import list_lines
 from netspec.data.random_words import permutation
 from netspec.data.sources import ALONE, Arrays, Cursor, Draws, Shape
 from netspec.errors import SpecError, Where
 from netspec.files.hdf5 import new_hdf5, open_hdf5
-from netspec.terminal import log
 
 _FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may span two
 

@@ -10,6 +10,7 @@ from tokenize import TokenError
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from netspec import log
 from netspec.data import blobs
 from netspec.data.database import Reader
 from netspec.data.datum import datum_to_array, parse_datum, times
@@ -18,7 +19,6 @@ from netspec.files.lfs import pointer_fault
 from netspec.files.limits import read_bytes
 from netspec.files.whole_file import write_whole
 from netspec.proto.schema import BlobProto
-from netspec.terminal import log
 
 
 def read_mean(path: str, where: Where | None = None) -> np.ndarray:

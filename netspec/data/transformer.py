@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import datum_to_array, times
 from netspec.data.mean import read_mean
 from netspec.data.random_words import WORDS, words_at
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import TRAIN
-from netspec.terminal import log
 
 
 def contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from netspec import log
 from netspec.data.datum import decode_pixels, planar
 from netspec.data.mean import read_mean
 from netspec.data.random_words import words_at
@@ -22,7 +23,6 @@ from netspec.data.transformer import mean_contradictions
 from netspec.errors import SpecError, Where
 from netspec.files.limits import read_bytes
 from netspec.files.opencv import cv2
-from netspec.terminal import log
 
 CHANNELS = 3  # images are always read in color
 

@@ -15,7 +15,7 @@ from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers import layer_class
-from netspec.layers.context import Context
+from netspec.layers.contract.context import Context
 from netspec.layers.data.files import ReadingLayer
 from netspec.proto.schema import PHASE_NAMES, PhaseValue, phase_of
 from netspec.proto.text import parse_net

@@ -16,7 +16,7 @@ from netspec.data.hdf5 import Hdf5Source
 from netspec.datasets.opened import Opened, PerProcess
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
-from netspec.layers.context import Context
+from netspec.layers.contract.context import Context
 from netspec.layers.data.files import BACKENDS, ReadingLayer
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import LayerParameter, phase_of

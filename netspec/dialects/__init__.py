@@ -40,7 +40,7 @@ To write one, put this into a file, say ``doubling.py``, and pass ``--plugin dou
 
 ``DECLARATIONS`` is in the language of caffe.proto (netspec/proto/dialect/registry.py): messages as they stand in the
 fork, new fields of Caffe's messages in ``extend``; one plain string. A layer is as Caffe's own are
-(netspec/layers/base.py);
+(netspec/layers/contract/base.py);
 ``@register`` has its type and the fields of LayerParameter that it reads: a net warns of fields that no layer reads.
 ``@register("Dropout", ..., replaces=Dropout)`` puts a subclass in the place of one of Caffe's layers, to honor a
 field that the fork added to it, in nets that use the dialect. To offer a dialect with a package, name its module in
@@ -66,7 +66,7 @@ def use_dialect(name: str | Path) -> None:
     Does nothing where it is there already. Raises SpecError where there is no such dialect, its file has a fault, or
     Caffe or another dialect has one of its fields or layer types.
     """
-    from netspec.layers.registry import use_everywhere  # it needs torch
+    from netspec.layers.contract.registry import use_everywhere  # it needs torch
 
     file = find_file(name)
     switch_on(file)

@@ -1,1 +1,1 @@
-"""A net in another form: ONNX, PyTorch source, torch.export, safetensors. Each layer defines how it is written."""
+"""Ways for a net to leave: files of other formats, and other engines that run it."""

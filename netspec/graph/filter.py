@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from netspec import log
 from netspec.errors import SpecError
 from netspec.proto.schema import LayerParameter, NetParameter, NetState, NetStateRule, PhaseValue, SolverParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
-from netspec.terminal import log
 
 
 def in_state(net: NetParameter, *states: NetState) -> NetParameter:

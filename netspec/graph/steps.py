@@ -16,7 +16,7 @@ from netspec.graph.fold import Chain, Roles, find_chains, origins
 from netspec.graph.plan import Plan
 
 FOLD, FUSE, SKIP, PACK = "fold", "fuse", "skip", "pack"
-PASSES = (FOLD, FUSE, SKIP, PACK)  # pack: weights laid out in advance (netspec/layers/fused.py)
+PASSES = (FOLD, FUSE, SKIP, PACK)  # pack: weights laid out in advance (netspec/layers/contract/fused.py)
 
 
 @dataclass(frozen=True)

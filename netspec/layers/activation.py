@@ -17,12 +17,12 @@ from typing_extensions import override
 from netspec.exact import ALL, libm, switch
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
-from netspec.layers.base import Layer, Shape
-from netspec.layers.learned import values_of
-from netspec.layers.preparing import RELU, Finish, Kernel, Preparation, finished
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, Room
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.learned import values_of
+from netspec.layers.contract.preparing import RELU, Finish, Kernel, Preparation, finished
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.training import Kernels, Learning, Room
 
 
 class Activation(Layer):

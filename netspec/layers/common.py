@@ -11,14 +11,14 @@ from torch.nn import functional as F
 from netspec.exact import SMALL_PRODUCT
 from netspec.exact.bound import BoundVectors, Weights, at_rest
 from netspec.exact.vectors import ChosenRows, SummedProducts, VectorProducts
-from netspec.layers import fused
-from netspec.layers.base import Layer, Shape
-from netspec.layers.exporting import refusal
-from netspec.layers.folding import Absorbed, blob_like, copy_of
-from netspec.layers.preparing import Kernel, Preparation, copies, finished, lent
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, Room, weight_and_bias
+from netspec.layers.contract import fused
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.folding import Absorbed, blob_like, copy_of
+from netspec.layers.contract.preparing import Kernel, Preparation, copies, finished, lent
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.training import Kernels, Learning, Room, weight_and_bias
 from netspec.proto.schema import TRAIN
 
 

@@ -12,10 +12,10 @@ from torch.nn import functional as F
 from netspec.exact import ALL
 from netspec.exact.channels import RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.base import MOST, Layer, Shape
-from netspec.layers.preparing import Kernel, Preparation, finished
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers.contract.base import MOST, Layer, Shape
+from netspec.layers.contract.preparing import Kernel, Preparation, finished
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 
 ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
 

@@ -9,11 +9,11 @@ import torch
 
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization
-from netspec.layers.base import Layer, Shape
-from netspec.layers.folding import Affine, blob_in_double
-from netspec.layers.preparing import RELU, Kernel, Preparation, channel_factors, finished, finishing
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.folding import Affine, blob_in_double
+from netspec.layers.contract.preparing import RELU, Kernel, Preparation, channel_factors, finished, finishing
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST
 
 MAX_OFFSET = 8  # means, in standard deviations, up to which torch's CPU kernel is exact to 1e-6

@@ -9,8 +9,8 @@ from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.layers.activation import Activation, Rounded, scaled_and_shifted, torch_scaled_and_shifted
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 @register("AbsVal")

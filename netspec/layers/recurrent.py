@@ -17,9 +17,9 @@ from netspec.exact import libm
 from netspec.exact.pointwise import CellUpdate, Pointwise, tanh_gradient
 from netspec.exact.sums import Copies
 from netspec.exact.vectors import VectorProducts
-from netspec.layers.base import Layer, Shape
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 # Functions that are copied into exported source; they take a net's blobs and states one by one.
 

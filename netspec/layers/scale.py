@@ -11,11 +11,11 @@ import torch
 from netspec.data.blobs import Shape
 from netspec.exact import SMALL_ITEM
 from netspec.exact.channels import ChannelProducts
-from netspec.layers.base import Layer
-from netspec.layers.folding import Absorbed, Affine, blob_in_double, copy_of
-from netspec.layers.preparing import Kernel, Preparation, finished
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.folding import Absorbed, Affine, blob_in_double, copy_of
+from netspec.layers.contract.preparing import Kernel, Preparation, finished
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class _Affine(Layer):

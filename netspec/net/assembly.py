@@ -13,19 +13,19 @@ from functools import partial
 
 import torch
 
+from netspec import log
 from netspec.errors import Report, SpecError, Where
 from netspec.files.limits import amount, is_out_of_memory
 from netspec.files.limits import memory as memory_of_machine
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Backward, Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
-from netspec.layers.base import Layer, Shape, shape_string
-from netspec.layers.context import Context, Random
-from netspec.layers.registry import dialects_of
+from netspec.layers.contract.base import Layer, Shape, shape_string
+from netspec.layers.contract.context import Context, Random
+from netspec.layers.contract.registry import dialects_of
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.run.eager import last_uses
-from netspec.terminal import log
 
 MUCH = 8  # a net that takes more than this part of the limit is first looked at as a whole
 

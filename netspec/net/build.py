@@ -9,6 +9,7 @@ import logging
 from collections.abc import Iterable
 from pathlib import Path
 
+from netspec import log
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import make_plan
@@ -19,7 +20,6 @@ from netspec.process.garbage import no_collection
 from netspec.proto.schema import TEST, NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
-from netspec.terminal import log
 
 
 def load_net(
@@ -27,7 +27,7 @@ def load_net(
 ) -> Net:
     """Build the net of a prototxt, with the weights of files. Raises SpecError for every fault of the files.
 
-    ``netspec.load_net`` (netspec/engines/net.py) is this with a keyword for each option.
+    ``netspec.load_net`` (netspec/load.py) is this with a keyword for each option.
     """
     options = options or BuildOptions()
     net, source = parse_net(path)

@@ -8,7 +8,7 @@ from pathlib import Path
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.layers import class_of
-from netspec.layers.reading import takes_shapes
+from netspec.layers.contract.reading import takes_shapes
 from netspec.proto.schema import NetParameter
 
 

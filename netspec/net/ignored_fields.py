@@ -12,8 +12,8 @@ from typing import Any
 from google.protobuf.message import Message
 
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
-from netspec.layers.fillers import READS
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.fillers import READS
 
 #: Fields of every layer, which the net reads.
 COMMON = frozenset(

@@ -10,8 +10,8 @@ import torch
 from netspec.errors import SpecError
 from netspec.files.limits import amount, memory
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
-from netspec.layers.reading import bytes_ahead
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.reading import bytes_ahead
 from netspec.proto.schema import TEST
 
 BYTES = 4  # of a number: float32

@@ -14,14 +14,15 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.exact import ALL
 from netspec.exact.blas import other_kernels
 from netspec.graph import check_blobs
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
-from netspec.layers.reading import Fed, Restarts, TakesArrays
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.reading import Fed, Restarts, TakesArrays
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST, TRAIN
@@ -29,7 +30,6 @@ from netspec.run.eager import Eager
 from netspec.run.prepared import Prepared
 from netspec.run.training import TrainingStep, obstacle
 from netspec.run.walk import Runner, weighted_sum
-from netspec.terminal import log
 
 Array = np.ndarray | torch.Tensor
 

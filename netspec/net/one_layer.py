@@ -14,9 +14,9 @@ from netspec.errors import SpecError
 from netspec.exact import SMALL
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, class_of, unknown_type
-from netspec.layers.base import Shape
-from netspec.layers.context import nowhere
-from netspec.layers.registry import dialects_of
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.context import nowhere
+from netspec.layers.contract.registry import dialects_of
 from netspec.net.net import Array
 from netspec.proto.reader import read_text
 from netspec.proto.schema import LayerParameter, NetParameter, phase_of

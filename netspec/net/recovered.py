@@ -8,17 +8,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from netspec import log
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.inputs import add_input, is_input, shapes_of_input
 from netspec.graph.splits import without_splits
 from netspec.layers import layer_class
-from netspec.layers.base import Shape
-from netspec.layers.reading import channels_read, reads_data, takes_shapes
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.reading import channels_read, reads_data, takes_shapes
 from netspec.proto.binary import parse_net_binary
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import write_text
-from netspec.terminal import log
 
 
 def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParameter, SourceMap]:

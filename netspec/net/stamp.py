@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from netspec import log
 from netspec.errors import SpecError, Where
-from netspec.terminal import log
 
 FORMAT = 2
 _BLOCK = 1 << 20  # bytes

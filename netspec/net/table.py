@@ -10,7 +10,7 @@ from itertools import islice, zip_longest
 from netspec.errors import printable
 from netspec.graph.plan import Plan
 from netspec.graph.splits import is_split
-from netspec.layers.base import Layer
+from netspec.layers.contract.base import Layer
 
 _HEAD = ("layer", "type", "bottoms", "tops", "shapes", "parameters", "MiB", "multiply-adds")
 _LISTS = (2, 3, 4)  # columns of lists, which may take several lines

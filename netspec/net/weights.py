@@ -16,16 +16,16 @@ import h5py
 import numpy as np
 import torch
 
+from netspec import log
 from netspec.data import blobs
 from netspec.errors import Report, SpecError, Where
 from netspec.files.hdf5 import layer_groups, new_hdf5, open_hdf5
 from netspec.files.whole_file import write_whole
-from netspec.layers.base import Layer, shape_string
+from netspec.layers.contract.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.net.stamp import check_weights
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import NetParameter
-from netspec.terminal import log
 
 MOST_NAMES = 20  # layers that a warning names
 MOST_BYTES = 2**31 - 1  # of a protobuf message

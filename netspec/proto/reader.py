@@ -14,13 +14,13 @@ from typing import Any
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 from google.protobuf.message import Message
 
+from netspec import log
 from netspec.errors import ForkFault, SpecError, Where, did_you_mean
 from netspec.proto.dialect import registry as dialect
 from netspec.proto.dialect.files import announce_known
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
 from netspec.proto.schema import MORE, Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Place
-from netspec.terminal import log
 
 _RANGES: dict[int, tuple[int, int]] = {
     Declared.TYPE_INT32: (-(1 << 31), (1 << 31) - 1),

@@ -1,4 +1,4 @@
-"""Layers in a row that one kernel may compute together (netspec/layers/preparing.py, RunsWith)."""
+"""Layers in a row that one kernel may compute together (netspec/layers/contract/preparing.py, RunsWith)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import torch
 
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
-from netspec.layers.offers import offered
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.offers import offered
 
 LONGEST = 3  # BatchNorm, Scale, ReLU
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
+from netspec.layers.contract.base import Layer
 from netspec.run.chains import chains, together
 from netspec.run.in_place import Memory, is_overwritten, run_overwritten
 from netspec.run.segments import Segment, rows

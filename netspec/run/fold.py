@@ -3,7 +3,7 @@
 A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
 weights s W and the bias s b + t. A BatchNorm that normalizes by its past is such a map, s = 1 / sqrt(var + eps) and t =
 -mean s, and so is a Scale; maps in a row are one map. The arithmetic is in double precision. The layers know their own
-part (netspec/layers/folding.py); here they are only put together.
+part (netspec/layers/contract/folding.py); here they are only put together.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import torch
 
 from netspec.graph.fold import Chain, Roles, find_chains
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
-from netspec.layers.folding import Absorbed, Affine, as_affine, passes_on
-from netspec.layers.offers import offered
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.folding import Absorbed, Affine, as_affine, passes_on
+from netspec.layers.contract.offers import offered
 
 
 @dataclass(frozen=True)

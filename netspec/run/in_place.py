@@ -17,8 +17,8 @@ from typing import Any
 import torch
 
 from netspec.graph.plan import Node, Plan
-from netspec.layers.base import Layer
-from netspec.layers.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
 
 
 @dataclass

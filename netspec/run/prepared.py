@@ -24,12 +24,12 @@ from netspec.exact.switch import is_recorded
 from netspec.graph import steps as planned
 from netspec.graph.plan import Plan
 from netspec.graph.steps import PACK, Schedule, schedule
-from netspec.layers.base import Layer
-from netspec.layers.folding import Absorbed, absorbing
-from netspec.layers.learned import Stamp, is_lent, stamp
-from netspec.layers.offers import offered
-from netspec.layers.preparing import Kernel, Preparation, finished, finishing, own_kernel
-from netspec.layers.reading import changes_itself
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.folding import Absorbed, absorbing
+from netspec.layers.contract.learned import Stamp, is_lent, stamp
+from netspec.layers.contract.offers import offered
+from netspec.layers.contract.preparing import Kernel, Preparation, finished, finishing, own_kernel
+from netspec.layers.contract.reading import changes_itself
 from netspec.process.heap import give_back_freed_memory
 from netspec.run.fold import absorbed_by, roles_of
 from netspec.run.shapes import fitted

@@ -21,14 +21,14 @@ from typing import Any
 
 import torch
 
+from netspec import log
 from netspec.errors import SpecError
 from netspec.exact import NONE
 from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
-from netspec.layers.offers import offered
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.offers import offered
 from netspec.run.walk import Step, walk
-from netspec.terminal import log
 
 FEWEST = 2  # layers: a single one gains nothing
 _numbers = count()

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 from netspec.data.blobs import Shape
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
-from netspec.layers.reading import changes_itself
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.reading import changes_itself
 
 
 def fitted(

@@ -1,8 +1,9 @@
 """Training passes of small nets: each layer prepared once, then run forward and backward without autograd between them.
 
 A pass through autograd costs about a millisecond for ten layers, whatever their size; that is what a net of small
-layers or batches spends most of its time on. Here a layer is a pair of kernels (netspec/layers/training.py), made for
-the shapes at hand, and a pass calls one after the other. The numbers are the same.
+layers or batches spends most of its time on. Here a layer is a pair of kernels
+(netspec/layers/contract/training.py), made for the shapes at hand, and a pass calls one after
+the other. The numbers are the same.
 """
 
 # pyright: reportPrivateImportUsage=false
@@ -20,9 +21,9 @@ import torch
 from netspec.exact.blas import one_thread
 from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
-from netspec.layers.base import Layer
-from netspec.layers.gradients import gradient_from_memory, gradient_reads
-from netspec.layers.training import Backward, Diff, Forward, Kernels, Learning, has_kernels, kernels, recorded
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.contract.training import Backward, Diff, Forward, Kernels, Learning, has_kernels, kernels, recorded
 from netspec.run.walk import losses_of
 
 LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory

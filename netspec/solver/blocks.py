@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from netspec.layers.learned import values_of
+from netspec.layers.contract.learned import values_of
 from netspec.net.assembly import Learnable
 from netspec.solver import update
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
+from netspec import log
 from netspec.graph.plan import Node
 from netspec.net.net import Net
-from netspec.terminal import log
 
 
 @contextmanager

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.files.whole_file import write_whole
-from netspec.layers import reading
+from netspec.layers.contract import reading
 from netspec.net.net import Net
 from netspec.net.stamp import FAULTS, Stamp, damaged, sealed, shown, unsealed, whole_number
 from netspec.solver.settings import Settings
 from netspec.solver.snapshot import find_learned_net, read_state
-from netspec.terminal import log
 
 _MOST_LAYERS = 1 << 24
 Remembered = dict[str, dict[str, Any]]  # by the layer's number, then by name: what JSON has of it
@@ -36,7 +36,7 @@ class Extra:
     """What the file has.
 
     ``seed`` is the solver's; ``losses`` are the last ``average_loss`` ones; ``nets`` has, for the training nets of all
-    ranks and the test nets, in this order, what each of their layers remembers (netspec/layers/reading.py).
+    ranks and the test nets, in this order, what each of their layers remembers (netspec/layers/contract/reading.py).
     """
 
     seed: int

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from netspec.graph.plan import Node
-from netspec.layers.reading import resume, running_state
+from netspec.layers.contract.reading import resume, running_state
 from netspec.net.net import Net
 
 

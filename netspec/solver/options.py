@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from netspec import log
 from netspec.errors import SpecError
 from netspec.exact import NONE
 from netspec.graph.options import BuildOptions
@@ -16,7 +17,6 @@ from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.solver.precision import FP32, check_precision
 from netspec.solver.processes import Processes
-from netspec.terminal import log
 
 
 @dataclass(frozen=True)

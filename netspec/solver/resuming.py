@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.net.stamp import Stamp
 from netspec.net.weights import load_weights, save_weights
@@ -22,7 +23,6 @@ from netspec.solver.settings import Settings, changes, settings_of
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.threads import divided_sums
 from netspec.solver.training import Training
-from netspec.terminal import log
 
 
 class Resumable(Training):

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
 from netspec.graph.options import BuildOptions
-from netspec.layers.reading import Waits, reads_data
+from netspec.layers.contract.reading import Waits, reads_data
 from netspec.proto.text import parse_solver
 from netspec.solver import update
 from netspec.solver.checks import check_prefix
@@ -30,7 +31,6 @@ from netspec.solver.precision import FP16, FP32, LossScale, computing
 from netspec.solver.processes import own_device
 from netspec.solver.tally import as_scores
 from netspec.solver.testing import Tested, log_scores
-from netspec.terminal import log
 
 
 def load_solver(

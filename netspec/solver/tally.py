@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from netspec.layers.reading import Scores
+from netspec.layers.contract.reading import Scores
+from netspec.log import number
 from netspec.net.net import Net
-from netspec.terminal.log import number
 
 Outputs = dict[str, list[float]]
 Scorer = Callable[[Sequence[torch.Tensor]], list[float]]

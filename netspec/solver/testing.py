@@ -9,12 +9,12 @@ from contextlib import AbstractContextManager, nullcontext
 
 import torch
 
+from netspec import log
 from netspec.net.net import Net
 from netspec.solver.debug import debug_info
 from netspec.solver.extra import running_state
 from netspec.solver.resuming import Resumable
 from netspec.solver.tally import Outputs, Tally, score_lines, scorers
-from netspec.terminal import log
 
 
 class Tested(Resumable):

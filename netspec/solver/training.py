@@ -13,9 +13,10 @@ from typing import Any
 
 import torch
 
+from netspec import log
 from netspec.errors import SpecError, Where
-from netspec.layers.fused import has_bfloat16
-from netspec.layers.reading import Scores
+from netspec.layers.contract.fused import has_bfloat16
+from netspec.layers.contract.reading import Scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
@@ -35,7 +36,6 @@ from netspec.solver.precision import BF16, FP16
 from netspec.solver.replicas import Replicas
 from netspec.solver.tally import Outputs
 from netspec.solver.threads import dependence
-from netspec.terminal import log
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),

@@ -21,9 +21,9 @@ from contextlib import contextmanager, nullcontext
 from itertools import takewhile
 from typing import Any
 
+from netspec import log
 from netspec.errors import SpecError, did_you_mean
 from netspec.files.limits import amount, is_out_of_memory, memory
-from netspec.terminal import log
 
 DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
 SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: there is something to say; a file cannot be read

@@ -41,13 +41,13 @@ from netspec.errors import SpecError, raise_fault
 from netspec.files.image_list import list_images
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
+from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.stamp import Stamp, sealed
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text, parse_solver_text
-from netspec.runs.scores import Score, Scores, Snapshot, read_scores
 from netspec.solver.checks import check_settings
 from netspec.solver.extra import Extra, read_extra, resume, write_extra
 from netspec.solver.settings import changes

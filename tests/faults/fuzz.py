@@ -22,7 +22,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 with atheris.instrument_imports(include=["netspec", "loopclosure", "lmdb_build"]):
     from faults.formats import FORMATS
     from faults.mutate import ending
-    from netspec.terminal import log
+    from netspec import log
 
 
 def main(words: list[str]) -> None:

@@ -28,8 +28,8 @@ import torch  # noqa: E402
 
 from faults.formats import FORMATS, Format  # noqa: E402
 from loopclosure.errors import InputError  # noqa: E402
+from netspec import log  # noqa: E402
 from netspec.errors import SpecError  # noqa: E402
-from netspec.terminal import log  # noqa: E402
 
 MEMORY = 1 << 30  # bytes
 SECONDS = 10

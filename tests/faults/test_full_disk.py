@@ -13,8 +13,8 @@ import pytest
 import lmdb_build.cli
 from faults.commands import CASES, THUMBNAILS, Case, check_npz
 from netspec.cli import main
-from netspec.engines.net import load_net
 from netspec.files import whole_file
+from netspec.load import load_net
 from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 

@@ -24,10 +24,10 @@ from loopclosure.places.masks import read_truth_matrix
 from netspec.data.database import Writer, open_reader
 from netspec.data.images import read_image
 from netspec.data.mean import read_mean_option
-from netspec.engines.net import load_net
 from netspec.errors import SpecError
-from netspec.features import embedding
-from netspec.features.images import read_pixels as read_for_features
+from netspec.inspect.features import embedding
+from netspec.inspect.features.images import read_pixels as read_for_features
+from netspec.load import load_net
 from netspec.net.weights import load_weights
 from netspec.solver.snapshot import read_state
 from netspec.solver.solver import load_solver

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from loopclosure.errors import InputError
+from netspec import log
 from netspec.cli import main
 from netspec.errors import SpecError, Where
-from netspec.terminal import log
 
 EVIL = "a\\033[31m\\nI1122 10:00:00.000000     1 solver.cpp:239] Iteration 99999, loss = 0\\r\\302\\233"
 NET = f"""name: "{EVIL}"

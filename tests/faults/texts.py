@@ -22,8 +22,8 @@ from hypothesis import strategies as st  # noqa: E402
 
 from faults.formats import FORMATS, NET, Format, text  # noqa: E402
 from faults.mutate import ending  # noqa: E402
-from netspec.check.check import check_file  # noqa: E402
-from netspec.terminal import log  # noqa: E402
+from netspec import log  # noqa: E402
+from netspec.inspect.check.check import check_file  # noqa: E402
 
 SOLVER = 'net: "x.prototxt" base_lr: 0.1 lr_policy: "step" gamma: 0.5 stepsize: 10 max_iter: 3 test_iter: 1\n'
 TEXTS = {

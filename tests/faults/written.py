@@ -10,20 +10,20 @@ import traceback
 from pathlib import Path
 from xml.etree import ElementTree
 
-from netspec.draw.diagram import diagram_of
-from netspec.draw.html import html_of
-from netspec.draw.picture import picture_of
-from netspec.draw.svg import svg_of
-from netspec.editor.messages import Messages
-from netspec.editor.server import make_server
 from netspec.errors import SpecError
-from netspec.export.convert import blob_tensors
-from netspec.export.deploy import fold
-from netspec.export.onnx import onnx_model
-from netspec.export.pt2 import torch_module
-from netspec.export.torch import torch_source
+from netspec.export.formats.convert import blob_tensors
+from netspec.export.formats.deploy import fold
+from netspec.export.formats.onnx import onnx_model
+from netspec.export.formats.pt2 import torch_module
+from netspec.export.formats.torch import torch_source
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
+from netspec.inspect.draw.diagram import diagram_of
+from netspec.inspect.draw.html import html_of
+from netspec.inspect.draw.picture import picture_of
+from netspec.inspect.draw.svg import svg_of
+from netspec.inspect.editor.messages import Messages
+from netspec.inspect.editor.server import make_server
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN

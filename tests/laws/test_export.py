@@ -10,9 +10,9 @@ from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, run_module, 
 from laws.examples import EXAMPLES
 from laws.test_registry import TYPES, folder  # noqa: F401
 from netspec.errors import SpecError
-from netspec.export.deploy import with_inputs
-from netspec.export.onnx import onnx_model
-from netspec.export.pt2 import torch_module
+from netspec.export.formats.deploy import with_inputs
+from netspec.export.formats.onnx import onnx_model
+from netspec.export.formats.pt2 import torch_module
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers import layer_class

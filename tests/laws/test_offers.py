@@ -4,7 +4,8 @@ import ast
 import inspect
 from collections.abc import Iterator
 
-from netspec.layers import Layer, exporting, folding, gradients, preparing, reading, training
+from netspec.layers import Layer
+from netspec.layers.contract import exporting, folding, gradients, preparing, reading, training
 from netspec.layers.data.files import ReadingLayer
 from paths import ROOT
 

@@ -98,7 +98,7 @@ WAYS = {
 NOT_STARTED = {
     "netspec": {
         "lsp": "serves standard input; it has no options of its own",
-        "run": "the script ends the process; tests/netspec/scripts",
+        "run": "the script ends the process; tests/netspec/compat/scripts",
     },
     "lmdb_build": {
         "pairs": "tests/lmdb_build/test_cli.py",

@@ -83,7 +83,7 @@ compared("import")
 """
 COMPILED = """
 import numpy as np
-from netspec.engines.net import load_net
+from netspec.load import load_net
 net = load_net("deploy.prototxt", phase="TEST", seed=0, passes=("compile",))
 compared("build")
 with torch.no_grad():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from each import each
-from netspec.check.check import ON_META, as_json, check_file
+from netspec.inspect.check.check import ON_META, as_json, check_file
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_solver
 from paths import SHARED

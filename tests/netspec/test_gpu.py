@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from fake_gpu import GPUS, NAME, POSSIBLE, FakeTensor, fake_gpu, gpu
-from netspec.features.describer import Describer
+from netspec.inspect.features.describer import Describer
 from netspec.solver.solver import load_solver
 from paths import GOLDEN
 

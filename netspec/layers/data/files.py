@@ -16,16 +16,16 @@ from typing import Any, ClassVar, TypeVar
 
 import torch
 
+from netspec import log
 from netspec.data.database import open_reader
 from netspec.data.images import read_image_list
 from netspec.data.prefetch import Feed
 from netspec.data.sources import Cursor, DatabaseSource, Draws, ImageListSource, Source, draw_skip
 from netspec.data.transformer import Transformer, contradictions
 from netspec.errors import SpecError, UnknownShape, Where
-from netspec.layers.base import Layer, Shape
-from netspec.layers.registry import register
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.registry import register
 from netspec.proto.schema import PHASE_NAMES, value
-from netspec.terminal import log
 
 BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
 MOVED = ("scale", "mean_file", "crop_size", "mirror")  # to transform_param, so in a current layer they mean nothing

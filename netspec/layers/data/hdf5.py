@@ -9,9 +9,9 @@ import torch
 from netspec.data.sources import Source
 from netspec.errors import SpecError
 from netspec.files.whole_file import why_unwritable
-from netspec.layers.base import Layer, Shape
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.registry import register
 from netspec.layers.data.files import ReadingLayer
-from netspec.layers.registry import register
 
 
 @register("HDF5Data", "hdf5_data_param", "transform_param", "data_param.prefetch")

@@ -9,14 +9,14 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from netspec import log
 from netspec.errors import SpecError
-from netspec.layers import fillers
-from netspec.layers.base import Layer, Shape
-from netspec.layers.exporting import refusal
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.contract import fillers
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import FillerParameter
-from netspec.terminal import log
 
 T = TypeVar("T")
 

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 from netspec.exact.sums import SumInOrder
-from netspec.layers.base import Layer, Shape
-from netspec.layers.targets import OnnxGraph
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.targets import OnnxGraph
 
 FULL, VALID, BATCH_SIZE, NONE = 0, 1, 2, 3  # caffe.proto: enum LossParameter.NormalizationMode
 

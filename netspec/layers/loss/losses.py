@@ -13,8 +13,11 @@ from netspec.exact import libm
 from netspec.exact.blas import dots, sum_in_order
 from netspec.exact.losses import SigmoidCrossEntropy
 from netspec.exact.sums import row_magnitudes, row_squares
-from netspec.layers.base import Shape
-from netspec.layers.exporting import refusal
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers.contract.training import Kernels, Learning
 from netspec.layers.loss.base import (
     BATCH_SIZE,
     FULL,
@@ -29,9 +32,6 @@ from netspec.layers.loss.base import (
     onnx_normalized_sum,
     total,
 )
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode, rounded
-from netspec.layers.training import Kernels, Learning
 
 
 @register("HingeLoss", "hinge_loss_param")

@@ -15,8 +15,11 @@ from netspec.data.blobs import to_array
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.losses import Infogain, bound_cross_entropy, bound_softmax, logarithm, softmax
 from netspec.files.limits import read_bytes
-from netspec.layers.base import Shape
-from netspec.layers.exporting import refusal
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.training import Kernels, Learning, Room
 from netspec.layers.loss.base import (
     BATCH_SIZE,
     FULL,
@@ -32,9 +35,6 @@ from netspec.layers.loss.base import (
     onnx_normalized_sum,
     total,
 )
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, Room
 from netspec.proto.schema import BlobProto
 
 FLT_MIN = 1.17549435e-38  # SoftmaxWithLoss takes no logarithm of less

@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
 from netspec.exact.sums import Product, RowSums, row_magnitudes, row_squares
-from netspec.layers.base import Layer, Shape
-from netspec.layers.preparing import Kernel, Preparation, finished
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.preparing import Kernel, Preparation, finished
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 @register("Eltwise", "eltwise_param")

@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from netspec.layers.base import Layer, Shape
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.training import Kernels, Learning
 
 
 def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:

@@ -13,13 +13,13 @@ from typing import Any
 
 import torch
 
+from netspec import log
 from netspec.errors import SpecError, did_you_mean
-from netspec.layers.base import Layer, Shape
-from netspec.layers.registry import register
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.registry import register
 from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.pycaffe_shim import can_import, importable
 from netspec.proto.schema import LayerParameter
-from netspec.terminal import log
 
 
 class _Call(torch.autograd.Function):

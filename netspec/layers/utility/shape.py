@@ -9,10 +9,10 @@ import torch
 
 from netspec.exact import switch
 from netspec.exact.sums import Copies, tiles
-from netspec.layers.base import Layer, Shape
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.training import Kernels, Learning
 
 
 class _OtherShape(Layer):

@@ -21,14 +21,14 @@ from netspec.exact.products import (
     laid_out_like,
 )
 from netspec.exact.switch import is_recorded
-from netspec.layers import fused
-from netspec.layers.base import Shape
-from netspec.layers.exporting import refusal
-from netspec.layers.folding import Absorbed, blob_like, copy_of
-from netspec.layers.preparing import Kernel, Preparation, copies, finished, lent
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, weight_and_bias
+from netspec.layers.contract import fused
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.folding import Absorbed, blob_like, copy_of
+from netspec.layers.contract.preparing import Kernel, Preparation, copies, finished, lent
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.training import Kernels, Learning, weight_and_bias
 from netspec.layers.vision.layout import channels_side_by_side
 from netspec.layers.vision.sliding import TORCH_USUAL, SlidingFilter
 

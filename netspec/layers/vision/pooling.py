@@ -10,12 +10,12 @@ import torch
 from torch.nn import functional as F
 
 from netspec.exact.sums import Copies
-from netspec.layers.base import Layer, Shape
-from netspec.layers.exporting import refusal
-from netspec.layers.preparing import Kernel, Preparation, finished
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
-from netspec.layers.training import Kernels, Learning, recorded
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.preparing import Kernel, Preparation, finished
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.training import Kernels, Learning, recorded
 from netspec.layers.vision.layout import channels_side_by_side
 from netspec.layers.vision.windows import (
     CEIL,

@@ -14,10 +14,10 @@ from netspec.exact.products import (
     Columns,
     Filter,
 )
-from netspec.layers.base import Layer, Shape
-from netspec.layers.exporting import refusal
-from netspec.layers.registry import register
-from netspec.layers.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.registry import register
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 def _by(sizes: Shape) -> str:

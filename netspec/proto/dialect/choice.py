@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from netspec import log
 from netspec.proto.dialect.files import announce_known, find_file, known_files, switch_on
 from netspec.proto.dialect.registry import Dialect, active, known
 from netspec.proto.lexer import NAME, STRING, SYMBOL, Lexer
 from netspec.proto.schema import caffe_names, fields_with
-from netspec.terminal import log
 
 
 def use_dialects_of(text: str, file: str) -> list[str]:

@@ -14,10 +14,10 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
+from netspec import log
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.proto.dialect.folders import FOLDERS
 from netspec.proto.dialect.registry import Dialect, activate, announce
-from netspec.terminal import log
 
 GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name and a module each
 
@@ -48,8 +48,9 @@ def known_files() -> dict[str, DialectFile]:
         else:
             found[point.name] = DialectFile(point.name, Path(spec.origin), module)
     for folder, package in FOLDERS:
-        for path in sorted(Path(folder).glob("[!_]*.py")):
-            found[path.stem] = DialectFile(path.stem, path, f"{package}.{path.stem}")
+        for path in sorted(Path(folder).glob("*/*.py"), key=lambda path: path.stem):
+            if "\nDECLARATIONS = " in path.read_text("utf-8"):
+                found[path.stem] = DialectFile(path.stem, path, f"{package}.{path.parent.name}.{path.stem}")
     return found
 
 

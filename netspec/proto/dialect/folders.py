@@ -1,4 +1,4 @@
-"""Folders whose .py files are dialects, as (folder, package)."""
+"""Folders of families of dialects, as (folder, package). A file of a family that has DECLARATIONS is a dialect."""
 
 import os.path
 

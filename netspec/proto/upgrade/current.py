@@ -16,6 +16,7 @@ from pathlib import Path
 
 from google.protobuf.message import Message
 
+from netspec import log
 from netspec.errors import SpecError
 from netspec.proto.schema import (
     BlobShape,
@@ -28,7 +29,6 @@ from netspec.proto.schema import (
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.upgrade.rewrite import Draft, copy_without
 from netspec.proto.upgrade.v0 import needs_v0_upgrade, upgrade_v0
-from netspec.terminal import log
 
 Upgraded = tuple[NetParameter, SourceMap]
 

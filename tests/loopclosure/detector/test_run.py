@@ -21,7 +21,7 @@ from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.frames import Selection
 from netspec.errors import SpecError
-from netspec.features import shipped
+from netspec.inspect.features import shipped
 
 
 def small(image):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from netspec.check.check import check_file
+from netspec.inspect.check.check import check_file
 from netspec.proto.schema import TEST
 from paths import SHARED
 

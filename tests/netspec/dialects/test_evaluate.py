@@ -92,7 +92,7 @@ def test_detection_evaluate_refuses(build: Build, settings: str, fault: str) -> 
 
 def test_average_precision() -> None:
     use_dialect("ssd")
-    from netspec.dialects._evaluate import average_precision
+    from netspec.dialects.ssd.evaluate import average_precision
 
     found = np.array([(0.9, 1, 0), (0.8, 0, 1), (0.7, 1, 0), (0.6, 0, 1)])  # of 4: recall 1/4 at 1, 1/2 at 2/3
     assert average_precision(found, 4, "Integral") == pytest.approx(1 / 4 * 1 + 1 / 4 * 2 / 3)

@@ -10,9 +10,9 @@ import torch
 
 import netspec
 import netspec.pycaffe as caffe
-from netspec.dialects import _faster
-from netspec.dialects._faster import settings
-from netspec.dialects._proposals import all_anchors, base_anchors
+from netspec.dialects.rcnn import faster
+from netspec.dialects.rcnn.faster import settings
+from netspec.dialects.rcnn.proposals import all_anchors, base_anchors
 from netspec.errors import SpecError
 from netspec.layers import Layer
 from netspec.proto.schema import TEST, TRAIN
@@ -171,7 +171,7 @@ def test_a_program_gives_the_images_as_it_did(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_losses_of_a_small_faster_rcnn_fall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_faster, "SHORTEST", 240)  # the fork's 600 would take ten times as long
+    monkeypatch.setattr(faster, "SHORTEST", 240)  # the fork's 600 would take ten times as long
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(5)
     entries = []

@@ -18,7 +18,7 @@ FORK = PLAIN.replace("kernel_size: 3", "kernel_size: 3 hole: 2")
 def test_a_layer_in_place_of_caffes_is_for_nets_of_its_dialect(net_of: Callable[..., Net]) -> None:
     fork, plain = net_of(FORK), net_of(PLAIN)
     assert type(plain.layers[1]) is Convolution
-    assert type(fork.layers[1]).__module__ == "netspec.dialects.filters"
+    assert type(fork.layers[1]).__module__ == "netspec.dialects.blocks.filters"
     assert (fork.options.dialects, plain.options.dialects) == (("filters",), ())
     values = torch.randn(1, 1, 9, 9)
     assert fork(values)["conv"].shape == (1, 2, 5, 5)

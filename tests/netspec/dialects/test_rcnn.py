@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from netspec.dialects import use_dialect
-from netspec.dialects._proposals import base_anchors
+from netspec.dialects.rcnn.proposals import base_anchors
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer

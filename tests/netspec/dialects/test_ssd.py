@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from netspec.dialects import use_dialect
-from netspec.dialects._boxes import CENTER_SIZE, decode, suppress
+from netspec.dialects.boxes import CENTER_SIZE, decode, suppress
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer

@@ -15,8 +15,8 @@ import pytest
 import netspec
 from golden_cases import LayerCase, assert_same_layers, parameters, train
 from netspec.dialects import use_dialects_of
-from netspec.dialects._boxes import highest
-from netspec.engines.net import load_net
+from netspec.dialects.boxes import highest
+from netspec.load import load_net
 from paths import GOLDEN
 
 SSD = GOLDEN / "ssd"

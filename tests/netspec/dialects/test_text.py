@@ -95,7 +95,7 @@ def test_how_well_decoded_texts_agree_with_labels(build: Build) -> None:
 
 def test_edit_distance(build: Build) -> None:
     build("text", "type: 'Reverse'", (1,))
-    edit_distance = sys.modules["netspec.dialects._ctc"].edit_distance
+    edit_distance = sys.modules["netspec.dialects.text.ctc"].edit_distance
     assert [edit_distance(a, b) for a, b in (("kitten", "sitting"), ("", "ab"), ("ab", "ab"), ("abc", "c"))] == [
         3,
         2,

@@ -33,8 +33,8 @@ from exported import (
     trained,
 )
 from netspec.dialects import use_dialect
-from netspec.export.deploy import fold, write_caffe
-from netspec.export.onnx import onnx_model
+from netspec.export.formats.deploy import fold, write_caffe
+from netspec.export.formats.onnx import onnx_model
 from netspec.net.net import Net
 from paths import SHARED
 

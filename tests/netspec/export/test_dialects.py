@@ -20,8 +20,8 @@ from exported import (
 )
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
-from netspec.export.onnx import onnx_model
-from netspec.export.shapes import find_shapes
+from netspec.export.formats.onnx import onnx_model
+from netspec.export.formats.shapes import find_shapes
 from netspec.net.net import Net
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,7 @@ import torch
 
 import netspec
 from exported import assert_same, here, random_inputs, trained
-from netspec.export.deploy import fold, with_inputs, write_caffe
+from netspec.export.formats.deploy import fold, with_inputs, write_caffe
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net

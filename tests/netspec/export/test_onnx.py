@@ -22,8 +22,8 @@ from exported import (
 )
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
-from netspec.export.onnx import export_onnx, onnx_model
-from netspec.export.preprocess import Preprocess
+from netspec.export.formats.onnx import export_onnx, onnx_model
+from netspec.export.formats.preprocess import Preprocess
 from netspec.net.net import Net
 from paths import ROOT, shared
 

@@ -7,8 +7,8 @@ import pytest
 
 from each import each
 from exported import ONNX_EXTRA, assert_same, golden_net, here, in_onnxruntime, in_opencv, other_inputs
-from netspec.export.onnx import onnx_model
-from netspec.export.shapes import find_shapes
+from netspec.export.formats.onnx import onnx_model
+from netspec.export.formats.shapes import find_shapes
 from paths import GOLDEN
 
 CASES = sorted((GOLDEN / "layers").iterdir())

@@ -13,7 +13,7 @@ import pytest
 
 import netspec
 from exported import assert_same, here, random_inputs, trained
-from netspec.export.deploy import fold, write_caffe
+from netspec.export.formats.deploy import fold, write_caffe
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net

@@ -15,10 +15,10 @@ import torch
 
 import netspec
 from exported import assert_same, golden_net, here, other_inputs, random_inputs, run_module, source_module, trained
-from netspec.export.pt2 import export_pt2, torch_module
-from netspec.export.shapes import settled
-from netspec.export.torch import export_torch, torch_source
-from netspec.export.torch_code import write_program
+from netspec.export.formats.pt2 import export_pt2, torch_module
+from netspec.export.formats.shapes import settled
+from netspec.export.formats.torch import export_torch, torch_source
+from netspec.export.formats.torch_code import write_program
 from netspec.net.net import Net
 from paths import GOLDEN, ROOT
 

@@ -11,8 +11,8 @@ from netspec.data.hdf5 import Hdf5Source
 from netspec.data.images import read_image
 from netspec.data.mean import read_mean
 from netspec.errors import SpecError
-from netspec.features.images import read_pixels
 from netspec.files.lfs import pointer_fault
+from netspec.inspect.features.images import read_pixels
 from netspec.net.build import build_net
 from netspec.net.weights import load_weights
 from netspec.proto.text import parse_net_text, read_net

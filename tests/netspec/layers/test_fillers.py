@@ -10,7 +10,7 @@ import pytest
 import torch
 from google.protobuf import text_format
 
-from netspec.layers.fillers import fill
+from netspec.layers.contract.fillers import fill
 from netspec.proto.schema import FillerParameter
 
 SHAPE = (200, 50, 2, 2)  # fan_in 200, fan_out 800

@@ -12,7 +12,7 @@ from netspec.exact import CHOICES
 from netspec.exact.blas import one_thread
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, layer_class
-from netspec.layers.training import Learning, kernels, recorded
+from netspec.layers.contract.training import Learning, kernels, recorded
 from netspec.proto.schema import TRAIN, LayerParameter
 
 MAPS = (3, 4, 9, 8)

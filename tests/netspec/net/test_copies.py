@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from netspec.engines.net import load_net
+from netspec.load import load_net
 from netspec.net.net import Net
 from netspec.solver.solver import load_solver
 

@@ -7,8 +7,8 @@ import torch
 from typing_extensions import override
 
 from netspec.errors import SpecError
-from netspec.layers import registry
-from netspec.layers.base import Layer, Shape
+from netspec.layers.contract import registry
+from netspec.layers.contract.base import Layer, Shape
 from netspec.net.net import Net
 
 TEXT = """

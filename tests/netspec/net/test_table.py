@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from netspec.check.check import as_json
+from netspec.inspect.check.check import as_json
 from netspec.net.net import Net
 from netspec.net.table import table
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import netspec
-from netspec.check.bug_report import bug_report
+from netspec.inspect.check.bug_report import bug_report
 from netspec.process import waiting
 from paths import ROOT
 

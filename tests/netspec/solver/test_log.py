@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from netspec import log
 from netspec.solver.solver import load_solver
-from netspec.terminal import log
 
 
 @pytest.fixture

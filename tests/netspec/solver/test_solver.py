@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
-from netspec.layers.reading import Fed
+from netspec.layers.contract.reading import Fed
 from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 from netspec.solver.snapshot import read_state

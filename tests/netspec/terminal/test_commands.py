@@ -8,9 +8,8 @@ from importlib import import_module
 
 import pytest
 
-from netspec import cli
+from netspec import cli, log
 from netspec.errors import SpecError, Where
-from netspec.terminal import log
 from netspec.terminal.commands import Commands, WrongUsage, refuse, run
 
 

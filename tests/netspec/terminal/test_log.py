@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from netspec import log
 from netspec.cli import main
-from netspec.terminal import log
 from paths import GOLDEN
 
 pytestmark = pytest.mark.slow

@@ -1,0 +1,122 @@
+"""A prototxt and its weights, given as paths or as what is in the files, and the runnable nets made of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netspec import log
+from netspec.errors import ForkFault, SpecError, Where
+from netspec.exact import NONE
+from netspec.graph.filter import filter_net, with_state
+from netspec.graph.options import BuildOptions
+from netspec.layers.contract.base import Shape
+from netspec.net.build import build_filtered
+from netspec.net.net import Net
+from netspec.net.weights import copy_weights, load_weights
+from netspec.proto.binary import parse_binary
+from netspec.proto.schema import TEST, NetParameter
+from netspec.proto.source_map import SourceMap
+from netspec.proto.text import parse_net_text
+from netspec.proto.upgrade.current import upgrade_net
+
+FileOrBytes = str | os.PathLike[str] | bytes | bytearray | memoryview | np.ndarray
+
+_NOT_SKIPPED = ("ConvolutionParameter", "PoolingParameter")  # another field may change their windows
+PROTOTXT, WEIGHTS = "<prototxt>", "<caffeModel>"  # what errors call files that were given as bytes
+
+
+@dataclass(frozen=True)
+class CaffeFiles:
+    """A net in phase TEST as its prototxt has it, and where its weights are (None: nowhere)."""
+
+    net: NetParameter
+    source: SourceMap
+    weights: FileOrBytes | None = None
+
+    @property
+    def inputs(self) -> dict[str, Shape | None]:
+        """The input blobs and their shapes, None where the prototxt gives none."""
+        found: dict[str, Shape | None] = {}
+        for layer in self.net.layer:
+            if layer.type == "Input":
+                shapes = [tuple(shape.dim) or None for shape in layer.input_param.shape]
+                shapes = shapes * len(layer.top) if len(shapes) == 1 else shapes
+                found.update(zip(layer.top, shapes or [None] * len(layer.top), strict=False))
+        return found
+
+    def build(self, shapes: Mapping[str, Shape], device: str = "cpu") -> Net:
+        """Return the net for inputs of other shapes than the prototxt's; on "meta" with shapes only. Raises SpecError.
+
+        SSD's layers are OpenCV's (netspec/compat/dnn/opencv_layers.py).
+        """
+        options = BuildOptions(device, exact=NONE)
+        with log.silent():  # of what has no effect; OpenCV says nothing of it
+            net = build_filtered(self._reshaped(shapes), self.source, options)
+        for i, layer in enumerate(net.layers):
+            if layer.type in ("PriorBox", "DetectionOutput"):
+                from netspec.compat.dnn.opencv_layers import (
+                    LAYERS,  # it registers SSD's layers, for nets that have them
+                )
+
+                net.replace_layer(i, LAYERS[layer.type](layer.param, layer.bottom_shapes, layer.context))
+        if self.weights is not None and device != "meta":
+            self._load(net, self.weights)
+        return net
+
+    def _reshaped(self, shapes: Mapping[str, Shape]) -> NetParameter:
+        """Return the net with these shapes of its inputs."""
+        net = NetParameter()
+        net.CopyFrom(self.net)
+        wanted = {**self.inputs, **shapes}
+        for layer in net.layer:
+            if layer.type == "Input" and any(blob in shapes for blob in layer.top):
+                del layer.input_param.shape[:]
+                for blob in layer.top:
+                    layer.input_param.shape.add().dim.extend(wanted[blob] or ())
+        return net
+
+    def _load(self, net: Net, weights: FileOrBytes) -> None:
+        if isinstance(weights, str | os.PathLike):
+            load_weights(net, os.fspath(weights))
+            return
+        message = parse_binary(bytes_of(weights), WEIGHTS, NetParameter)
+        source = SourceMap.unknown(WEIGHTS, len(message.layer) + len(message.layers))
+        copy_weights(net, upgrade_net(message, source)[0], Path(WEIGHTS))
+
+
+def read_files(prototxt: FileOrBytes, weights: FileOrBytes | None) -> CaffeFiles:
+    """Read a prototxt and filter it for phase TEST. Raises SpecError."""
+    if isinstance(prototxt, str | os.PathLike):
+        file = os.fspath(prototxt)
+        try:
+            data = Path(file).read_bytes()
+        except OSError as fault:
+            raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(file)) from None
+    else:
+        file, data = PROTOTXT, bytes_of(prototxt)
+    text = data.removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")
+    net, source = parse_net_text(text, file, upgrade=False, report=_skip)
+    if not net.input_shape and not net.input_dim:
+        for _ in net.input:  # Caffe leaves out an input without a shape; for OpenCV it gets one from setInput
+            net.input_shape.add()
+    with log.silent():  # of older formats
+        net, source = upgrade_net(net, source)
+    return CaffeFiles(*filter_net(with_state(net, TEST), source), weights=weights)
+
+
+def _skip(fault: SpecError) -> None:
+    """Skip an unknown field, with a warning; raise the fault where OpenCV's importer fails too."""
+    if not isinstance(fault, ForkFault) or fault.owner in _NOT_SKIPPED:
+        raise fault
+    log.logger.warning(f"{fault.where}: skipped: {fault.message}")
+
+
+def bytes_of(data: Any) -> bytes:
+    """Return what is in a buffer, or in an array of bytes."""
+    return data.tobytes() if isinstance(data, np.ndarray) else bytes(data)

@@ -1,0 +1,129 @@
+"""Where the pixels of one blob lie in another: how far to crop a map so that it fits the image it came from.
+
+A mapping is (axis, scale, shift), from a layer's bottom to its top: top coordinate = scale * bottom coordinate + shift,
+along the axes behind ``axis``; (None, 1, 0) leaves everything where it is. Blobs are Tops of a NetSpec.
+Caffe: python/caffe/coord_map.py
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netspec.compat.pycaffe.net_spec import Function, Top, layers
+
+Mapping = tuple[Any, Any, Any]
+
+IDENTITY: Mapping = (None, 1, 0)
+PASS_THROUGH_LAYERS = (
+    *("AbsVal", "BatchNorm", "Bias", "BNLL", "Dropout", "Eltwise", "ELU", "Exp", "Log", "LRN", "MVN", "Power"),
+    *("PReLU", "ReLU", "Scale", "Sigmoid", "Split", "TanH", "Threshold"),
+)
+_TWO_DIMENSIONAL = frozenset(f"{what}_{axis}" for what in ("kernel", "stride", "pad") for axis in "hw")
+
+
+class UndefinedMapException(Exception):
+    """The layer moves its bottom's pixels in no regular way."""
+
+
+class AxisMismatchException(Exception):
+    """Two mappings are of different axes."""
+
+
+def conv_params(fn: Function) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """Return (axis, stride, extent of the dilated kernel, pad) of a layer with a kernel, an entry for each axis or one.
+
+    Raises AssertionError for the fields of two dimensions (kernel_h and the like), which it does not know.
+    """
+    given = fn.params.get("convolution_param", fn.params)
+    assert not _TWO_DIMENSIONAL & set(fn.params), "cropping does not support legacy _h/_w params"
+    kernel, dilation = _vector(given["kernel_size"]), _vector(given.get("dilation", 1))
+    extent = (kernel - 1) * dilation + 1
+    return given.get("axis", 1), _vector(given.get("stride", 1)), extent, _vector(given.get("pad", 0))
+
+
+def crop_params(fn: Function) -> tuple[int, np.ndarray]:
+    """Return (axis, offset) of a Crop layer."""
+    given = fn.params.get("crop_param", fn.params)
+    return given.get("axis", 2), _vector(given.get("offset", 0))
+
+
+def coord_map(fn: Function) -> Mapping:
+    """Return the mapping of a layer. Raises UndefinedMapException where it has none."""
+    if fn.type_name in PASS_THROUGH_LAYERS:
+        return IDENTITY
+    if fn.type_name == "Crop":
+        axis, offset = crop_params(fn)
+        return axis - 1, 1, -offset  # a mapping's axis is the last that it leaves alone, as a convolution's is
+    if fn.type_name in ("Convolution", "Pooling", "Im2col"):
+        axis, stride, extent, pad = conv_params(fn)
+        return axis, 1 / stride, (pad - (extent - 1) / 2) / stride
+    if fn.type_name == "Deconvolution":
+        axis, stride, extent, pad = conv_params(fn)
+        return axis, stride, (extent - 1) / 2 - pad
+    raise UndefinedMapException(f"a layer of type {fn.type_name} has no coordinate mapping")
+
+
+def compose(base_map: Mapping, next_map: Mapping) -> Mapping:
+    """Return ``base_map`` after ``next_map``. Raises AxisMismatchException where their axes differ."""
+    base_axis, base_scale, base_shift = base_map
+    next_axis, next_scale, next_shift = next_map
+    if None not in (base_axis, next_axis) and base_axis != next_axis:
+        raise AxisMismatchException(f"one mapping is of the axes behind {base_axis}, the other behind {next_axis}")
+    axis = next_axis if base_axis is None else base_axis
+    return axis, base_scale * next_scale, base_scale * next_shift + base_shift
+
+
+def inverse(coord_map: Mapping) -> Mapping:
+    """Return the mapping from top to bottom."""
+    axis, scale, shift = coord_map
+    return axis, 1 / scale, -shift / scale
+
+
+def coord_map_from_to(top_from: Top, top_to: Top) -> Mapping:
+    """Return the mapping from one top to another, by way of a blob from which both are computed.
+
+    Raises RuntimeError where layers with mappings connect them with no blob in common.
+    """
+    from_maps = _ancestors(top_from)
+    for top, to_map in _ancestors(top_to).items():
+        if top in from_maps:
+            return compose(to_map, inverse(from_maps[top]))
+    raise RuntimeError("Could not compute map between tops; are they connected by spatial layers?")
+
+
+def crop(top_from: Top, top_to: Top) -> Top:
+    """Return the top of a Crop layer that crops one top to the place and size of another.
+
+    Raises AssertionError where their scales differ, or the offset is negative or no whole number.
+    """
+    axis, scale, shift = coord_map_from_to(top_from, top_to)
+    assert np.all(scale == 1), f"scale mismatch on crop (a = {scale})"
+    assert np.all(shift <= 0), f"cannot crop negative width (b = {shift})"
+    assert np.all(np.round(shift) == shift), f"cannot crop noninteger width (b = {shift})"
+    offset = [int(number) for number in -np.round(np.atleast_1d(shift))]
+    return layers.Crop(top_from, top_to, crop_param={"axis": axis + 1, "offset": offset})
+
+
+def _ancestors(top: Top) -> dict[Top, Mapping]:
+    """Return the blobs that a top is computed from, itself first, each with the mapping from it to the top.
+
+    The second bottom of Crop gives a size only, so it is left out. Layers without a mapping end the walk.
+    """
+    maps = {top: IDENTITY}
+    for reached in (pending := [top]):
+        bottoms = reached.fn.inputs[:1] if reached.fn.type_name == "Crop" else reached.fn.inputs
+        try:
+            step = coord_map(reached.fn) if bottoms else IDENTITY
+        except UndefinedMapException:
+            continue
+        for bottom in bottoms:
+            if bottom not in maps:
+                maps[bottom] = compose(maps[reached], step)
+                pending.append(bottom)
+    return maps
+
+
+def _vector(value: Any) -> np.ndarray:
+    return np.array(value, ndmin=1)

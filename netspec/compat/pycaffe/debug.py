@@ -1,0 +1,46 @@
+"""``debug_info`` of a solver whose passes go through the memory of blobs.
+
+Caffe: Net::ForwardDebugInfo, Net::BackwardDebugInfo, Net::Backward (src/caffe/net.cpp)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from netspec.compat.pycaffe.passes import Passes
+from netspec.solver.debug import log_all_params, log_bottom_diff, log_param_diffs, log_params, log_top
+
+
+@contextmanager
+def debug_info(passes: Passes) -> Iterator[None]:
+    """Log the mean absolute values of what passes forward and backward within the block."""
+    net = passes.net
+    ran_backward = False
+
+    def forward(i: int) -> None:
+        for b in passes.top_ids[i]:
+            blob = passes.blobs[b]
+            log_top(net.plan.nodes[i].name, passes.names[b], blob.data_memory.tensor(blob.shape))
+        log_params(net.plan.nodes[i], net.layers[i])
+
+    def backward(i: int) -> None:
+        nonlocal ran_backward
+        ran_backward = True
+        if not net.backward_plan.layers[i]:
+            return
+        for b, wanted in zip(passes.bottom_ids[i], net.backward_plan.bottoms[i], strict=True):
+            if wanted:
+                blob = passes.blobs[b]
+                log_bottom_diff(net.plan.nodes[i].name, passes.names[b], blob.diff_memory.tensor(blob.shape))
+        log_param_diffs(net.plan.nodes[i], net.layers[i])
+
+    passes.hooks["after_forward"].append(forward)
+    passes.hooks["after_backward"].append(backward)
+    try:
+        yield
+    finally:
+        passes.hooks["after_forward"].remove(forward)
+        passes.hooks["after_backward"].remove(backward)
+    if ran_backward:
+        log_all_params(net)

@@ -1,0 +1,102 @@
+"""A net that looks at windows of images. Caffe: python/caffe/detector.py."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from netspec.compat.pycaffe import io
+from netspec.compat.pycaffe.classifier import transformer
+from netspec.compat.pycaffe.net import Net
+from netspec.compat.pycaffe.proto import caffe_pb2
+
+Window = Sequence[int]
+
+
+class Detector(Net):
+    """A net with an image input that windows of images are warped to.
+
+    ``context_pad`` is how many pixels at each border of the net's input show what is around a window; what lies outside
+    of the image is the mean. The other settings are the Transformer's.
+    """
+
+    def __init__(
+        self,
+        model_file: str,
+        pretrained_file: str,
+        mean: np.ndarray | None = None,
+        input_scale: float | None = None,
+        raw_scale: float | None = None,
+        channel_swap: Sequence[int] | None = None,
+        context_pad: int | None = None,
+    ) -> None:
+        super().__init__(model_file, caffe_pb2.TEST, weights=pretrained_file)
+        self.transformer = transformer(self, mean, input_scale, raw_scale, channel_swap)
+        self.configure_crop(context_pad)
+
+    def detect_windows(self, images_windows: Iterable[tuple[str, Iterable[Window]]]) -> list[dict[str, Any]]:
+        """Return window, prediction and filename for each window (ymin, xmin, ymax, xmax) of image files."""
+        images_windows = [(name, list(windows)) for name, windows in images_windows]
+        in_ = self.inputs[0]
+        given = []
+        for name, windows in images_windows:
+            image = io.load_image(name).astype(np.float32)
+            given += [self.transformer.preprocess(in_, self.crop(image, np.array(window))) for window in windows]
+        blobs: dict[str, Any] = {in_: np.stack(given)}
+        predictions = self.forward_all(**blobs)[self.outputs[0]]
+        places = ((name, window) for name, windows in images_windows for window in windows)
+        return [
+            {"window": window, "prediction": prediction, "filename": name}
+            for (name, window), prediction in zip(places, predictions, strict=True)
+        ]
+
+    def detect_selective_search(self, image_fnames: Sequence[str]) -> list[dict[str, Any]]:
+        """Return what ``detect_windows`` does, for windows that selective search proposes.
+
+        Needs the module selective_search_ijcv_with_python, which its authors publish apart, and MATLAB.
+        """
+        search = importlib.import_module("selective_search_ijcv_with_python")
+        names = [os.path.abspath(name) for name in image_fnames]
+        windows = search.get_windows(names, cmd="selective_search_rcnn")
+        return self.detect_windows(zip(names, windows, strict=True))
+
+    def crop(self, im: np.ndarray, window: np.ndarray) -> np.ndarray:
+        """Return the part of an image (H, W, K) that a window shows, with the context around it where that is set."""
+        top, left, bottom, right = (int(place) for place in window)
+        cropped = im[top:bottom, left:right]
+        if not self.context_pad:
+            return cropped
+        size = self.blobs[self.inputs[0]].width  # the input is square
+        scale = size / (size - 2.0 * self.context_pad)
+        half = np.array([bottom - top + 1, right - left + 1]) / 2.0
+        center = np.array([top, left]) + half
+        low, high = np.round(center - scale * half), np.round(center + scale * half)
+        wanted = high - low + 1
+        factors = size / wanted
+        missing = np.maximum(0, -low)  # above and left of the image
+        shift = np.round(missing * factors).astype(int)
+        low = np.clip(low, 0, im.shape[:2]).astype(int)
+        high = np.clip(high, 0, im.shape[:2]).astype(int)
+        seen = im[low[0] : high[0], low[1] : high[1]]
+        extent = np.minimum(np.round((high - low + 1) * factors).astype(int), size - shift)
+        result = np.ones((size, size, im.shape[2]), np.float32) * self.crop_mean
+        result[shift[0] : shift[0] + extent[0], shift[1] : shift[1] + extent[1]] = io.resize_image(seen, extent)
+        return result
+
+    def configure_crop(self, context_pad: int | None) -> None:
+        """Set the context, and as what lies outside an image the mean as an image has it; 0 where no mean is set."""
+        self.context_pad = context_pad
+        if not context_pad:
+            return
+        in_ = self.inputs[0]
+        mean = self.transformer.mean.get(in_)
+        if mean is None:
+            self.crop_mean = np.zeros(self.blobs[in_].data.shape[1:], np.float32).transpose(1, 2, 0)
+            return
+        # deprocess() adds the mean to what is 0 for the net.
+        zero = np.zeros(self.blobs[in_].data.shape[1:], np.float32)
+        self.crop_mean = self.transformer.deprocess(in_, zero)

@@ -1,0 +1,255 @@
+"""Images and arrays on their way into a net and out of it.
+
+Images are float arrays (H, W, K) with values from 0 to 1, K being 3 (RGB) or 1.
+Caffe: python/caffe/io.py
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from netspec.compat.pycaffe import extras
+from netspec.compat.pycaffe.proto import caffe_pb2
+
+Array = np.ndarray
+Extents = Sequence[int] | Array
+
+
+# ---- Messages and arrays ----
+
+
+def blobproto_to_array(blob: Any, return_diff: bool = False) -> Array:
+    """Return the data, or the diff, of a BlobProto as float64, (num, channels, height, width) where it has these.
+
+    Raises ValueError where the shape does not suit the number of values.
+    """
+    values = np.array(blob.diff if return_diff else blob.data, np.float64)
+    legacy = ("num", "channels", "height", "width")
+    if any(blob.HasField(name) for name in legacy):
+        return values.reshape([getattr(blob, name) for name in legacy])
+    return values.reshape(list(blob.shape.dim))
+
+
+def array_to_blobproto(arr: Array, diff: Array | None = None) -> Any:
+    """Return an array, and its diff where one is given, as a BlobProto."""
+    blob = caffe_pb2.BlobProto()
+    blob.shape.dim.extend(arr.shape)
+    blob.data.extend(np.asarray(arr, np.float32).ravel())
+    if diff is not None:
+        blob.diff.extend(np.asarray(diff, np.float32).ravel())
+    return blob
+
+
+def arraylist_to_blobprotovector_str(arraylist: Sequence[Array]) -> bytes:
+    """Return arrays as the bytes of a BlobProtoVector."""
+    return caffe_pb2.BlobProtoVector(blobs=[array_to_blobproto(arr) for arr in arraylist]).SerializeToString()
+
+
+arraylist_to_blobprotovecor_str = arraylist_to_blobprotovector_str  # as Caffe spells it
+
+
+def blobprotovector_str_to_arraylist(str: bytes) -> list[Array]:
+    """Return the arrays of the bytes of a BlobProtoVector."""
+    return [blobproto_to_array(blob) for blob in caffe_pb2.BlobProtoVector.FromString(str).blobs]
+
+
+def array_to_datum(arr: Array, label: int | np.integer | None = None) -> Any:
+    """Return an array (C, H, W) as a Datum: uint8 as bytes, other numbers as floats.
+
+    Raises ValueError where it does not have three axes.
+    """
+    if arr.ndim != 3:
+        raise ValueError(f"Incorrect array shape: found {arr.shape}, expected (channels, height, width).")
+    datum = caffe_pb2.Datum()
+    datum.channels, datum.height, datum.width = arr.shape
+    if arr.dtype == np.uint8:
+        datum.data = arr.tobytes()
+    else:
+        datum.float_data.extend(np.asarray(arr, np.float64).ravel())
+    if label is not None:
+        datum.label = int(label)
+    return datum
+
+
+def datum_to_array(datum: Any) -> Array:
+    """Return the values of a Datum as (C, H, W), uint8 or float64; an encoded image is not decoded."""
+    shape = datum.channels, datum.height, datum.width
+    if datum.data:
+        return np.frombuffer(datum.data, np.uint8).reshape(shape).copy()
+    return np.array(datum.float_data, np.float64).reshape(shape)
+
+
+# ---- Pre-processing ----
+
+
+class Transformer:
+    """Makes an image into a net's input: resized, transposed, its channels in another order, scaled, without a mean.
+
+    ``inputs`` has the shape of each input blob (N, C, H, W). What is not set is not done.
+    """
+
+    def __init__(self, inputs: Mapping[str, Sequence[int]]) -> None:
+        self.inputs = inputs
+        self.transpose: dict[str, Sequence[int]] = {}
+        self.channel_swap: dict[str, Sequence[int]] = {}
+        self.raw_scale: dict[str, float] = {}
+        self.mean: dict[str, Array] = {}
+        self.input_scale: dict[str, float] = {}
+
+    def preprocess(self, in_: str, data: Array) -> Array:
+        """Return an image (H', W', K) as (K, H, W) float32 for the input blob ``in_``.
+
+        The order is: resize, transpose, swap the channels, times raw_scale, minus the mean, times input_scale. As in
+        Caffe, a float32 image that needs neither resizing nor swapping is itself scaled in place.
+        """
+        self._check_input(in_)
+        values = data.astype(np.float32, copy=False)
+        size = tuple(self.inputs[in_][2:])
+        if values.shape[:2] != size:
+            values = resize_image(values, size)
+        if in_ in self.transpose:
+            values = values.transpose(self.transpose[in_])
+        if in_ in self.channel_swap:
+            values = values[list(self.channel_swap[in_]), :, :]
+        if in_ in self.raw_scale:
+            values *= self.raw_scale[in_]
+        if in_ in self.mean:
+            values -= self.mean[in_]
+        if in_ in self.input_scale:
+            values *= self.input_scale[in_]
+        return values
+
+    def deprocess(self, in_: str, data: Array) -> Array:
+        """Return what an input (K, H, W) was before ``preprocess``, but for its size."""
+        self._check_input(in_)
+        values = data.copy().squeeze()
+        if in_ in self.input_scale:
+            values /= self.input_scale[in_]
+        if in_ in self.mean:
+            values += self.mean[in_]
+        if in_ in self.raw_scale:
+            values /= self.raw_scale[in_]
+        if in_ in self.channel_swap:
+            values = values[np.argsort(self.channel_swap[in_]), :, :]
+        if in_ in self.transpose:
+            values = values.transpose(np.argsort(self.transpose[in_]))
+        return values
+
+    def set_transpose(self, in_: str, order: Sequence[int]) -> None:
+        """Set the order of an image's axes in the blob: (2, 0, 1) makes (H, W, K) into (K, H, W)."""
+        self._check_input(in_)
+        if len(order) != len(self.inputs[in_]) - 1:
+            raise Exception("Transpose order needs to have the same number of dimensions as the input.")
+        self.transpose[in_] = order
+
+    def set_channel_swap(self, in_: str, order: Sequence[int]) -> None:
+        """Set the order of the channels, after transposing: (2, 1, 0) makes RGB into BGR."""
+        self._check_input(in_)
+        if len(order) != self.inputs[in_][1]:
+            raise Exception("Channel swap needs to have the same number of dimensions as the input channels.")
+        self.channel_swap[in_] = order
+
+    def set_raw_scale(self, in_: str, scale: float) -> None:
+        """Set what the image is multiplied by before the mean is subtracted: 255 for nets that know 0 to 255."""
+        self._check_input(in_)
+        self.raw_scale[in_] = scale
+
+    def set_mean(self, in_: str, mean: Array) -> None:
+        """Set what is subtracted: a value for each channel (K,), or an image (H, W) or (K, H, W).
+
+        An image of another size than the input's is resized, as Caffe does. Raises ValueError for another number of
+        channels or axes.
+        """
+        self._check_input(in_)
+        mean = np.asarray(mean)
+        shape = tuple(self.inputs[in_][1:])
+        if mean.ndim == 1:
+            if mean.shape[0] != shape[0]:
+                raise ValueError(f"Mean channels incompatible with input: found {mean.shape[0]}, expected {shape[0]}.")
+            mean = mean[:, np.newaxis, np.newaxis]
+        elif mean.ndim not in (2, 3):
+            raise ValueError(f"Mean shape invalid: found {mean.shape}.")
+        elif (image := mean.reshape((1,) * (3 - mean.ndim) + mean.shape)).shape != shape:
+            if len(image) != shape[0]:
+                raise ValueError(f"Mean channels incompatible with input: found {len(image)}, expected {shape[0]}.")
+            low, span = mean.min(), np.ptp(mean) or 1
+            mean = resize_image(((image - low) / span).transpose(1, 2, 0), shape[1:]).transpose(2, 0, 1) * span + low
+        self.mean[in_] = mean
+
+    def set_input_scale(self, in_: str, scale: float) -> None:
+        """Set what the input is multiplied by after the mean was subtracted."""
+        self._check_input(in_)
+        self.input_scale[in_] = scale
+
+    def _check_input(self, in_: str) -> None:
+        if in_ not in self.inputs:
+            raise Exception(f"{in_} is not one of the net inputs: {list(self.inputs)}")
+
+
+# ---- Images ----
+
+
+def load_image(filename: Any, color: bool = True) -> Array:
+    """Return an image file as float32 (H, W, 3) RGB, or (H, W, 1) gray, with values from 0 to 1; alpha is dropped.
+
+    Needs the extra ``pycaffe``.
+    """
+    skimage = extras.load("skimage", "pycaffe", "caffe.io.load_image")
+    reading = extras.load("skimage.io", "pycaffe", "caffe.io.load_image")
+    image = skimage.img_as_float(reading.imread(filename, as_gray=not color)).astype(np.float32)
+    if image.ndim == 2:
+        image = image[:, :, np.newaxis]
+        return np.tile(image, (1, 1, 3)) if color else image
+    return image[:, :, :3] if image.shape[2] == 4 else image
+
+
+def resize_image(im: Array, new_dims: Extents, interp_order: int = 1) -> Array:
+    """Return an image (H, W, K) in another size (height, width), by splines of an order, without anti-aliasing.
+
+    As in Caffe, K of 1 or 3 goes through scikit-image (the extra ``pycaffe``), other K through SciPy's zoom.
+    """
+    height, width = (int(extent) for extent in new_dims)
+    if im.shape[-1] not in (1, 3):
+        from scipy.ndimage import zoom
+
+        scale = (height / im.shape[0], width / im.shape[1], 1)
+        return np.asarray(zoom(im, scale, order=interp_order), np.float32)
+    low, high = im.min(), im.max()
+    if not high > low:
+        return np.full((height, width, im.shape[-1]), low, np.float32)
+    transform = extras.load("skimage.transform", "pycaffe", "caffe.io.resize_image")
+    unit = (im - low) / (high - low)  # scikit-image takes values from 0 to 1
+    resized = transform.resize(unit, (height, width), order=interp_order, mode="constant", anti_aliasing=False)
+    return (resized * (high - low) + low).astype(np.float32)
+
+
+def oversample(images: Sequence[Array] | Array, crop_dims: Extents) -> Array:
+    """Return ten crops (10 N, h, w, K) of each of N images of one size: corners, center, and the five mirrored."""
+    height, width = (int(extent) for extent in crop_dims)
+    rows, columns, channels = images[0].shape
+    starts = [(top, left) for top in (0, rows - height) for left in (0, columns - width)]
+    starts.append((int(rows / 2 - height / 2), int(columns / 2 - width / 2)))
+    crops = np.empty((10 * len(images), height, width, channels), np.float32)
+    for number, image in enumerate(images):
+        for k, (top, left) in enumerate(starts):
+            crop = image[top : top + height, left : left + width]
+            crops[10 * number + k] = crop
+            crops[10 * number + 5 + k] = crop[:, ::-1]
+    return crops
+
+
+def __getattr__(name: str) -> Any:
+    """Give what scripts take from Caffe's module because it imports it: ``resize``, ``zoom``, ``skimage``."""
+    if name == "zoom":
+        from scipy.ndimage import zoom
+
+        return zoom
+    if name == "resize":
+        return extras.load("skimage.transform", "pycaffe", "caffe.io.resize").resize
+    if name == "skimage":
+        extras.load("skimage.io", "pycaffe", "caffe.io.skimage")
+        return extras.load("skimage", "pycaffe", "caffe.io.skimage")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

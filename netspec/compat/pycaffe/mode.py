@@ -1,0 +1,139 @@
+"""What holds for all nets to come: the device, the seed, and which of several processes this is.
+
+Caffe: class Caffe (include/caffe/common.hpp)
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass, field
+
+import torch
+
+from netspec import log
+from netspec.exact import CHOICES, SMALL
+from netspec.graph.options import BuildOptions
+from netspec.layers.contract.context import Random
+
+
+@dataclass
+class _Mode:
+    gpu: bool = False
+    device: int = 0
+    warned: bool = False
+    seed: int | None = None
+    nets: int = 0  # made since the seed was set
+    exact: str = SMALL
+    multiprocess: bool = False
+    solver_count: int = 1
+    solver_rank: int = 0
+    draws: weakref.WeakSet[Random] = field(default_factory=weakref.WeakSet)
+
+
+_mode = _Mode()
+
+
+def set_mode_cpu() -> None:
+    """Make nets that are built from now on run on the CPU."""
+    _mode.gpu = False
+
+
+def set_mode_gpu() -> None:
+    """Make nets that are built from now on run on the GPU; on the CPU, with one warning, where torch finds none."""
+    _mode.gpu = torch.cuda.is_available()
+    if not _mode.gpu and not _mode.warned:
+        _mode.warned = True
+        log.warning("common.cpp:152", "set_mode_gpu: torch finds no GPU here: nets run on the CPU")
+
+
+def set_device(device_id: int) -> None:
+    """Choose the GPU for nets that are built from now on, by its number."""
+    if torch.cuda.is_available() and not 0 <= device_id < torch.cuda.device_count():
+        raise ValueError(f"found device {device_id}, but torch finds {torch.cuda.device_count()} GPU(s) here")
+    _mode.device = device_id
+
+
+def device() -> torch.device:
+    """Return where nets are built."""
+    return torch.device("cuda", _mode.device) if _mode.gpu else torch.device("cpu")
+
+
+def set_random_seed(seed: int) -> None:
+    """Make random draws begin anew: fillers of the nets to come, Dropout and the like of those that are there."""
+    _mode.seed, _mode.nets = int(seed), 0
+    for random in _mode.draws:
+        random.restart(_mode.seed)
+
+
+def next_seed() -> int | None:
+    """Return the seed of the next net; None where none was set."""
+    if _mode.seed is None:
+        return None
+    _mode.nets += 1
+    return _mode.seed + _mode.nets - 1
+
+
+def solver_seed() -> int | None:
+    """Return the seed of the next solver: processes side by side must draw the order of their records alike."""
+    seed = next_seed()
+    return 0 if seed is None and multiprocess() else seed
+
+
+def follow_seed(random: Random) -> None:
+    """Make a net's draws begin anew when a seed is set."""
+    _mode.draws.add(random)
+
+
+def set_exact(choice: str) -> None:
+    """Say whose sums are Caffe's to the last bit, in nets that are built from now on: "none", "small" or "all".
+
+    Not of Caffe; see netspec/exact/__init__.py.
+    """
+    if choice not in CHOICES:
+        raise ValueError(f"found exact {choice!r}, expected {', '.join(map(repr, CHOICES))}")
+    _mode.exact = choice
+
+
+def exact() -> str:
+    """Return what :func:`set_exact` was told last."""
+    return _mode.exact
+
+
+def build_options() -> BuildOptions:
+    """Return how the next net is built."""
+    return BuildOptions(str(device()), next_seed(), allow_python=True, exact=_mode.exact, accumulate_in_place=True)
+
+
+def set_multiprocess(value: bool) -> None:
+    """Say whether several processes train side by side."""
+    _mode.multiprocess = bool(value)
+
+
+def multiprocess() -> bool:
+    """Return whether several processes train side by side."""
+    return _mode.multiprocess and _mode.solver_count > 1
+
+
+def set_solver_count(count: int) -> None:
+    """Say how many solvers train side by side."""
+    _mode.solver_count = int(count)
+
+
+def set_solver_rank(rank: int) -> None:
+    """Say which of the solvers that train side by side this process has; 0 is the root."""
+    _mode.solver_rank = int(rank)
+
+
+def solver_count() -> int:
+    """Return how many solvers train side by side."""
+    return _mode.solver_count
+
+
+def solver_rank() -> int:
+    """Return which of the solvers that train side by side this process has."""
+    return _mode.solver_rank
+
+
+def root_solver() -> bool:
+    """Return whether this process has the root solver."""
+    return _mode.solver_rank == 0

@@ -1,0 +1,251 @@
+"""Nets written in Python: each call of ``L.Convolution(bottom, num_output=20)`` is a layer, its results are its tops.
+
+    n = NetSpec()
+    n.data = L.Input(shape=dict(dim=[1, 3, 224, 224]))
+    n.conv1 = L.Convolution(n.data, kernel_size=3, num_output=20, weight_filler=dict(type="xavier"))
+    n.relu1 = L.ReLU(n.conv1, in_place=True)
+    n.to_proto()  # a caffe_pb2.NetParameter; str() of it is a prototxt
+
+Caffe: python/caffe/net_spec.py
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from typing import Any
+
+from netspec.compat.pycaffe.proto import caffe_pb2
+from netspec.errors import did_you_mean
+from netspec.proto.dialect.files import announce_known
+from netspec.proto.dialect.registry import advice_for, dialects_with_field, dialects_with_type
+
+Name = Callable[["Top | Function"], str]
+
+
+class Top:
+    """One blob that a layer writes: the number ``n`` of the tops of ``fn``."""
+
+    def __init__(self, fn: Function, n: int) -> None:
+        self.fn = fn
+        self.n = n
+
+    def to_proto(self) -> Any:
+        """Return the net of all layers that this blob needs, with names made of the layers' types."""
+        return to_proto(self)
+
+
+class Function:
+    """A layer: its type, the tops it reads, and its parameters.
+
+    ``ntop`` (1) is how many tops it writes; with ``in_place=True`` they are its bottoms. The other parameters are
+    fields of the message that its type has (``num_output`` of ``convolution_param``), or else of LayerParameter.
+    Raises TypeError for an input that is not a Top.
+    """
+
+    def __init__(self, type_name: str, inputs: Iterable[Any], params: Mapping[str, Any]) -> None:
+        self.type_name = type_name
+        self.inputs = tuple(inputs)
+        for number, given in enumerate(self.inputs):
+            if not isinstance(given, Top):
+                raise TypeError(f"{type_name} input {number} is not a Top (type is {type(given)})")
+        self.params = dict(params)
+        self.ntop: int = self.params.pop("ntop", 1)
+        self.in_place: bool = self.params.pop("in_place", False)
+        self.tops = tuple(Top(self, n) for n in range(self.ntop))
+
+    def to_layer(self, bottoms: Iterable[str], name_of: Name) -> Any:
+        """Return the LayerParameter; ``name_of`` gives the names of tops and of a layer that has none."""
+        layer = caffe_pb2.LayerParameter(type=self.type_name, bottom=bottoms)
+        layer.top.extend(layer.bottom if self.in_place else [name_of(top) for top in self.tops])
+        layer.name = name_of(self.tops[0] if self.tops else self)
+        own = _own_message(layer, self.type_name)
+        own_fields = layer.DESCRIPTOR.fields_by_name[own].message_type.fields_by_name if own else ()
+        for name, value in self.params.items():
+            # As in Caffe, a field of both goes to the layer's own message, unless it is a message itself.
+            in_layer = name in layer.DESCRIPTOR.fields_by_name
+            if name in own_fields and not (in_layer and name.endswith("param")):
+                assign_proto(getattr(layer, own), name, value)
+            elif in_layer:
+                assign_proto(layer, name, value)
+            else:
+                raise AttributeError(self._unknown(layer, own, name))
+        return layer
+
+    def _unknown(self, layer: Any, own: str, name: str) -> str:
+        messages = [layer.DESCRIPTOR]
+        if own:
+            messages.append(layer.DESCRIPTOR.fields_by_name[own].message_type)
+        places = f"{own} and LayerParameter have" if own else "LayerParameter has"
+        announce_known()
+        with_field = {d for message in messages for d in dialects_with_field(message.full_name, name)}
+        with_type = dialects_with_type(self.type_name)
+        advice = advice_for(name, tuple(sorted(with_field))) or advice_for(self.type_name, with_type)
+        known = [field for message in messages for field in message.fields_by_name]
+        hint = f"; {advice}" if advice else did_you_mean(name, known)
+        return f'layer of type "{self.type_name}": {places} no field "{name}"{hint}'
+
+
+def to_proto(*tops: Top) -> Any:
+    """Return the net of all layers that the tops need, with names made of the layers' types: ``Convolution1``."""
+    return _net(tops, {})
+
+
+class NetSpec:
+    """A net whose blobs and layers have the names of the attributes, or keys, that they are assigned to."""
+
+    tops: dict[str, Any]
+
+    def __init__(self) -> None:
+        super().__setattr__("tops", {})
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        self.tops[name] = value
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # what copy and pickle ask an object for
+            raise AttributeError(name)
+        if name not in self.tops:
+            raise _NoSuchTop(f"the net has no top {name!r}{did_you_mean(name, list(self.tops))}")
+        return self.tops[name]
+
+    def __delattr__(self, name: str) -> None:
+        del self.tops[name]
+
+    __setitem__ = __setattr__
+    __getitem__ = __getattr__
+    __delitem__ = __delattr__
+
+    def keys(self) -> list[str]:
+        """Return the assigned names; as SSD has it."""
+        return list(self.tops)
+
+    def vals(self) -> list[Any]:
+        """Return what was assigned; as SSD has it."""
+        return list(self.tops.values())
+
+    def update(self, name: str, params: Mapping[str, Any]) -> None:
+        """Change parameters of the layer of a top; as SSD has it."""
+        _function(self[name]).params.update(params)
+
+    def to_proto(self) -> Any:
+        """Return the net of all layers that the assigned tops need."""
+        return _net(self.tops.values(), {top: name for name, top in self.tops.items()})
+
+
+class _NoSuchTop(AttributeError, KeyError):
+    """Caffe raises KeyError; ``hasattr`` needs AttributeError."""
+
+    __str__ = Exception.__str__
+
+
+def _net(wanted: Iterable[Top | Function], names: dict[Any, str]) -> Any:
+    """Return the net of the layers that some tops need, each layer behind those that it reads from."""
+    autonames: Counter[str] = Counter()
+    layers: dict[Function, Any] = {}
+
+    def name_of(item: Top | Function) -> str:
+        if item not in names:
+            type_name = (item.fn if isinstance(item, Top) else item).type_name
+            autonames[type_name] += 1
+            names[item] = f"{type_name}{autonames[type_name]}"
+        return names[item]
+
+    for item in wanted:
+        pending = [_function(item)]
+        while pending:
+            fn = pending[-1]
+            missing = [top.fn for top in fn.inputs if top.fn not in layers]
+            if fn in layers or not missing:
+                pending.pop()
+                if fn not in layers:
+                    layers[fn] = fn.to_layer([layers[top.fn].top[top.n] for top in fn.inputs], name_of)
+            else:
+                pending.append(missing[0])
+    return caffe_pb2.NetParameter(layer=layers.values())
+
+
+def _function(item: Any) -> Function:
+    if isinstance(item, Top):
+        return item.fn
+    if isinstance(item, Function):
+        return item
+    raise TypeError(
+        f"expected a Top, or a layer without tops, found {type(item)}; a layer with ntop=2 gives a tuple of tops"
+    )
+
+
+def assign_proto(proto: Any, name: str, value: Any) -> None:
+    """Set a field: a dict fills a message, a list a repeated field; a single value given to one becomes its only one.
+
+    Raises AttributeError for a field that the message does not have, TypeError or ValueError for a value that does not
+    suit it.
+    """
+    field = getattr(proto, name)
+    repeated = hasattr(field, "extend")
+    if repeated and not isinstance(value, (list, tuple)):
+        value = [value]
+    if repeated:
+        for item in value:
+            if isinstance(item, dict):
+                _fill(field.add(), item)
+            else:
+                field.extend([item])
+    elif isinstance(value, dict):
+        _fill(field, value)
+    elif hasattr(field, "CopyFrom"):
+        field.CopyFrom(value)
+    else:
+        setattr(proto, name, value)
+
+
+def _fill(message: Any, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        assign_proto(message, name, value)
+
+
+def param_name_dict() -> dict[str, str]:
+    """Return the fields of LayerParameter that have a layer's parameters, by layer type: Convolution, convolution."""
+    return _param_names(caffe_pb2.LayerParameter.DESCRIPTOR)
+
+
+@cache
+def _param_names(layer: Any) -> dict[str, str]:
+    return {
+        field.message_type.name.removesuffix("Parameter"): field.name.removesuffix("_param")
+        for field in layer.fields
+        if field.name.endswith("_param")
+    }
+
+
+def _own_message(layer: Any, type_name: str) -> str:
+    names = _param_names(layer.DESCRIPTOR)
+    return f"{names[type_name]}_param" if type_name in names else ""
+
+
+class Layers:
+    """``L``: ``L.Type(*bottoms, **params)`` gives the layer's top, a tuple of several, or without tops the layer."""
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name.startswith("__"):
+            raise AttributeError(name)
+
+        def layer(*bottoms: Any, **params: Any) -> Any:
+            made = Function(name, bottoms, params)
+            return {0: made, 1: made.tops[0] if made.tops else None}.get(made.ntop, made.tops)
+
+        return layer
+
+
+class Parameters:
+    """``P``: ``P.Pooling.MAX`` is the value MAX of the enums of PoolingParameter."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(caffe_pb2, f"{name}Parameter")
+
+
+layers = Layers()
+params = Parameters()

@@ -1,0 +1,78 @@
+"""Several processes that train side by side, as Caffe's python/train.py starts them; and a stopwatch.
+
+Caffe's NCCL class averages the gradients of all solvers; here torch.distributed does, on GPUs through the NCCL library.
+
+Caffe: src/caffe/parallel.cpp, python/caffe/_caffe.cpp
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+import uuid
+from pathlib import Path
+
+from torch import distributed
+
+from netspec.compat.pycaffe import mode
+from netspec.compat.pycaffe.solver import Solver
+from netspec.solver.processes import Processes, join
+from netspec.solver.replicas import Replicas
+
+
+def has_nccl() -> bool:
+    """Return whether torch has NVIDIA's NCCL. Without it several processes train side by side too, on CPUs."""
+    return distributed.is_available() and distributed.is_nccl_available()
+
+
+class NCCL:
+    """Joins the solvers of ``solver_count()`` processes that were given the same ``uid``.
+
+    Every process makes its own, having set its ``set_solver_rank``; the constructor waits for the others.
+    """
+
+    def __init__(self, solver: Solver, uid: bytes) -> None:
+        count = mode.solver_count()
+        if count == 1:
+            processes = Processes()
+        elif distributed.is_initialized():
+            processes = Processes(mode.solver_rank(), count)
+        else:
+            processes = join(count, mode.solver_rank(), f"file://{Path(tempfile.gettempdir(), os.fsdecode(uid))}")
+        self._replicas = Replicas(solver._training.net, (), processes)
+
+    @staticmethod
+    def new_uid() -> bytes:
+        """Return a name for a group of processes."""
+        return f"netspec-{uuid.uuid4().hex}".encode()
+
+    def bcast(self) -> None:
+        """Give every process the root's weights."""
+        self._replicas.begin()
+
+    def on_start(self) -> None:
+        """Do nothing: the weights are alike."""
+
+    def on_gradients_ready(self) -> None:
+        """Replace each gradient by the mean of all processes' gradients."""
+        self._replicas.reduce()
+
+    def __call__(self, layer: int) -> None:
+        """Do nothing after a layer's backward: all gradients are averaged at once (layer_wise_reduce only hurries)."""
+
+
+class Timer:
+    """A stopwatch: ``start``, ``stop``, and ``ms``, the milliseconds between."""
+
+    def __init__(self) -> None:
+        self._began = 0.0
+        self.ms = 0.0
+
+    def start(self) -> None:
+        """Begin."""
+        self._began = time.perf_counter()
+
+    def stop(self) -> None:
+        """End."""
+        self.ms = (time.perf_counter() - self._began) * 1e3

@@ -1,0 +1,410 @@
+"""Forward and backward passes through the memory of a net's blobs, layer by layer, as Caffe makes them.
+
+A net of netspec hands tensors from layer to layer, and autograd goes backward through all of them. Scripts of pycaffe
+read and write the blobs between two layers' passes: so here each layer reads its bottoms' memory and writes its tops',
+and each layer's backward reads the diffs of its tops, and what it needs of the data, from that memory.
+
+Caffe: Net::ForwardFromTo, Net::BackwardFromTo, Net::Reshape (src/caffe/net.cpp)
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
+
+import torch
+
+from netspec import log
+from netspec.compat.pycaffe.tapes import (
+    Bound,
+    Tape,
+    apart,
+    by_autograd,
+    gradient_of,
+    overwrites_shared,
+    parameters,
+    places_of,
+    storages,
+)
+from netspec.exact.blas import one_thread
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.contract.offers import offered
+from netspec.layers.contract.reading import Constant
+from netspec.layers.contract.training import Learning, has_kernels, kernels
+from netspec.layers.utility.live_blobs import Blob, BorrowedMemory
+from netspec.layers.utility.pycaffe_shim import importable
+from netspec.layers.utility.python import Python
+from netspec.net.net import Net
+from netspec.run.walk import Step, walk
+
+AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
+Hook = Callable[[int], object]
+
+
+class Passes:
+    """The blobs of a net and the passes through them.
+
+    ``names`` and ``blobs`` run in step, in Caffe's order; ``bottoms[i]`` and ``tops[i]`` are the blobs of layer i,
+    ``params[i]`` its learnable blobs. ``hooks`` are called with a layer's number, before and after its passes.
+    """
+
+    def __init__(self, net: Net) -> None:
+        self.net = net
+        self.names: list[str] = []
+        self.blobs: list[Blob] = []
+        self.bottom_ids: list[list[int]] = []
+        self.top_ids: list[list[int]] = []
+        self.hooks: dict[str, list[Hook]] = {
+            f"{when}_{which}": [] for when in ("before", "after") for which in ("forward", "backward")
+        }
+        self._lock = threading.RLock()
+        self._last: threading.Thread | None = None  # the one that ran a forward pass last
+        self._overtaken = weakref.WeakSet[threading.Thread]()  # those that did before
+        self._layers: list[Layer] = list(net.layers)
+        self.params = [parameters(layer) for layer in self._layers]
+        self._tapes: list[Tape | None] = [None] * len(self._layers)
+        self._bound: list[Bound | None] = [None] * len(self._layers)
+        for i in range(len(self._layers)):
+            self._wire(i)
+        self.bottoms = [[self.blobs[b] for b in ids] for ids in self.bottom_ids]
+        self.tops = [[self.blobs[b] for b in ids] for ids in self.top_ids]
+        self._losses = [
+            [(top, weight) for top, weight in zip(tops, weights, strict=True) if weight]
+            for tops, weights in zip(self.tops, net.loss_weights, strict=True)
+        ]
+        self._kept = [layer.filled_once() if isinstance(layer, Constant) else () for layer in self._layers]
+        self._records = [self._is_recorded(i) for i in range(len(self._layers))]
+        self._has_kernels = [self._can_bind(i) for i in range(len(self._layers))]
+        for i in range(len(self._layers)):
+            self._set_up(i)
+        self._prepares = self._can_prepare()
+        self._given, self._results = self._ends()
+        self._final_values = frozenset(v for v, *_ in (*self._given, *self._results))
+        self._hand_on = not all(fresh for *_, fresh in self._results)
+        self._no_loss = torch.zeros((), device=net.device)
+
+    # Building
+
+    def _wire(self, i: int) -> None:
+        """Make the blobs that layer ``i`` adds (Caffe: AppendBottom, AppendTop)."""
+        plan, layer = self.net.plan, self._layers[i]
+        node = plan.nodes[i]
+        current = {name: b for b, name in enumerate(self.names)}
+        bottoms = [current[plan.blobs[v]] for v in node.bottoms]
+        tops = []
+        for j, shape in enumerate(layer.top_shapes):
+            if j < len(node.tops) and node.in_place[j]:
+                tops.append(bottoms[j])
+                continue
+            blob = layer.top[j] if isinstance(layer, Python) and layer.code else Blob(shape)
+            blob.data_memory.device = blob.diff_memory.device = self.net.device
+            tops.append(len(self.blobs))
+            self.blobs.append(blob)
+            self.names.append(plan.blobs[node.tops[j]] if j < len(node.tops) else AUTOMATIC)
+            if "data" in layer.shares:
+                blob.data_memory = self.blobs[bottoms[0]].data_memory
+            if "diff" in layer.shares:
+                blob.diff_memory = self.blobs[bottoms[0]].diff_memory
+        self.bottom_ids.append(bottoms)
+        self.top_ids.append(tops)
+
+    def _set_up(self, i: int) -> None:
+        """Write what Caffe writes when it makes the layer."""
+        layer = self._layers[i]
+        if isinstance(layer, Python) and layer.code:
+            layer.bottom[:], layer.top[:] = self.bottoms[i], self.tops[i]
+            layer.code.blobs[:] = self.params[i]
+        for top, constant in zip(self.tops[i], self._kept[i], strict=False):
+            if constant is not None:
+                top.data_memory.put(constant.clone())
+        for top, weight in self._losses[i]:
+            top.diff_memory.put(torch.full(top.shape, weight, device=self.net.device))
+
+    def _ends(self) -> tuple[list[tuple[int, int]], list[tuple[int, Blob, bool, bool]]]:
+        """Return the inputs, each a value and its blob; and the last value of every other blob.
+
+        With each of these: whether it lies where another blob does, and whether it is in memory of its own.
+        """
+        given: list[tuple[int, int]] = []
+        results: dict[int, tuple[int, Blob, bool, bool]] = {}
+        for node, layer, ids in zip(self.net.plan.nodes, self._layers, self.top_ids, strict=True):
+            for v, b in zip(node.tops, ids, strict=False):
+                if layer.is_input:
+                    given.append((v, b))
+                else:
+                    results[b] = v, self.blobs[b], "data" in layer.shares, bool(offered(layer, "fresh"))
+        return given, list(results.values())
+
+    def _is_recorded(self, i: int) -> bool:
+        """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
+        layer, plan = self._layers[i], self.net.backward_plan
+        from_memory = isinstance(layer, Python) or layer.shares or gradient_reads(layer)
+        wanted = any(plan.bottoms[i]) or any(blob.requires_grad for blob in layer.blobs)
+        return plan.layers[i] and wanted and not from_memory
+
+    def _can_bind(self, i: int) -> bool:
+        """Return whether layer ``i`` has kernels of its own for what autograd would watch."""
+        layer = self._layers[i]
+        return (
+            has_kernels(layer)
+            and self.net.device.type == "cpu"
+            and not any(self._is_in_place(i, blob) for blob in self.bottoms[i])
+            and all(blob.dtype == torch.float32 and blob.is_contiguous() for blob in layer.blobs)
+            and all(layer.blob(j) is blob for j, blob in enumerate(layer.blobs))
+        )
+
+    # Running
+
+    @contextmanager
+    def used(self, forward: bool = True) -> Iterator[None]:
+        """Let one thread at a time use the net within the block, to run forward or backward.
+
+        What a thread looks at then stays as it is when another runs the net. Raises RuntimeError for a backward pass
+        through what another thread's forward pass has left.
+        """
+        with self._lock:
+            thread = threading.current_thread()
+            if self._last is not None and thread is not self._last:
+                if not forward and thread in self._overtaken:
+                    advice = "give each thread a net of its own (share_with), or a lock around both passes"
+                    raise RuntimeError(f"backward: another thread has run this net since; {advice}")
+                self._leave_views()
+            if forward:
+                if self._last is not None:
+                    self._overtaken.add(self._last)
+                self._overtaken.discard(thread)
+                self._last = thread
+            yield
+
+    def _leave_views(self) -> None:
+        """Leave what passes compute to those who look at it; they go on in other memory."""
+        written = {id(self.blobs[b].data_memory) for _, b in self._given}
+        written |= {id(self.blobs[self.names.index(name)].diff_memory) for name in self.net.outputs}
+        memories = {id(each): each for blob in self.blobs for each in (blob.data_memory, blob.diff_memory)}
+        fresh = {key: memory for key, memory in memories.items() if key not in written}
+        for memory in fresh.values():
+            memory.leave_views()
+        self._bound = [None] * len(self._layers)  # kernels keep the memory that they compute into
+
+    @torch.no_grad()
+    def forward(self, start: int, end: int) -> torch.Tensor:
+        """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses, a scalar."""
+        self.upload()
+        hooked = self.hooks["before_forward"] or self.hooks["after_forward"]
+        if self._prepares and (start, end) == (0, len(self._layers) - 1) and not hooked:
+            return self._forward_prepared()
+        with one_thread() if any(self._has_kernels) else nullcontext():
+            loss = walk(self._steps("forward", range(start, end + 1)), {}, self.net.options.exact)
+        return self._no_loss if loss is None else loss
+
+    def _steps(self, which: str, numbers: Iterable[int]) -> Iterator[Step]:
+        """Yield the forward or backward passes of layers through memory, and what hooks do before and after them."""
+        run = self._forward if which == "forward" else self._backward
+        for i in numbers:
+            for hook in self.hooks[f"before_{which}"]:
+                yield Step(i, partial(hook, i), (), ())
+            losses = tuple((j, weight) for j, (_, weight) in enumerate(self._losses[i])) if which == "forward" else ()
+            yield Step(i, partial(run, i), (), (), losses)
+            for hook in self.hooks[f"after_{which}"]:
+                yield Step(i, partial(hook, i), (), ())
+
+    def _can_prepare(self) -> bool:
+        """Return whether a whole pass may run as netspec's own: only its results matter, blob by blob."""
+        return (
+            self.net.prepared is not None
+            and self.net.device.type == "cpu"
+            and not any(self._records)
+            and not any(self._kept)
+            and not any(isinstance(layer, Python) for layer in self._layers)
+            and AUTOMATIC not in self.names
+            and not overwrites_shared(self.net.plan.nodes, self.tops)
+        )
+
+    def _forward_prepared(self) -> torch.Tensor:
+        """Run the whole net as netspec does (netspec/run/prepared.py), and put what it computes where views look."""
+        assert self.net.prepared is not None
+        given = {v: self.blobs[b].data_memory.tensor(self.blobs[b].shape) for v, b in self._given}
+        found = self.net.prepared.run(given, self._final_values)
+        assert found is not None, "a pass of pycaffe records no gradients"
+        loss, values = found
+        taken = storages(list(given.values())) if self._hand_on else set[int]()
+        for v, blob, shares, fresh in self._results:
+            tensor = values[v]
+            if shares:
+                if tensor.shape != blob.shape:
+                    blob.reshape(*tensor.shape)
+                continue
+            blob.put_data(tensor if fresh else apart(tensor, taken))
+            if not fresh:
+                taken |= storages([tensor])
+        return self._no_loss if loss is None else loss
+
+    @torch.no_grad()
+    def backward(self, start: int, end: int) -> None:
+        """Run the backward passes of layers ``start`` down to ``end``, both included, from the diffs of their tops.
+
+        Bottoms' diffs are overwritten, those of learnable blobs added to. Layers that need none are passed over.
+        """
+        self.upload()
+        with one_thread() if any(self._has_kernels) else nullcontext():
+            walk(self._steps("backward", range(start, end - 1, -1)), {}, self.net.options.exact)
+
+    def reshape(self) -> None:
+        """Give every blob the shape that follows from those of the inputs, and compute nothing."""
+        for i in range(len(self._layers)):
+            self._reshape(i)
+
+    def share_with(self, other: Passes) -> None:
+        """Use the learnable blobs of another net (Caffe: ShareTrainedLayersWith); their gradients stay apart."""
+        other.upload()
+        mine = {layer.param.name: layer for layer in reversed(self._layers)}
+        for theirs in other._layers:
+            layer = mine.get(theirs.param.name)
+            if layer is None:
+                log.info("net.cpp:680", f"Ignoring source layer {theirs.param.name}")
+                continue
+            if layer.blob_shapes != theirs.blob_shapes:
+                found = f"blobs {layer.blob_shapes} here, {theirs.blob_shapes} there"
+                raise layer.error(f"cannot share param weights of the other net: {found}")
+            for blob, source in zip(layer.blobs, theirs.blobs, strict=True):
+                blob.data = source.data
+
+    @torch.no_grad()
+    def clear_param_diffs(self) -> None:
+        """Set the gradients of all learnable blobs to 0, where they are."""
+        self.upload()
+        for learnable in self.net.learnable:
+            if learnable.parameter.grad is not None:
+                learnable.parameter.grad.zero_()
+
+    def upload(self) -> None:
+        """Bring to the GPU what scripts wrote to learnable blobs, before anything else reads or writes these."""
+        if self.net.device.type != "cpu":
+            for blobs in self.params:
+                for blob in blobs:
+                    for memory in (blob.data_memory, blob.diff_memory):
+                        if isinstance(memory, BorrowedMemory):
+                            memory.upload()
+
+    def _reshape(self, i: int) -> None:
+        layer = self._layers[i]
+        if layer.is_input or not self.bottoms[i]:
+            return
+        if isinstance(layer, Python):
+            with importable():
+                layer.code.reshape(self.bottoms[i], self.tops[i])
+            return
+        layer.fit([blob.shape for blob in self.bottoms[i]])
+        for top, shape in zip(self.tops[i], layer.top_shapes, strict=True):
+            if top.shape != shape:
+                top.reshape(*shape)
+
+    def _forward(self, i: int) -> tuple[torch.Tensor, ...]:
+        """Run layer ``i``; return its losses as they are in memory."""
+        self._compute(i)
+        return tuple([top.data_memory.tensor(top.shape) for top, _ in self._losses[i]])
+
+    def _compute(self, i: int) -> None:
+        layer, bottoms, tops = self._layers[i], self.bottoms[i], self.tops[i]
+        if layer.is_input:
+            return
+        if isinstance(layer, Python):
+            with importable():
+                layer.code.reshape(bottoms, tops)
+                layer.code.forward(bottoms, tops)
+            return
+        if layer.shares:
+            self._reshape(i)
+            return
+        if self._records[i]:
+            tape = self._tapes[i] = self._record(i)
+            values, made = tape.leaves, tape.made
+        else:
+            values = [blob.data_memory.tensor(blob.shape) for blob in bottoms]
+            made = layer.run(*values)
+        kept = self._kept[i] or [None] * len(made)
+        taken = storages(values or list(layer.blobs))
+        for top, tensor, constant in zip(tops, made, kept, strict=True):
+            if constant is None:
+                top.put_data(apart(tensor.detach(), taken))
+
+    def _record(self, i: int) -> Tape:
+        """Run layer ``i`` by its kernels, or watched by autograd."""
+        if bound := self._kernels(i):
+            forward, backward = bound.kernels
+            values = [blob.data_memory.tensor(blob.shape) for blob in self.bottoms[i]]
+            holders = [blob.data_memory.holder(blob.count) for blob in self.bottoms[i]]
+            made = forward(*values)
+            return Tape(values, holders, (made,) if isinstance(made, torch.Tensor) else made, backward)
+        leaves, holders = [], []
+        for blob, wanted in zip(self.bottoms[i], self.net.backward_plan.bottoms[i], strict=True):
+            memory = blob.data_memory
+            value = memory.tensor(blob.shape)
+            overwritten = memory.is_watched() and self._is_in_place(i, blob)
+            leaves.append((value.clone() if overwritten else value.detach()).requires_grad_(wanted))
+            holders.append(memory.holder(blob.count))
+        with torch.enable_grad():
+            made = self._layers[i].run(*leaves)
+        return Tape(leaves, holders, made, partial(by_autograd, leaves, made))
+
+    def _kernels(self, i: int) -> Bound | None:
+        """Return the kernels of layer ``i`` at its present shapes, None where autograd is to watch it."""
+        layer, bound = self._layers[i], self._bound[i]
+        if not self._has_kernels[i]:
+            return None
+        shapes = [blob.shape for blob in self.bottoms[i]]
+        if bound is None or bound.shapes != shapes or bound.places != places_of(layer):
+            layer.fit(shapes)
+            sums = tuple(gradient_of(blob) if blob.requires_grad else None for blob in layer.blobs)
+            learning = Learning(tuple(self.net.backward_plan.bottoms[i]), sums, steady=False)
+            bound = self._bound[i] = Bound(shapes, places_of(layer), kernels(layer, learning))
+        return bound
+
+    def _tape(self, i: int) -> Tape:
+        """Return the record of the last forward pass of layer ``i``, its bottoms' values as they are now in memory.
+
+        A layer that has not run, or on other shapes, runs for it.
+        """
+        tape, bottoms = self._tapes[i], self.bottoms[i]
+        if tape is None or any(leaf.shape != blob.shape for leaf, blob in zip(tape.leaves, bottoms, strict=True)):
+            return self._record(i)
+        for leaf, holder, blob in zip(tape.leaves, tape.holders, bottoms, strict=True):
+            kept = self._is_in_place(i, blob) or blob.data_memory.holder(blob.count) is holder
+            if not kept:
+                leaf.data.copy_(blob.data_memory.tensor(blob.shape))
+        return tape
+
+    def _is_in_place(self, i: int, blob: Blob) -> bool:
+        """Return whether layer ``i`` writes over one of its bottoms: then it has kept what its gradient needs."""
+        return any(top is blob for top in self.tops[i])
+
+    def _backward(self, i: int) -> None:
+        if not self.net.backward_plan.layers[i]:
+            return
+        layer, bottoms, tops = self._layers[i], self.bottoms[i], self.tops[i]
+        wanted = self.net.backward_plan.bottoms[i]
+        if isinstance(layer, Python):
+            with importable():
+                layer.code.backward(tops, list(wanted), bottoms)
+            return
+        if "diff" in layer.shares:
+            return
+        diffs = [top.diff_memory.tensor(top.shape) for top in tops]
+        if gradient_reads(layer):
+            if wanted[0]:
+                bottom, top = (blob.data_memory.tensor(blob.shape) for blob in (bottoms[0], tops[0]))
+                bottoms[0].diff_memory.put(gradient_from_memory(layer, bottom, top, diffs[0]))
+            return
+        tape = self._tape(i)
+        found = tape.backward(*diffs)
+        if not any(wanted):
+            return
+        taken = storages(diffs)
+        found = (found,) if isinstance(found, torch.Tensor) else found
+        for blob, leaf, diff, asked in zip(bottoms, tape.leaves, found, wanted, strict=True):
+            if asked:
+                blob.diff_memory.put(apart(torch.zeros_like(leaf) if diff is None else diff, taken))

@@ -1,0 +1,238 @@
+"""``caffe.SGDSolver`` and the others.
+
+Caffe: python/caffe/_caffe.cpp, src/caffe/solver.cpp
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any, ClassVar
+
+import torch
+from typing_extensions import override
+
+from netspec import log
+from netspec.compat.pycaffe import mode
+from netspec.compat.pycaffe.debug import debug_info
+from netspec.compat.pycaffe.errors import caffes_errors
+from netspec.compat.pycaffe.net import FilePath, Net
+from netspec.graph.options import BuildOptions
+from netspec.layers.contract.reading import Constant
+from netspec.layers.utility.python import Python
+from netspec.net import net as core
+from netspec.proto.text import parse_solver
+from netspec.solver import solver as core_solver
+from netspec.solver.nets import TRAIN_NET
+from netspec.solver.options import TrainingOptions
+from netspec.solver.update import rule_faults
+
+Outputs = dict[str, torch.Tensor]
+
+
+class _Training(core_solver.Solver):
+    """A training whose passes go through the memory of the nets' blobs, as far as somebody can look at it.
+
+    ``is_watched``: blobs are filled in every iteration, for functions of a script or Python layers may look at them,
+    or a pass reads what a script wrote to them.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
+        self.is_watched = bool(self.net.inputs) or any(
+            isinstance(layer, Python)
+            or (isinstance(layer, Constant) and any(top is not None for top in layer.filled_once()))
+            for layer in self.net.layers
+        )
+
+    @override
+    def build(self, described: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
+        if role == TRAIN_NET and mode.multiprocess():
+            rank, ranks = mode.solver_rank(), mode.solver_count()
+            role = f"rank {rank}" if rank else role
+        return super().build(described, role, device, rank, ranks)
+
+    @override
+    def check_inputs(self) -> None:
+        """Do nothing: a net's inputs are what its input blobs hold."""
+
+    @override
+    def clear_gradients(self) -> None:
+        """Zero the gradients where they are: views of them stay valid."""
+        self.shown[self.net].passes.upload()
+        super().clear_gradients()
+
+    @override
+    def train_pass(self) -> tuple[torch.Tensor, Outputs]:
+        """Run forward and backward; only the last pass of several, and one that somebody watches, fills the blobs."""
+        seen = self.is_watched or self.param.debug_info or not self.to_come
+        if not seen and (passed := self.net.train_pass()):
+            return passed
+        loss, outputs = self.test_pass(self.net)
+        self.shown[self.net].passes.backward(len(self.net.layers) - 1, 0)
+        return loss, outputs
+
+    @override
+    def test_pass(self, net: core.Net) -> tuple[torch.Tensor, Outputs]:
+        shown = self.shown[net]
+        loss = shown.passes.forward(0, len(net.layers) - 1)
+        blobs = {name: shown.blobs[name] for name in shown.outputs}
+        return loss, {name: blob.data_memory.tensor(blob.shape) for name, blob in blobs.items()}
+
+    @override
+    def debugged(self, net: core.Net) -> AbstractContextManager[None]:
+        return debug_info(self.shown[net].passes)
+
+    @override
+    def apply_update(self) -> None:
+        """Move the weights, from the values and gradients that scripts may have written."""
+        self.shown[self.net].passes.upload()
+        super().apply_update()
+
+    @override
+    def test_all(self) -> None:
+        """Test, in the root's process."""
+        if mode.root_solver():
+            super().test_all()
+
+    @override
+    def snapshot(self) -> tuple[str, str]:
+        """Take a snapshot, in the root's process."""
+        self.shown[self.net].passes.upload()
+        return super().snapshot() if mode.root_solver() else ("", "")
+
+
+class Solver:
+    """A training, from a solver's prototxt: ``get_solver(file)``, or ``SGDSolver(file)`` whatever type the file has.
+
+    ``net`` and ``test_nets`` are live: their blobs hold what the last iteration left in them, their parameters' diffs
+    what it subtracted. Raises SpecError (a ValueError) for every fault of the files.
+    """
+
+    type_name: ClassVar[str] = ""
+
+    def __init_subclass__(cls, type_name: str = "") -> None:
+        cls.type_name = type_name or cls.type_name
+
+    def __init__(self, solver_file: FilePath) -> None:
+        solver_file = os.fsdecode(solver_file)
+        param, node = parse_solver(solver_file)
+        if self.type_name:
+            param.type = self.type_name
+        with caffes_errors():
+            build = BuildOptions(seed=mode.solver_seed(), allow_python=True, exact=mode.exact())
+            # nan: as Caffe goes on: a script may look for itself
+            options = TrainingOptions(build, [mode.device()], nan="warn")
+            self._training = _Training(param, node, options)
+        self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
+        self._training.on_start = lambda: self._call(0)
+        self._training.on_gradients = lambda: self._call(1)
+
+    @property
+    def net(self) -> Net:
+        """The training net."""
+        return self._training.shown[self._training.net]
+
+    @property
+    def test_nets(self) -> list[Net]:
+        """The test nets; they share the training net's weights from the first test on."""
+        return [self._training.shown[net] for net in self._training.test_nets]
+
+    @property
+    def iter(self) -> int:
+        """How many updates were done."""
+        return self._training.iteration
+
+    @property
+    def param(self) -> Any:
+        """The settings, a SolverParameter; what is changed there holds from the next iteration on."""
+        return self._training.param
+
+    @property
+    def lr(self) -> float:
+        """The learning rate of the iteration to come."""
+        return self._training.learning_rate
+
+    def solve(self, resume_file: FilePath | None = None) -> None:
+        """Train up to max_iter, from a .solverstate on where one is given."""
+        if resume_file:
+            log.info("solver.cpp:296", f"Restoring previous solver status from {os.fsdecode(resume_file)}")
+            self.restore(resume_file)
+        with caffes_errors():
+            self._training.solve()
+
+    def step(self, iterations: int) -> None:
+        """Train for some iterations."""
+        with caffes_errors():
+            self._training.step(int(iterations))
+
+    def restore(self, state_file: FilePath) -> None:
+        """Go on from a .solverstate, and from its weights."""
+        self.net.passes.upload()
+        self._training.restore(os.fsdecode(state_file))
+
+    def snapshot(self) -> None:
+        """Write the weights and the state, as snapshot_prefix says."""
+        self._training.snapshot()
+
+    def share_weights(self, net: Net) -> None:
+        """Let a net use the training net's weights."""
+        net.share_with(self.net)
+
+    def apply_update(self) -> None:
+        """Move the weights by the gradients that are there, and count an iteration."""
+        self._training.apply_update()
+
+    def add_callback(self, on_start: Any, on_gradients_ready: Callable[[], object] | None = None) -> None:
+        """Call two functions at each iteration: before its passes, and between them and the update.
+
+        An object that has ``on_start`` and ``on_gradients_ready`` may stand for both, as a :class:`NCCL` does.
+        """
+        self._training.is_watched = True
+        whole = on_gradients_ready is None
+        self._callbacks.append(
+            (on_start.on_start, on_start.on_gradients_ready) if whole else (on_start, on_gradients_ready)
+        )
+
+    def _call(self, which: int) -> None:
+        for pair in self._callbacks:
+            pair[which]()
+
+
+class SGDSolver(Solver, type_name="SGD"):
+    """Stochastic gradient descent with momentum."""
+
+
+class NesterovSolver(Solver, type_name="Nesterov"):
+    """Nesterov's accelerated gradient."""
+
+
+class AdaGradSolver(Solver, type_name="AdaGrad"):
+    """AdaGrad."""
+
+
+class RMSPropSolver(Solver, type_name="RMSProp"):
+    """RMSProp."""
+
+
+class AdaDeltaSolver(Solver, type_name="AdaDelta"):
+    """AdaDelta."""
+
+
+class AdamSolver(Solver, type_name="Adam"):
+    """Adam."""
+
+
+_SOLVERS = (SGDSolver, NesterovSolver, AdaGradSolver, RMSPropSolver, AdaDeltaSolver, AdamSolver)
+
+
+def get_solver(solver_file: FilePath) -> Solver:
+    """Return the solver of the type that the file has."""
+    solver_file = os.fsdecode(solver_file)
+    param, node = parse_solver(solver_file)
+    for fault in rule_faults(param, node):
+        raise fault
+    named = {cls.type_name.lower(): cls for cls in _SOLVERS}
+    return named[param.type.lower()](solver_file)

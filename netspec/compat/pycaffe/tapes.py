@@ -1,0 +1,94 @@
+"""What :class:`netspec.pycaffe.passes.Passes` keeps of a layer's run, and where tensors lie."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from netspec.graph.plan import Node
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.training import Kernels
+from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
+
+
+@dataclass(frozen=True)
+class Tape:
+    """One run of a layer: what it read, the tensors that held it, what it returned, and its gradients from the tops'.
+
+    Autograd has watched it, and read copies; or it was run by kernels, which read the tensors themselves.
+    """
+
+    leaves: list[torch.Tensor]
+    holders: list[torch.Tensor]
+    made: Sequence[torch.Tensor]
+    backward: Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The kernels of a layer for bottoms of these shapes, and where its learnable blobs were when they were made."""
+
+    shapes: list[tuple[int, ...]]
+    places: list[Any]
+    kernels: Kernels
+
+
+def by_autograd(
+    leaves: Sequence[torch.Tensor], made: Sequence[torch.Tensor], *diffs: torch.Tensor
+) -> list[torch.Tensor | None]:
+    """Return the gradients of what autograd saw a layer read, from those of what it returned."""
+    ends = [(top, diff) for top, diff in zip(made, diffs, strict=True) if top.requires_grad]
+    if ends:
+        torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends], retain_graph=True)
+    found = [leaf.grad for leaf in leaves]
+    for leaf in leaves:
+        leaf.grad = None
+    return found
+
+
+def places_of(layer: Layer) -> list[Any]:
+    """Return where a layer's learnable blobs and their gradients are."""
+    return [place for blob in layer.blobs for place in (blob.data_ptr(), id(blob.grad), blob.requires_grad)]
+
+
+def storages(tensors: Sequence[torch.Tensor]) -> set[int]:
+    """Return where tensors lie in main memory. (What views show of a GPU's tensors is a copy.)"""
+    return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.device.type == "cpu"}
+
+
+def apart(tensor: torch.Tensor, taken: set[int]) -> torch.Tensor:
+    """Return a tensor, or a copy of one that lies where others do."""
+    aliased = tensor.device.type == "cpu" and tensor.untyped_storage().data_ptr() in taken
+    return tensor.clone() if aliased else tensor
+
+
+def parameters(layer: Layer) -> BlobVec:
+    """Return a layer's learnable blobs, as views of its parameters and of their gradients."""
+    made = BlobVec()
+    for j, shape in enumerate(layer.blob_shapes):
+        count = layer.blobs[j].numel()
+        data = BorrowedMemory(lambda j=j: layer.blobs[j], count)
+        made.append(Blob(shape, data, BorrowedMemory(lambda j=j: gradient_of(layer.blobs[j]), count)))
+    return made
+
+
+def gradient_of(parameter: torch.Tensor) -> torch.Tensor:
+    """Return where a parameter's gradient is summed up; passes add to it and never replace it."""
+    if parameter.grad is None:
+        parameter.grad = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
+    return parameter.grad
+
+
+def overwrites_shared(nodes: Sequence[Node], tops: Sequence[Sequence[Blob]]) -> bool:
+    """Return whether a layer works in place on memory that is already another blob's too."""
+    sharing: dict[int, set[int]] = {}
+    for node, blobs in zip(nodes, tops, strict=True):
+        for top, in_place in zip(blobs, node.in_place, strict=False):
+            users = sharing.setdefault(id(top.data_memory), set())
+            users.add(id(top))
+            if in_place and len(users) > 1:
+                return True
+    return False

@@ -1,0 +1,356 @@
+"""What NumPy, SciPy, scikit-image, lmdb and Python itself have dropped since old scripts were written, given back.
+
+Only a program that `netspec run` runs gets them: each module gets its names when it is imported, and only those that it
+has not.
+"""
+
+from __future__ import annotations
+
+import collections
+import collections.abc
+import importlib
+import importlib.abc
+import importlib.util
+import inspect
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from importlib.machinery import ModuleSpec, PathFinder
+from types import ModuleType
+from typing import Any
+
+from netspec.terminal.commands import VARIABLE
+
+
+def install(also: Mapping[str, Callable[[Any], None]], quiet: bool = False) -> None:
+    """Give the names to modules that are imported already, and to others when they are imported.
+
+    ``also`` are functions for further modules, which are called with the module. Unless ``quiet``, a NumPy that is too
+    new for old programs gets one warning, in this process and none that it forks.
+    """
+    _PATCHES.update(also)
+    if not quiet and os.environ.get(VARIABLE, "0") in ("", "0", "1"):
+        process = os.getpid()
+
+        def numpy_with_a_warning(np: Any) -> None:
+            _numpy(np)
+            if os.getpid() == process:
+                _warn_if_too_new(np)
+
+        _PATCHES["numpy"] = numpy_with_a_warning
+    for name, value in (("clock", time.perf_counter),):
+        _give(time, name, value)
+    for name in collections.abc.__all__:
+        _give(collections, name, getattr(collections.abc, name))
+    _give(inspect, "getargspec", lambda function: inspect.getfullargspec(function)[:4])
+    for name, patch in _PATCHES.items():
+        if name in sys.modules:
+            patch(sys.modules[name])
+    sys.meta_path.insert(0, _Finder())
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Finds the modules to patch where Python does; scipy.misc also where SciPy has it no longer."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
+        if fullname not in _PATCHES:
+            return None
+        spec = PathFinder.find_spec(fullname, path)
+        if spec is not None and spec.loader is not None:
+            spec.loader = _Patched(spec.loader)
+            return spec
+        return ModuleSpec(fullname, _Patched(None)) if fullname == "scipy.misc" else None
+
+
+class _Patched(importlib.abc.Loader):
+    """A module's own loader, and a patch after it."""
+
+    def __init__(self, own: Any) -> None:
+        self.own = own
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        return self.own.create_module(spec) if self.own else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        if self.own:
+            self.own.exec_module(module)
+        _PATCHES[module.__name__](module)
+
+    def __getattr__(self, name: str) -> Any:  # get_source and others
+        if name == "own":
+            raise AttributeError(name)
+        return getattr(self.own, name)
+
+
+def _give(module: Any, name: str, value: Any) -> None:
+    if name not in vars(module):
+        setattr(module, name, value)
+
+
+# ---- NumPy ----
+
+
+def _numpy(np: Any) -> None:
+    for name, value in (("bool", bool), ("int", int), ("float", float), ("complex", complex), ("object", object)):
+        _give(np, name, value)
+    for name, value in (("str", str), ("unicode", str), ("long", int)):
+        _give(np, name, value)
+    renamed = {
+        **{"float_": "float64", "complex_": "complex128", "string_": "bytes_", "unicode_": "str_"},
+        **{"Inf": "inf", "Infinity": "inf", "infty": "inf", "PINF": "inf", "NaN": "nan", "NAN": "nan"},
+        **{"product": "prod", "cumproduct": "cumprod", "sometrue": "any", "alltrue": "all", "row_stack": "vstack"},
+        **{"round_": "round", "rank": "ndim", "trapz": "trapezoid", "in1d": "isin"},
+    }
+    for old, new in renamed.items():
+        if hasattr(np, new):
+            _give(np, old, getattr(np, new))
+    _give(np, "NINF", -np.inf)
+    _give(np, "asscalar", lambda a: a.item())
+    _give(np, "asfarray", lambda a, dtype=np.float64: np.asarray(a, dtype))
+    _give(np, "typeDict", getattr(np, "sctypeDict", {}))
+    _give(np, "msort", lambda a: np.sort(a, axis=0))
+    np.fromstring = _fromstring(np)
+    _let_threshold_be_nan(np)
+
+
+_TOO_NEW = "NumPy {} takes no array of one element for a number, as old programs expect: pip install 'numpy<2.4'"
+
+
+def _is_too_new(np: Any) -> bool:
+    return tuple(map(int, np.__version__.split(".")[:2])) >= (2, 4)
+
+
+def _warn_if_too_new(np: Any) -> None:
+    if _is_too_new(np):
+        print(f"netspec run: warning: {_TOO_NEW.format(np.__version__)}", file=sys.stderr)
+
+
+def remedy(fault: BaseException) -> str:
+    """Return what to do about a fault that an old program meets and a new one would not; or an empty string."""
+    text = str(fault)
+    np = sys.modules.get("numpy")
+    one_element = "only 0-dimensional arrays can be converted", "setting an array element with a sequence"
+    if np and _is_too_new(np) and text.startswith(one_element):
+        return _TOO_NEW.format(np.__version__)
+    if unknown := re.search(r'has no (?:field named )?"(\w+)"', text):
+        registry, files = (importlib.import_module(f"netspec.proto.dialect.{name}") for name in ("registry", "files"))
+        files.announce_known()
+        named = {d.name for d in registry.known() if any(unknown[1] == field for _, field in d.fields())}
+        return registry.advice_for(unknown[1], tuple(sorted(named)))
+    caffe = sys.modules.get("netspec.compat.pycaffe")
+    if isinstance(fault, FileNotFoundError) and caffe and isinstance(fault.filename, str):
+        beside = os.path.relpath(fault.filename, os.path.dirname(str(caffe.__file__)))
+        if not beside.startswith(os.pardir):
+            return f"this is python/caffe/{beside} of Caffe's sources: put a copy at {fault.filename}"
+    return ""
+
+
+def _let_threshold_be_nan(np: Any) -> None:
+    """Let set_printoptions(threshold="nan") mean that arrays are printed whole."""
+    new = np.set_printoptions
+
+    def set_printoptions(precision: Any = None, threshold: Any = None, *arguments: Any, **named: Any) -> None:
+        whole = threshold == "nan" or threshold != threshold
+        new(precision, sys.maxsize if whole else threshold, *arguments, **named)
+
+    np.set_printoptions = set_printoptions
+
+
+def _fromstring(np: Any) -> Callable[..., Any]:
+    text = np.fromstring
+
+    def fromstring(string: Any, dtype: Any = float, count: int = -1, *, sep: str = "", **named: Any) -> Any:
+        if sep:
+            return text(string, dtype, count, sep=sep, **named)
+        data = string.encode("latin-1") if isinstance(string, str) else string
+        return np.frombuffer(data, dtype, count).copy()
+
+    return fromstring
+
+
+def _numpy_random(random: Any) -> None:
+    _give(random, "random_integers", lambda low, high=None, size=None: _integers(random, low, high, size))
+
+
+def _integers(random: Any, low: int, high: int | None, size: Any) -> Any:
+    low, high = (1, low) if high is None else (low, high)
+    return random.randint(low, high + 1, size)
+
+
+# ---- SciPy ----
+
+
+def _scipy_misc(misc: Any) -> None:
+    for name, value in (("imread", imread), ("imsave", imsave), ("imresize", imresize), ("toimage", toimage)):
+        _give(misc, name, value)
+    _give(misc, "bytescale", bytescale)
+    _give(misc, "fromimage", lambda image, flatten=False, mode=None: _as_array(image, flatten, mode))
+    special = importlib.import_module("scipy.special")
+    for name in ("comb", "factorial", "logsumexp"):
+        _give(misc, name, getattr(special, name))
+
+
+def imread(name: Any, flatten: bool = False, mode: str | None = None) -> Any:
+    """Return an image file as an array, (H, W) or (H, W, 3 or 4) uint8; with ``flatten`` as gray float32."""
+    from PIL import Image
+
+    with Image.open(name) as image:
+        return _as_array(image, flatten, mode)
+
+
+def imsave(name: Any, arr: Any, format: str | None = None) -> None:
+    """Write an array as an image; other types than uint8 are scaled from their least and greatest value to 0..255."""
+    toimage(arr).save(name, format)
+
+
+def imresize(arr: Any, size: Any, interp: str = "bilinear", mode: str | None = None) -> Any:
+    """Return an image in another size: per cent (int), a factor (float), or (height, width); always uint8."""
+    import numpy as np
+    from PIL import Image
+
+    image = toimage(arr, mode=mode)
+    if isinstance(size, (int, np.integer)):
+        new = tuple(int(extent * (size / 100.0)) for extent in image.size)
+    elif isinstance(size, (float, np.floating)):
+        new = tuple((np.array(image.size) * size).astype(int))
+    else:
+        new = int(size[1]), int(size[0])
+    return np.array(image.resize(new, getattr(Image.Resampling, {"cubic": "bicubic"}.get(interp, interp).upper())))
+
+
+def toimage(arr: Any, high: int = 255, low: int = 0, cmin: Any = None, cmax: Any = None, mode: Any = None) -> Any:
+    """Return an array (H, W), (H, W, 3), (H, W, 4) or with channels first as an image of PIL."""
+    import numpy as np
+    from PIL import Image
+
+    values = np.asarray(arr)
+    if mode == "F":
+        return Image.fromarray(values.astype(np.float32))
+    if values.ndim == 3 and values.shape[2] not in (3, 4) and values.shape[0] in (3, 4):
+        values = values.transpose(1, 2, 0)
+    image = Image.fromarray(bytescale(values, cmin, cmax, high, low))
+    return image.convert(mode) if mode else image
+
+
+def bytescale(data: Any, cmin: Any = None, cmax: Any = None, high: int = 255, low: int = 0) -> Any:
+    """Return uint8: as it is, or scaled from ``cmin``..``cmax`` (the least and greatest value) to ``low``..``high``."""
+    import numpy as np
+
+    values = np.asarray(data)
+    if values.dtype == np.uint8:
+        return values
+    least = values.min() if cmin is None else cmin
+    span = (values.max() if cmax is None else cmax) - least
+    scaled = (values - least) * ((high - low) / (span or 1)) + low
+    return (np.clip(scaled, low, high) + 0.5).astype(np.uint8)
+
+
+def _as_array(image: Any, flatten: bool, mode: str | None) -> Any:
+    import numpy as np
+
+    if mode:
+        image = image.convert(mode)
+    elif image.mode == "P":
+        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+    elif image.mode == "1":
+        image = image.convert("L")
+    return np.array(image.convert("F")) if flatten else np.array(image)
+
+
+# ---- scikit-image ----
+
+
+def _skimage_io(io: Any) -> None:
+    new = io.imread
+    if "as_grey" in inspect.signature(new).parameters:
+        return
+
+    def imread(fname: Any, as_gray: bool = False, *arguments: Any, as_grey: bool = False, **named: Any) -> Any:
+        return new(fname, as_gray or as_grey, *arguments, **named)
+
+    io.imread = imread
+
+
+def _skimage_color(color: Any) -> None:
+    for old, new in (("rgb2grey", "rgb2gray"), ("grey2rgb", "gray2rgb"), ("gray2rgb", "gray2rgb")):
+        _give(color, old, getattr(color, new))
+
+
+# ---- lmdb ----
+
+
+def _lmdb(lmdb: Any) -> None:
+    """Let keys be text, as they were in Python 2; only bytes are taken today."""
+    whole, transaction = lmdb.open, lmdb.Transaction
+
+    def open(*arguments: Any, **named: Any) -> _Environment:
+        return _Environment(whole(*arguments, **named))
+
+    def begin(env: Any, *arguments: Any, **named: Any) -> _Transaction:
+        return _Transaction(transaction(getattr(env, "real", env), *arguments, **named))
+
+    lmdb.open, lmdb.Environment, lmdb.Transaction = open, open, begin
+
+
+class _Proxy:
+    """Hands everything on to an object of lmdb, whose classes cannot be derived from."""
+
+    def __init__(self, real: Any) -> None:
+        self.real = real
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.real, name)
+
+    def __enter__(self) -> Any:
+        self.real.__enter__()
+        return self
+
+    def __exit__(self, *fault: Any) -> Any:
+        return self.real.__exit__(*fault)
+
+
+class _Environment(_Proxy):
+    def begin(self, *arguments: Any, **named: Any) -> _Transaction:
+        return _Transaction(self.real.begin(*arguments, **named))
+
+
+class _Transaction(_Proxy):
+    def put(self, key: Any, value: Any, *arguments: Any, **named: Any) -> bool:
+        return self.real.put(_bytes(key), _bytes(value), *arguments, **named)
+
+    def get(self, key: Any, *arguments: Any, **named: Any) -> Any:
+        return self.real.get(_bytes(key), *arguments, **named)
+
+    def delete(self, key: Any, *arguments: Any, **named: Any) -> bool:
+        return self.real.delete(_bytes(key), *arguments, **named)
+
+
+def _bytes(text: Any) -> Any:
+    return text.encode() if isinstance(text, str) else text
+
+
+# ---- Python ----
+
+
+def _unittest_case(case: Any) -> None:
+    renamed = {
+        **{"assertEquals": "assertEqual", "assertNotEquals": "assertNotEqual", "assert_": "assertTrue"},
+        **{"assertAlmostEquals": "assertAlmostEqual", "assertRaisesRegexp": "assertRaisesRegex"},
+        **{"assertRegexpMatches": "assertRegex", "assertItemsEqual": "assertCountEqual"},
+    }
+    for old, new in renamed.items():
+        _give(case.TestCase, old, getattr(case.TestCase, new))
+
+
+_PATCHES: dict[str, Callable[[Any], None]] = {
+    "numpy": _numpy,
+    "numpy.random": _numpy_random,
+    "scipy.misc": _scipy_misc,
+    "scipy.ndimage": lambda ndimage: _give(ndimage, "imread", imread),
+    "skimage.io": _skimage_io,
+    "skimage.color": _skimage_color,
+    "lmdb": _lmdb,
+    "unittest.case": _unittest_case,
+}

@@ -1,0 +1,113 @@
+"""Runs a script, or a module, as Python itself does, with netspec's ``caffe`` at hand."""
+
+from __future__ import annotations
+
+import builtins
+import importlib.util
+import linecache
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType, TracebackType
+from typing import NoReturn
+
+from netspec.compat.scripts import old_names, sources, workers
+from netspec.errors import SpecError
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to run: in the place of a real Caffe, as Python 2 in any case."""
+
+    shadow: bool = False
+    python2: bool = False
+
+
+def run_script(path: str, arguments: Sequence[str], options: Options) -> NoReturn:
+    """Run a script. Ends as the script does, with its exit status and its traceback.
+
+    Raises SpecError where the file cannot be read.
+    """
+    data = sources.bytes_of(path)
+    reader = _prepare(os.path.dirname(os.path.realpath(path)), options)
+    sys.argv = [path, *arguments]
+    path = os.path.abspath(path)
+    main = ModuleType("__main__")
+    main.__dict__.update(__file__=path, __cached__=None, __builtins__=builtins)
+    _execute(data, main, path, reader)
+
+
+def run_module(name: str, arguments: Sequence[str], options: Options) -> NoReturn:
+    """Run a module as ``python -m`` does; of a package, its ``__main__``. Ends as :func:`run_script` does.
+
+    Raises SpecError where there is no such module.
+    """
+    reader = _prepare(os.getcwd(), options)
+    sys.argv = ["-m", *arguments]
+    try:
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.submodule_search_locations is not None:
+            spec = importlib.util.find_spec(f"{name}.__main__")
+    except ImportError as fault:
+        raise SpecError(f"-m {name}: {fault}") from None
+    if spec is None or spec.origin is None:
+        raise SpecError(f"-m {name}: there is no module of that name that can be run")
+    path = spec.origin
+    sys.argv[0] = path
+    main = ModuleType("__main__")
+    main.__dict__.update(__file__=path, __cached__=None, __builtins__=builtins, __spec__=spec, __package__=spec.parent)
+    _execute(Path(path).read_bytes(), main, path, reader)
+
+
+def _prepare(folder: str, options: Options) -> sources.Reader:
+    # The folder of the console script makes room; ``python -m netspec`` has already taken its own away.
+    of_program = [os.path.dirname(os.path.abspath(sys.argv[0]))]
+    sys.path[: int(sys.path[:1] == of_program)] = [folder]
+    reader = sources.Reader(folder, options.python2)
+    workers.prepare(reader, options.shadow)
+    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+        if callable(signal.getsignal(number)):  # netspec's own; a program's workers are ended by SIGTERM
+            signal.signal(number, usual)
+    return reader
+
+
+def _execute(data: bytes, main: ModuleType, path: str, reader: sources.Reader) -> NoReturn:
+    """Run a file's bytes as ``__main__``, and end."""
+    sys.modules["__main__"] = main
+    status = 0
+    try:
+        code = reader.main_code(data, path)
+    except SyntaxError as fault:
+        _show(fault, None)
+        raise SystemExit(1) from None
+    try:
+        exec(code, main.__dict__)
+    except SystemExit:
+        raise
+    except BaseException as fault:
+        _show(fault, _from(fault.__traceback__, path))
+        status = 130 if isinstance(fault, KeyboardInterrupt) else 1
+    raise SystemExit(status)
+
+
+def _from(trace: TracebackType | None, path: str) -> TracebackType | None:
+    """Return the part of a traceback that begins in the script; None where it does not get there."""
+    while trace is not None and trace.tb_frame.f_code.co_filename != path:
+        trace = trace.tb_next
+    return trace
+
+
+def _show(fault: BaseException, trace: TracebackType | None) -> None:
+    """Print a traceback as Python does, or as the script wants it."""
+    fault = fault.with_traceback(trace)
+    if sys.excepthook is not sys.__excepthook__:
+        sys.excepthook(type(fault), fault, trace)
+    else:
+        linecache.checkcache()
+        traceback.print_exception(type(fault), fault, trace)
+    if remedy := old_names.remedy(fault):
+        print(f"netspec run: {remedy}", file=sys.stderr)

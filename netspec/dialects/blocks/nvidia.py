@@ -1,0 +1,80 @@
+"""NVIDIA Caffe: a BatchNorm that also has the slopes and biases of a Scale."""
+
+from __future__ import annotations
+
+import torch
+
+from netspec.layers import normalization, register
+from netspec.layers.contract.folding import Affine, blob_in_double
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.proto.schema import has, value
+
+DECLARATIONS = """
+extend BatchNormParameter {
+  optional FillerParameter scale_filler = 5;
+  optional FillerParameter bias_filler = 6;
+  optional bool scale_bias = 7 [default = false];
+}
+"""
+
+GROUP = "batch_norm_param"
+SLOPES, BIASES = 3, 4
+
+
+@register(
+    "BatchNorm",
+    GROUP,
+    *(f"{GROUP}.{name}" for name in ("scale_filler", "bias_filler", "scale_bias")),
+    replaces=normalization.BatchNorm,
+)
+class BatchNorm(normalization.BatchNorm):
+    """Caffe's BatchNorm; with scale_bias its top is multiplied by learned slopes, and learned biases are added.
+
+    bottom[0]  (N, C) or (N, C, ...)
+    top[0]     the same shape
+    blobs[0]   sum of means     (C,)
+    blobs[1]   sum of variances (C,)
+    blobs[2]   sum of weights   (1,)                                   what the others are to be divided by
+    blobs[3]   slopes (C,), 1 unless scale_filler is given             only with scale_bias
+    blobs[4]   biases (C,), 0 unless bias_filler is given              only with scale_bias
+    Fork: NVIDIA/caffe, src/caffe/layers/batch_norm_layer.cpp
+    """
+
+    default_param_lr = 1.0
+    not_learned = frozenset(range(SLOPES))
+
+    def setup(self) -> None:
+        super().setup()
+        param = self.param.batch_norm_param
+        self.scales: bool = value(param, "scale_bias")
+        for name, start in (("scale_filler", 1.0), ("bias_filler", 0.0)) if self.scales else ():
+            self.add_blob((self.channels,), value(param, name) if has(param, name) else None, value=start)
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        top = super().forward(data)
+        if not self.scales:
+            return top
+        slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (SLOPES, BIASES))
+        return top * slope + bias
+
+    def as_affine(self) -> Affine | None:
+        affine = super().as_affine()
+        if affine is None or not self.scales:
+            return affine
+        slope, bias = (blob_in_double(self, i) for i in (SLOPES, BIASES))
+        return affine[0] * slope, affine[1] * slope + bias
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        top = super().to_onnx(graph, *bottoms)
+        if not self.scales:
+            return top
+        shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
+        return graph.node("Add", graph.node("Mul", top, graph.blob(SLOPES, shape)), graph.blob(BIASES, shape))
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        top = super().to_torch(code, *bottoms)
+        if not self.scales:
+            return top
+        shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
+        slope, bias = code.parameter(SLOPES, shape, "slope"), code.parameter(BIASES, shape, "bias")
+        return code.call("{x} * {slope} + {bias}", x=top, slope=slope, bias=bias)

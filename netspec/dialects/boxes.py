@@ -1,0 +1,259 @@
+"""Boxes as SSD's layers handle them: what overlaps, what is encoded, matched and suppressed.
+
+A box is (xmin, ymin, xmax, ymax) in parts of the image, so 0 to 1 within it. Arrays are float32, as the fork's boxes.
+Fork: weiliu89/caffe (ssd), src/caffe/util/bbox_util.cpp
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.targets import OnnxGraph
+
+Array = np.ndarray
+
+CORNER, CENTER_SIZE, CORNER_SIZE = 1, 2, 3  # ssd.py: enum PriorBoxParameter.CodeType
+NO_MATCH, LEFT_OUT = -1, -2  # instead of the index of a matched box
+LEAST_OVERLAP = 1e-6  # less is none
+LEAST_SIZE = 1e-5  # smaller boxes do not take part in suppress_all
+
+
+def as_array(tensor: torch.Tensor) -> Array:
+    """Return the values of a tensor."""
+    return tensor.detach().cpu().float().numpy()
+
+
+def check_predictions(layer: Layer, bottom_shapes: Sequence[Shape], kinds: int, classes: int) -> int:
+    """Return how many priors there are; refuse boxes of so many kinds, or confidences, that do not suit them.
+
+    The bottoms are boxes, confidences and priors.
+    """
+    loc, conf, prior = bottom_shapes[:3]
+    if prior[:2] != (1, 2) or math.prod(prior) % 8:
+        raise layer.error(f"found priors of shape {prior}, expected (1, 2, 4 P)", "bottom", 2)
+    priors = math.prod(prior) // 8
+    for i, (shape, each, what) in enumerate(((loc, 4 * kinds, "numbers of boxes"), (conf, classes, "confidences"))):
+        if math.prod(shape[1:]) != priors * each or shape[:1] != loc[:1]:
+            message = f"found {what} of shape {shape}, expected ({loc[0]}, {priors * each}) for {priors} priors"
+            raise layer.error(message, "bottom", i)
+    return priors
+
+
+# Nets that were not trained predict boxes without bounds: areas are infinite, overlaps not a number, as in C++.
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def sizes(boxes: Array) -> Array:
+    """Return the areas of boxes (..., 4): (...); 0 where a box is turned inside out."""
+    width, height = boxes[..., 2] - boxes[..., 0], boxes[..., 3] - boxes[..., 1]
+    return np.where((width < 0) | (height < 0), np.float32(0), width * height)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def shared(first: Array, second: Array) -> Array:
+    """Return the areas that each pair of boxes (..., 4), broadcast against each other, has in common."""
+    low = np.maximum(first[..., :2], second[..., :2])
+    high = np.minimum(first[..., 2:], second[..., 2:])
+    width, height = high[..., 0] - low[..., 0], high[..., 1] - low[..., 1]
+    return np.where((width > 0) & (height > 0), width * height, np.float32(0))
+
+
+@np.errstate(invalid="ignore")
+def overlaps(first: Array, second: Array) -> Array:
+    """Return intersection over union of each pair of boxes (..., 4), broadcast against each other."""
+    common = shared(first, second)
+    union = sizes(first) + sizes(second) - common
+    return np.divide(common, union, out=np.zeros_like(common), where=common > 0)
+
+
+def coverage(first: Array, second: Array) -> Array:
+    """Return which part of the first box of each pair (..., 4) lies in the second."""
+    common = shared(first, second)
+    area = np.broadcast_to(sizes(first), common.shape)
+    return np.divide(common, area, out=np.zeros_like(common), where=common > 0)
+
+
+def encode(boxes: Array, priors: Array, variances: Array | None, code: int) -> Array:
+    """Return boxes (n, 4) relative to their priors (n, 4), divided by the variances (n, 4) unless None."""
+    (low, high), (extent, center) = _corners(priors), _centers(priors)
+    box_low, box_high = _corners(boxes)
+    if code == CENTER_SIZE:
+        box_extent, box_center = _centers(boxes)
+        codes = np.concatenate([(box_center - center) / extent, np.log(box_extent / extent)], axis=1)
+    else:
+        scale = extent if code == CORNER_SIZE else np.float32(1)
+        codes = np.concatenate([(box_low - low) / scale, (box_high - high) / scale], axis=1)
+    return codes if variances is None else codes / variances
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def decode(codes: Array, priors: Array, variances: Array | None, code: int) -> Array:
+    """Return the boxes (n, 4) of which :func:`encode` makes ``codes``."""
+    (low, high), (extent, center) = _corners(priors), _centers(priors)
+    if variances is not None:
+        codes = codes * variances
+    first, second = _corners(codes)
+    if code == CENTER_SIZE:
+        return around(first * extent + center, np.exp(second) * extent)
+    scale = extent if code == CORNER_SIZE else np.float32(1)
+    return np.concatenate([low + first * scale, high + second * scale], axis=1)
+
+
+def _corners(boxes: Array) -> tuple[Array, Array]:
+    return boxes[:, :2], boxes[:, 2:]
+
+
+def _centers(boxes: Array) -> tuple[Array, Array]:
+    low, high = _corners(boxes)
+    return high - low, (low + high) / np.float32(2)
+
+
+def around(centers: Array, extents: Array) -> Array:
+    """Return the boxes (..., 4) of these sizes (..., 2) around these points (..., 2)."""
+    half = extents / np.float32(2)
+    return np.concatenate([centers - half, centers + half], axis=-1)
+
+
+def sigmoid(x: Array) -> Array:
+    """Return 1 / (1 + exp(-x))."""
+    return 1 / (1 + np.exp(-x))
+
+
+def outside(boxes: Array) -> Array:
+    """Return which coordinates of boxes (..., 4) lie outside the image."""
+    return (boxes < 0) | (boxes > 1)
+
+
+def match(boxes: Array, truth: Array, threshold: float | None, leave_out: Array) -> tuple[Array, Array]:
+    """Match boxes (p, 4) with true ones (g, 4): the index of the true box, or NO_MATCH or LEFT_OUT; largest overlaps.
+
+    First the pairs of the largest overlap, each box and each true box once; then, with a threshold, every box left
+    that overlaps one by at least that, with the one it overlaps most. ``leave_out`` (p,) says which boxes take no part.
+    """
+    found = np.where(leave_out, LEFT_OUT, NO_MATCH)
+    table = overlaps(boxes[:, None], truth[None])
+    table = np.where((table > LEAST_OVERLAP) & ~leave_out[:, None], table, np.float32(0))
+    best = table.max(axis=1, initial=0)
+    free = table.copy()
+    for _ in range(len(truth)):
+        box, true = np.unravel_index(free.argmax(), free.shape)
+        if free[box, true] == 0:
+            break
+        found[box] = true
+        free[box], free[:, true] = 0, 0
+    if threshold is not None and len(truth):
+        extra = (found == NO_MATCH) & (best >= threshold) & (best > 0)
+        found[extra] = table[extra].argmax(axis=1)
+    return found, best
+
+
+def suppress(boxes: Array, threshold: float, eta: float = 1.0) -> list[int]:
+    """Return which boxes (n, 4), in this order, overlap none kept before by more than the threshold.
+
+    Where ``eta`` is below 1, the threshold is multiplied by it after each box kept, as long as it is above 0.5.
+    """
+    limit = np.float32(threshold)
+    kept: list[int] = []
+    most = np.zeros(len(boxes), np.float32)
+    for i in range(len(boxes)):
+        if most[i] > limit:
+            continue
+        kept.append(i)
+        most = np.maximum(most, overlaps(boxes[i], boxes))
+        if eta < 1 and limit > 0.5:
+            limit *= np.float32(eta)
+    return kept
+
+
+def highest(scores: Array, count: int) -> Array:
+    """Return the indices of the ``count`` highest of scores (n,), in the order in which the fork has them.
+
+    It sorts with libstdc++'s std::sort, which is not stable: which of equal scores come first follows from its
+    partitions. They are repeated where equal scores stand among the highest, or at the cut.
+    """
+    order = np.argsort(-scores, kind="stable")
+    top = scores[order[: count + 1]]
+    if (top[1:] == top[:-1]).any() and not np.isnan(scores).any():
+        order = np.array(_introsorted((-scores).tolist()))
+    return order[:count]
+
+
+def _introsorted(keys: list[float]) -> list[int]:
+    """Return the order of keys that introsort gives, ascending.
+
+    Ranges of more than 16 are partitioned around the median of three; insertion, which is stable, does the rest. The
+    heap sort that follows on 2 log2(n) bad partitions in a row is left out.
+    """
+    order, ranges = list(range(len(keys))), [(0, len(keys))]
+    while ranges:
+        first, last = ranges.pop()
+        while last - first > 16:
+            cut = _partition(keys, order, first, last)
+            ranges.append((cut, last))
+            last = cut
+    return sorted(order, key=keys.__getitem__)
+
+
+def _partition(keys: list[float], order: list[int], first: int, last: int) -> int:
+    """Move what is less than the median of three to the front of a range; return where the rest begins."""
+    middle = first + (last - first) // 2
+    # Which of equal keys is the median decides, as in std::__move_median_to_first.
+    a, b, c = first + 1, middle, last - 1
+    ka, kb, kc = keys[order[a]], keys[order[b]], keys[order[c]]
+    if ka < kb:
+        median = b if kb < kc else c if ka < kc else a
+    else:
+        median = a if ka < kc else c if kb < kc else b
+    order[first], order[median] = order[median], order[first]
+    pivot, low, high = keys[order[first]], first + 1, last
+    while True:
+        while keys[order[low]] < pivot:
+            low += 1
+        high -= 1
+        while pivot < keys[order[high]]:
+            high -= 1
+        if low >= high:
+            return low
+        order[low], order[high] = order[high], order[low]
+        low += 1
+
+
+def suppress_all(boxes: Array, scores: Array, threshold: float, top_k: int) -> Array:
+    """Return the indices of the boxes that :func:`suppress` keeps among the ``top_k`` (-1: all) of highest score."""
+    order = np.argsort(-scores, kind="stable")
+    order = order[: top_k if top_k > -1 else None]
+    order = order[sizes(boxes[order]) >= LEAST_SIZE]
+    return order[suppress(boxes[order], threshold)]
+
+
+def detections(rows: Sequence[Array], like: torch.Tensor) -> torch.Tensor:
+    """Return the detections (d, 7) of all images as a top (1, 1, D, 7); of none at all a row (image, -1, ...) each."""
+    found = np.concatenate(rows)
+    if not len(found):
+        found = np.full((len(rows), 7), -1, np.float32)
+        found[:, 0] = np.arange(len(rows))
+    return torch.from_numpy(found[None, None]).to(like)
+
+
+def onnx_decode(graph: OnnxGraph, codes: str, priors: str, variances: str | None, code: int) -> str:
+    """Write what :func:`decode` computes, for codes (..., P, 4) and priors and variances (1, P, 4)."""
+    halves = graph.constant([2, 2])
+    low, high = graph.nodes("Split", priors, halves, outputs=2, axis=-1)
+    extent = graph.node("Sub", high, low)
+    if variances is not None:
+        codes = graph.node("Mul", codes, variances)
+    first, second = graph.nodes("Split", codes, halves, outputs=2, axis=-1)
+    if code == CENTER_SIZE:
+        half = graph.constant(0.5)
+        middle = graph.node("Mul", graph.node("Add", low, high), half)
+        center = graph.node("Add", graph.node("Mul", first, extent), middle)
+        reach = graph.node("Mul", graph.node("Mul", graph.node("Exp", second), extent), half)
+        return graph.node("Concat", graph.node("Sub", center, reach), graph.node("Add", center, reach), axis=-1)
+    if code == CORNER_SIZE:
+        first, second = graph.node("Mul", first, extent), graph.node("Mul", second, extent)
+    return graph.node("Concat", graph.node("Add", low, first), graph.node("Add", high, second), axis=-1)

@@ -1,0 +1,269 @@
+"""Faster R-CNN's layers that py-faster-rcnn has as Python code: images, proposals, and what both heads learn.
+
+A Python layer of these modules and classes runs here without running anybody's code. What the code reads from its
+configuration has the values of experiments/cfgs/faster_rcnn_end2end.yml. A box is (x1, y1, x2, y2) in pixels, both
+corners included. Random choices are the net's, not numpy's.
+Fork: rbgirshick/py-faster-rcnn, lib/rpn, lib/roi_data_layer
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from netspec.data.images import read_image
+from netspec.dialects.boxes import Array, as_array
+from netspec.dialects.rcnn.proposals import all_anchors, base_anchors
+from netspec.files.opencv import cv2
+from netspec.layers.contract.base import Layer, Shape
+
+RATIOS, SCALES = (0.5, 1, 2), (8, 16, 32)
+ANCHORS, OBJECTS = 256, 0.5  # a minibatch of the region proposals: its size, and the most that are objects
+OBJECT, BACKGROUND = 0.7, 0.3  # an anchor of at least, and of less than this overlap
+REGIONS, FOREGROUND = 128, 0.25  # a minibatch of the classifier: its size, and the most that are objects
+OVERLAP = 0.5  # a region of at least this overlap is an object
+DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)  # the classifier's targets are divided by them
+SHORTEST, LONGEST = 600, 1000  # sides to which images are scaled
+MEANS = np.array([102.9801, 115.9465, 122.7717], np.float32)  # blue, green, red
+
+
+_SETTING = r"""(\w+)['"]?\s*:\s*(?:[^\s\[(]*\s*[\[(]([^\])]*)[\])]|([-+.\w]+))"""  # a name; a list or a number
+
+
+def settings(layer: Layer, **least: int | None) -> dict[str, Any]:
+    """Return the numbers and lists of numbers of ``param_str``, a line of YAML each: ``'feat_stride': 16``.
+
+    ``least`` names the integers that must be given, with the least value, None for those that may be missing.
+    """
+    text = layer.param.python_param.param_str
+    found: dict[str, Any] = {}
+    for name, listed, single in re.findall(_SETTING, text):
+        numbers = [float(word) for word in re.findall(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?", listed or single)]
+        found[name] = numbers if listed else numbers[0] if numbers else single
+    for name, minimum in least.items():
+        if minimum is not None and not (isinstance(found.get(name), float) and found[name] >= minimum):
+            message = f"param_str has no {name} of at least {minimum}; found {text!r}"
+            raise layer.error(message, "python_param", "param_str")
+    return found
+
+
+def overlaps(boxes: Array, others: Array) -> Array:
+    """Return intersection over union of each of (n, 4) with each of (m, 4): (n, m)."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    shared = np.prod(np.maximum(high - low + 1, 0), axis=2)
+    areas, other_areas = (np.prod(b[:, 2:] - b[:, :2] + 1, axis=1) for b in (boxes, others))
+    return shared / (areas[:, None] + other_areas - shared)
+
+
+def targets(boxes: Array, truth: Array) -> Array:
+    """Return how to move and scale each box (n, 4) to its true one (n, 4): dx, dy, log dw, log dh."""
+    sizes, true_sizes = (b[:, 2:] - b[:, :2] + 1 for b in (boxes, truth))
+    shift = truth[:, :2] + true_sizes / 2 - boxes[:, :2] - sizes / 2
+    return np.concatenate([shift / sizes, np.log(true_sizes / sizes)], axis=1).astype(np.float32)
+
+
+class _Sampling(Layer):
+    """A layer that chooses at random, and passes no gradient on."""
+
+    not_exported = "it is for training, and chooses at random"
+
+    def choose(self, indices: Array, count: int) -> Array:
+        """Return ``count`` of the indices, or all if they are fewer."""
+        if len(indices) <= count:
+            return indices
+        order = torch.randperm(len(indices), generator=self.context.random.on("cpu"))
+        return indices[order[:count].numpy()]
+
+    def tops_of(self, like: torch.Tensor, arrays: Sequence[Array]) -> tuple[torch.Tensor, ...]:
+        """Return the tops, and keep their shapes, which follow from the values."""
+        tops = tuple(torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(like) for a in arrays)
+        self.top_shapes = [tuple(top.shape) for top in tops]
+        return tops
+
+
+class AnchorTarget(_Sampling):
+    """Say which anchors show an object, and where it lies beside them.
+
+    An anchor within the image is an object if it overlaps a true box by 0.7 or more, or most of all anchors;
+    background if it overlaps none by 0.3. Of both together 256 are chosen, at most half of them objects.
+
+    bottom[0]  scores (1, 2 A, H, W); only their size counts
+    bottom[1]  true boxes (n, 5): x1, y1, x2, y2, class
+    bottom[2]  height, width and scale of the image (1, 3)
+    bottom[3]  optional, not used: the image
+    top[0]     labels (1, 1, A H, W): 1 object, 0 background, -1 not chosen
+    top[1]     targets (1, 4 A, H, W): dx, dy, log dw, log dh
+    top[2]     inside weights, the same shape: 1 for objects
+    top[3]     outside weights, the same shape: 1 / the number chosen
+    Fork: py-faster-rcnn, lib/rpn/anchor_target_layer.py
+    """
+
+    bottoms, tops = (3, 4), (4, 4)
+    label_bottoms = frozenset(range(4))
+
+    def setup(self) -> None:
+        found = settings(self, feat_stride=1)
+        self.stride, self.border = int(found["feat_stride"]), found.get("allowed_border", 0)
+        self.anchors = base_anchors(16, RATIOS, found.get("scales", SCALES))
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        if len(bottom_shapes[0]) != 4 or bottom_shapes[0][0] != 1:
+            raise self.error(f"found scores of shape {bottom_shapes[0]}, expected (1, C, H, W)", "bottom", 0)
+        if bottom_shapes[1][1:] not in ((4,), (5,)):
+            raise self.error(f"found true boxes of shape {bottom_shapes[1]}, expected (n, 5)", "bottom", 1)
+        count, (height, width) = len(self.anchors), bottom_shapes[0][2:]
+        return [(1, 1, count * height, width), *[(1, 4 * count, height, width)] * 3]
+
+    def forward(
+        self, scores: torch.Tensor, boxes: torch.Tensor, image: torch.Tensor, *more: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        height, width = scores.shape[2:]
+        anchors, truth, sizes = all_anchors(self.anchors, self.stride, height, width), as_array(boxes), as_array(image)
+        end = sizes.reshape(-1)[[1, 0]] + self.border
+        inside = np.flatnonzero((anchors[:, :2] >= -self.border).all(1) & (anchors[:, 2:] < end).all(1))
+        labels, moves = np.full(len(anchors), -1), np.zeros((len(anchors), 4), np.float32)
+        if len(inside) and len(truth):
+            table = overlaps(anchors[inside].astype(np.float64), truth[:, :4].astype(np.float64))
+            most = table.max(axis=1)
+            labels[inside[most < BACKGROUND]] = 0
+            labels[inside[(table == table.max(axis=0)).any(axis=1) | (most >= OBJECT)]] = 1
+            moves[inside] = targets(anchors[inside], truth[table.argmax(axis=1), :4])
+        elif len(inside):
+            labels[inside] = 0
+        objects = self.choose(np.flatnonzero(labels == 1), int(OBJECTS * ANCHORS))
+        others = self.choose(np.flatnonzero(labels == 0), ANCHORS - len(objects))
+        labels[:] = -1
+        labels[objects], labels[others] = 1, 0
+        chosen = max(1, len(objects) + len(others))
+        inner = np.repeat(labels[:, None] == 1, 4, axis=1)
+        outer = np.repeat(labels[:, None] >= 0, 4, axis=1) / np.float32(chosen)
+        by_map = [a.reshape(height, width, -1).transpose(2, 0, 1) for a in (labels, moves, inner, outer)]
+        return self.tops_of(scores, [by_map[0].reshape(1, 1, -1, width), *(a[None] for a in by_map[1:])])
+
+
+class ProposalTarget(_Sampling):
+    """Choose regions to learn from, and say what they show and where it lies beside them.
+
+    128 of the proposals and the true boxes: at most a quarter that overlap a true box by half or more, the rest
+    background.
+
+    bottom[0]  proposals (R, 5): 0, x1, y1, x2, y2
+    bottom[1]  true boxes (n, 5): x1, y1, x2, y2, class
+    top[0]     the regions (r, 5), those with an object first
+    top[1]     classes (r,), 0 background
+    top[2]     targets (r, 4 num_classes), divided by (0.1, 0.1, 0.2, 0.2), at the region's class
+    top[3]     inside weights, the same shape: 1 there
+    top[4]     outside weights, the same shape: 1 there
+    Fork: py-faster-rcnn, lib/rpn/proposal_target_layer.py
+    """
+
+    bottoms, tops = (2, 2), (5, 5)
+    label_bottoms = frozenset({0, 1})
+    counted_axis = 0
+
+    def setup(self) -> None:
+        self.classes = int(settings(self, num_classes=1)["num_classes"])
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        if bottom_shapes[0][1:] != (5,):
+            raise self.error(f"found proposals of shape {bottom_shapes[0]}, expected (R, 5)", "bottom", 0)
+        if bottom_shapes[1][1:] not in ((4,), (5,)):  # the second until there are data, as in the fork
+            raise self.error(f"found true boxes of shape {bottom_shapes[1]}, expected (n, 5)", "bottom", 1)
+        return [(1, 5), (1,), *[(1, 4 * self.classes)] * 3]
+
+    def forward(self, proposals: torch.Tensor, boxes: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        truth = as_array(boxes)
+        if truth.shape[1] != 5:
+            raise self.error(f"found true boxes of shape {truth.shape}, expected (n, 5)", "bottom", 1)
+        own = np.concatenate([np.zeros((len(truth), 1), np.float32), truth[:, :4]], axis=1)
+        regions = np.concatenate([as_array(proposals), own])
+        best, which = np.zeros(len(regions)), np.zeros(len(regions), int)
+        if len(truth):
+            table = overlaps(regions[:, 1:].astype(np.float64), truth[:, :4].astype(np.float64))
+            best, which = table.max(axis=1), table.argmax(axis=1)
+        objects = self.choose(np.flatnonzero(best >= OVERLAP), round(FOREGROUND * REGIONS))
+        others = self.choose(np.flatnonzero(best < OVERLAP), REGIONS - len(objects))
+        regions, which = regions[[*objects, *others]], which[[*objects, *others]]
+        labels = np.zeros(len(regions), int)
+        rows = np.arange(len(objects))
+        labels[rows] = truth[which[rows], 4]
+        if (labels >= self.classes).any():
+            raise self.error(f"found class {labels.max()}, expected less than {self.classes}", "bottom", 1)
+        moves, weights = np.zeros((2, len(regions), self.classes, 4), np.float32)
+        moves[rows, labels[rows]] = targets(regions[rows, 1:], truth[which[rows], :4]) / DEVIATIONS
+        weights[rows, labels[rows]] = 1
+        flat = [a.reshape(len(regions), -1) for a in (moves, weights, weights)]
+        return self.tops_of(proposals, [regions, labels, *flat])
+
+
+class RoIData(_Sampling):
+    """Read images and their true boxes, one image a pass, in random order.
+
+    The short side is scaled to 600 pixels, the long one at most to 1000. ``net.layers[0].set_roidb(entries)`` gives
+    the images: each entry is a dict with "image" (a path), "boxes" (n, 4), "gt_classes" (n,) and, if it is mirrored,
+    "flipped": True, its boxes being mirrored already.
+
+    top[0]     the image (1, 3, H, W): blue, green, red, minus their means
+    top[1]     its height, width and scale (1, 3)
+    top[2]     the true boxes (n, 5), scaled: x1, y1, x2, y2, class
+    Fork: py-faster-rcnn, lib/roi_data_layer/layer.py, minibatch.py
+    """
+
+    bottoms, tops = (0, 0), (3, 3)
+    promises = False  # images differ in size
+
+    def setup(self) -> None:
+        self.entries: Sequence[Mapping[str, Any]] = ()
+        self.waiting: list[int] = []
+
+    @property
+    def code(self) -> RoIData:
+        """What ``net.layers[0]`` of pycaffe is, as in the fork, where this layer is Python code."""
+        return self
+
+    def set_roidb(self, entries: Sequence[Mapping[str, Any]]) -> None:
+        """Read these images from now on; see the class. Raises SpecError where an entry lacks something."""
+        for i, entry in enumerate(entries):
+            if missing := {"image", "boxes", "gt_classes"} - set(entry):
+                raise self.error(f"entry {i} has no {' and no '.join(sorted(missing))}")
+        self.entries, self.waiting = list(entries), []
+
+    def restart(self) -> None:
+        self.waiting = []
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        given = self.context.options.given_shapes
+        default = [(1, 3, SHORTEST, LONGEST), (1, 3), (1, 5)]
+        return [given.get(name, shape) for name, shape in zip(self.param.top, default, strict=True)]
+
+    def forward(self) -> tuple[torch.Tensor, ...]:
+        if not self.entries:
+            raise self.error("no images were given; call net.layers[0].set_roidb(entries)")
+        if not self.waiting:
+            every = np.arange(len(self.entries))
+            order = torch.randperm(len(every), generator=self.context.random.on("cpu"))
+            self.waiting = [int(i) for i in every[order.numpy()]]
+        entry = self.entries[self.waiting.pop()]
+        try:
+            pixels = read_image(str(entry["image"])).transpose(1, 2, 0)
+        except ValueError as fault:
+            raise self.error(str(fault)) from None
+        if entry.get("flipped"):
+            pixels = pixels[:, ::-1]
+        image, scale = scaled(pixels.astype(np.float32) - MEANS)
+        rows = np.concatenate([np.array(entry["boxes"]) * scale, np.array(entry["gt_classes"])[:, None]], axis=1)
+        sizes = [[*image.shape[:2], scale]]
+        like = torch.empty(0, device=self.context.device)
+        return self.tops_of(like, [image.transpose(2, 0, 1)[None], np.array(sizes), rows[rows[:, 4] > 0]])
+
+
+def scaled(image: Array) -> tuple[Array, float]:
+    """Return an image (H, W, 3) of which the short side is 600 pixels, or the long one 1000, and the scale."""
+    short, long = sorted(image.shape[:2])
+    scale = min(SHORTEST / short, LONGEST / long)
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR), scale

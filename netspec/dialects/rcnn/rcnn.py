@@ -1,0 +1,322 @@
+"""Fast and Faster R-CNN: rbgirshick/caffe-fast-rcnn; R-FCN's layers are in rfcn.py.
+
+The Python layers of py-faster-rcnn are here too, by module and class. Where ``--allow-python-layers`` is given and
+their module can be imported, the module's code runs instead.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from functools import reduce
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from netspec.dialects.boxes import as_array
+from netspec.dialects.rcnn.faster import RATIOS, SCALES, AnchorTarget, ProposalTarget, RoIData, settings
+from netspec.dialects.rcnn.proposals import all_anchors, base_anchors, moved, suppress
+from netspec.dialects.rcnn.regions import RegionPooling, whole
+from netspec.layers import Layer, register
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers.loss.base import BATCH_SIZE, Loss, onnx_normalized_sum
+from netspec.proto.schema import TRAIN, value
+
+DECLARATIONS = """
+message ROIPoolingParameter {
+  optional uint32 pooled_h = 1 [default = 0];
+  optional uint32 pooled_w = 2 [default = 0];
+  optional float spatial_scale = 3 [default = 1];
+}
+message SmoothL1LossParameter {
+  optional float sigma = 1 [default = 1];
+}
+message ProposalParameter {
+  optional uint32 feat_stride = 1 [default = 16];
+  optional uint32 base_size = 2 [default = 16];
+  optional uint32 min_size = 3 [default = 16];
+  repeated float ratio = 4;
+  repeated float scale = 5;
+  optional uint32 pre_nms_topn = 6 [default = 6000];
+  optional uint32 post_nms_topn = 7 [default = 300];
+  optional float nms_thresh = 8 [default = 0.7];
+}
+extend LayerParameter {
+  optional ProposalParameter proposal_param = 10002;
+  optional ROIPoolingParameter roi_pooling_param = 8266711;
+  optional SmoothL1LossParameter smooth_l1_loss_param = 8266712;
+}
+"""
+
+
+@register("ROIPooling", "roi_pooling_param")
+class ROIPooling(RegionPooling):
+    """Divide each region of a map into pooled_h x pooled_w bins and return the maximum of each.
+
+    A region's corners are scaled by spatial_scale and rounded to pixels, both included. The first of equal pixels gets
+    the gradient; a bin without a pixel is 0.
+
+    bottom[0]  the map (N, C, H, W)
+    bottom[1]  regions (R, 5): image, x1, y1, x2, y2; gets no gradient
+    top[0]     (R, C, pooled_h, pooled_w)
+    Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/roi_pooling_layer.cpp
+    """
+
+    not_exported = "PyTorch has no pooling of regions; torchvision's roi_pool is near to it"
+
+    def setup(self) -> None:
+        param = value(self.param, "roi_pooling_param")
+        for name in ("pooled_h", "pooled_w"):
+            if getattr(param, name) < 1:
+                raise self.error(f"{name} must be at least 1", "roi_pooling_param", name)
+        self.bins = (param.pooled_h, param.pooled_w)
+        self.scale: float = param.spatial_scale
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return [(self.check_regions(bottom_shapes), bottom_shapes[0][1], *self.bins)]
+
+    def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
+        images, channels, height, width = maps.shape
+        with torch.no_grad():
+            regions = regions.reshape(-1, 5)
+            image = self.images_of(regions, images)
+            corners = whole(regions[:, 1:] * self.scale)
+            rows = self._bins(corners[:, 1], corners[:, 3], self.bins[0], height)[:, :, None]
+            columns = self._bins(corners[:, 0], corners[:, 2], self.bins[1], width)[:, None]
+            windows = torch.cat(torch.broadcast_tensors(rows, columns), dim=3)
+            pixel = torch.empty((*windows.shape[:3], channels), dtype=torch.int32, device=maps.device)
+            for i in image.unique().tolist():
+                own = image == i
+                pixel[own] = _first_maxima(maps[i], windows[own].reshape(-1, 4)).reshape(-1, *pixel.shape[1:])
+            pixel = pixel.permute(0, 3, 1, 2)
+            plane = image[:, None] * channels + torch.arange(channels, device=maps.device)
+            place = plane[:, :, None, None] * (height * width) + pixel.clamp(min=0)
+        return maps.reshape(-1)[place].where(pixel >= 0, 0)
+
+    @staticmethod
+    def _bins(first: torch.Tensor, last: torch.Tensor, count: int, size: int) -> torch.Tensor:
+        """Return where each bin of each region begins and ends along one axis, in pixels of the map: (R, count, 2)."""
+        length = (last - first + 1).clamp(min=1)
+        steps = torch.arange(count + 1, dtype=first.dtype, device=first.device) * (length / count)[:, None]
+        ends = torch.stack([steps[:, :-1].floor(), steps[:, 1:].ceil()], dim=2) + first[:, None, None]
+        return ends.clamp(0, size).long()
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        regions = graph.reshape(bottoms[1], [-1, 5])
+        return graph.node("MaxRoiPool", bottoms[0], regions, pooled_shape=self.bins, spatial_scale=self.scale)
+
+
+Table = tuple[torch.Tensor, torch.Tensor]  # values and the pixels that they come from
+
+
+def _first_maxima(maps: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
+    """Return the pixel, row * width + column, of the first maximum of each window of maps (C, H, W): (n, C).
+
+    Windows (n, 4) are begin and end of their rows, begin and end of their columns; an empty one yields -1. Each is
+    covered by four, which may overlap, of sides that are powers of two; the maxima of those are made by doubling.
+    """
+    height, width = maps.shape[1:]
+    sides = windows[:, 1::2] - windows[:, ::2]
+    doublings = sides.clamp(min=1).log2().long().masked_fill((sides < 1).any(dim=1, keepdim=True), -1)
+    most_down, most_across = doublings.amax(dim=0).tolist() if len(windows) else (-1, -1)
+    found = torch.full((len(windows), maps.shape[0]), -1, dtype=torch.int32, device=maps.device)
+    values = maps.permute(1, 2, 0).contiguous()
+    pixels = torch.arange(height * width, dtype=found.dtype, device=maps.device)
+    pixels = pixels.reshape(height, width, 1).expand_as(values)
+    tall = values, pixels
+    for down in range(most_down + 1):
+        tall = tall if down == 0 else _doubled(tall, 0, 1 << down - 1)
+        table = tall
+        for across in range(most_across + 1):
+            table = table if across == 0 else _doubled(table, 1, 1 << across - 1)
+            own = (doublings[:, 0] == down) & (doublings[:, 1] == across)
+            upper, lower, left, right = windows[own].unbind(dim=1)
+            corners = [(y, x) for y in (upper, lower - (1 << down)) for x in (left, right - (1 << across))]
+            parts = [(table[0][corner], table[1][corner]) for corner in corners]
+            found[own] = reduce(_first_of, parts)[1]
+    return found
+
+
+def _doubled(table: Table, axis: int, side: int) -> Table:
+    """Return the first maxima of windows of twice a side along an axis, from those of that side."""
+    count = table[0].shape[axis] - side
+    values, pixels = ([part.narrow(axis, start, count) for start in (0, side)] for part in table)
+    return _first_of((values[0], pixels[0]), (values[1], pixels[1]))
+
+
+def _first_of(a: Table, b: Table) -> Table:
+    """Return the greater values; of equal ones those of the first pixel."""
+    second = (b[0] > a[0]) | ((b[0] == a[0]) & (b[1] < a[1]))
+    return torch.where(second, b[0], a[0]), torch.where(second, b[1], a[1])
+
+
+@register("Proposal", "proposal_param")
+class Proposal(Layer):
+    """Propose regions: anchors moved by what is predicted, the best of those that do not overlap.
+
+    An anchor for each ``ratio`` (height / width; 0.5, 1, 2) and each ``scale`` (8, 16, 32) of base_size pixels lies at
+    every feat_stride pixels. Of the pre_nms_topn of highest score, at most post_nms_topn stay, none of which overlaps a
+    better one by more than nms_thresh. Boxes with a side below min_size times the image's scale count as score 0. There
+    may be fewer regions than the top's declared shape says.
+
+    bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
+    bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor
+    bottom[2]  (1, 3) or (1, 4): height, width, scale of the image, or its scales of height and width
+    top[0]     regions (n, 5): 0, x1, y1, x2, y2
+    top[1]     optional: their scores (n,)
+    Fork: PVANet's and Intel's caffe, src/caffe/layers/proposal_layer.cpp
+    """
+
+    promises = False  # it may find fewer
+    bottoms = (3, 3)
+    tops = (1, 2)
+    label_bottoms = frozenset({0, 1, 2})
+
+    def setup(self) -> None:
+        """Make the anchors of one pixel."""
+        self.settings = param = value(self.param, "proposal_param")
+        for name in ("feat_stride", "base_size", "pre_nms_topn", "post_nms_topn"):
+            if getattr(param, name) < 1:
+                raise self.error(f"{name} must be at least 1", "proposal_param", name)
+        for name in ("ratio", "scale"):
+            if any(number <= 0 for number in getattr(param, name)):
+                raise self.error(f"{name} must be above 0", "proposal_param", name)
+        self.anchors = base_anchors(param.base_size, param.ratio or (0.5, 1, 2), param.scale or (8, 16, 32))
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        scores, deltas, image = bottom_shapes
+        count = len(self.anchors)
+        if len(scores) != 4 or scores[:2] != (1, 2 * count):
+            raise self.error(f"found scores of shape {scores}, expected (1, {2 * count}, H, W)", "bottom", 0)
+        if deltas != (1, 4 * count, *scores[2:]):
+            expected = (1, 4 * count, *scores[2:])
+            raise self.error(f"found boxes of shape {deltas}, expected {expected}", "bottom", 1)
+        if image[:1] != (1,) or math.prod(image) not in (3, 4):
+            raise self.error(f"found an image's sizes of shape {image}, expected (1, 3) or (1, 4)", "bottom", 2)
+        most = self.settings.post_nms_topn
+        return [(most, 5), (most,)][: self.num_tops]
+
+    def forward(self, scores: torch.Tensor, deltas: torch.Tensor, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        param = self.settings
+        count, (height, width) = len(self.anchors), scores.shape[2:]
+        sizes = as_array(image).reshape(-1)
+        anchors = all_anchors(self.anchors, param.feat_stride, height, width)
+        moves = as_array(deltas)[0].reshape(count, 4, height, width).transpose(2, 3, 0, 1).reshape(-1, 4)
+        boxes = moved(anchors, moves, sizes[0], sizes[1])
+        least = param.min_size * sizes[[-1, 2]]  # of width and height
+        large = (boxes[:, 2:] - boxes[:, :2] + 1 >= least).all(axis=1)
+        found = np.where(large, as_array(scores)[0, count:].transpose(1, 2, 0).reshape(-1), np.float32(0))
+        order = np.argsort(-found, kind="stable")[: param.pre_nms_topn]
+        order = order[suppress(boxes[order], param.nms_thresh, param.post_nms_topn)]
+        regions = np.concatenate([np.zeros((len(order), 1), np.float32), boxes[order]], axis=1)
+        tops = (torch.from_numpy(regions), torch.from_numpy(found[order]))
+        self.top_shapes = [tuple(top.shape) for top in tops[: self.num_tops]]
+        return tuple(top.to(scores) for top in tops[: self.num_tops])
+
+
+@register("rpn.proposal_layer.ProposalLayer", "python_param")
+class ProposalLayer(Proposal):
+    """Proposal with the settings of py-faster-rcnn, whose Python layer rpn.proposal_layer.ProposalLayer it is.
+
+    In training 2000 of 12000 regions stay, in testing 300 of 6000; param_str has feat_stride and scales.
+
+    bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
+    bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor
+    bottom[2]  (1, 3): height, width, scale of the image
+    top[0]     regions (n, 5): 0, x1, y1, x2, y2
+    top[1]     optional: their scores (n,)
+    Fork: rbgirshick/py-faster-rcnn, lib/rpn/proposal_layer.py
+    """
+
+    def setup(self) -> None:
+        found = settings(self, feat_stride=1)
+        self.settings = param = copy.deepcopy(value(self.param, "proposal_param"))
+        param.feat_stride = int(found["feat_stride"])
+        param.pre_nms_topn, param.post_nms_topn = (12000, 2000) if self.phase == TRAIN else (6000, 300)
+        self.anchors = base_anchors(param.base_size, RATIOS, found.get("scales", SCALES))
+
+
+register("rpn.anchor_target_layer.AnchorTargetLayer", "python_param")(AnchorTarget)
+register("rpn.proposal_target_layer.ProposalTargetLayer", "python_param")(ProposalTarget)
+register("roi_data_layer.layer.RoIDataLayer", "python_param")(RoIData)
+
+
+@register("SmoothL1Loss", "smooth_l1_loss_param")
+class SmoothL1Loss(Loss):
+    """Sum of outside weight x smooth(inside weight x (prediction - target)), divided by the number of items N.
+
+    smooth(d) = 0.5 (sigma d)^2 where |d| < 1 / sigma^2, else |d| - 0.5 / sigma^2
+
+    bottom[0]  predictions (N, ...)
+    bottom[1]  targets, the same shape
+    bottom[2]  optional: inside weights, the same shape; gets no gradient
+    bottom[3]  optional: outside weights, the same shape; gets no gradient
+    top[0]     the loss, ()
+    Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/smooth_L1_loss_layer.cu
+    """
+
+    bottoms = (2, 4)
+    label_bottoms = frozenset({2, 3})
+
+    def setup(self) -> None:
+        sigma = value(self.param, "smooth_l1_loss_param").sigma
+        if sigma <= 0:
+            raise self.error(f"sigma must be above 0, found {sigma:g}", "smooth_l1_loss_param", "sigma")
+        self.knee = 1 / (sigma * sigma)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the scalar top's shape; the bottoms must be of one shape, but for ones at its end."""
+        full = [(*shape, 1, 1, 1)[: max(4, len(shape))] for shape in bottom_shapes]
+        for i, shape in enumerate(full):
+            if shape != full[0]:
+                message = f"found bottoms of shapes {bottom_shapes[0]} and {bottom_shapes[i]}, expected equal shapes"
+                raise self.error(message, "bottom", i)
+        return super().reshape(bottom_shapes)
+
+    def forward(self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
+        inside, outside = (*(weight.detach().reshape_as(predictions) for weight in weights), None, None)[:2]
+        difference = predictions - targets.reshape_as(predictions)
+        if inside is not None:
+            difference = difference * inside
+        losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=self.knee)
+        return (losses if outside is None else losses * outside).sum() / len(predictions)
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        predictions, *others = bottoms
+        shape = graph.shape_of(predictions)
+        aligned = [
+            bottom if self.bottom_shapes[i] == self.bottom_shapes[0] else graph.node("Reshape", bottom, shape)
+            for i, bottom in enumerate(others, 1)
+        ]
+        difference = graph.node("Sub", predictions, aligned[0])
+        if len(aligned) > 1:
+            difference = graph.node("Mul", difference, aligned[1])
+        length = graph.node("Abs", difference)
+        knee = graph.constant(self.knee)
+        square = graph.node("Mul", graph.node("Mul", difference, difference), graph.constant(0.5 / self.knee))
+        linear = graph.node("Sub", length, graph.constant(0.5 * self.knee))
+        losses = graph.node("Where", graph.node("Less", length, knee), square, linear)
+        if len(aligned) > 2:
+            losses = graph.node("Mul", losses, aligned[2])
+        return onnx_normalized_sum(graph, losses, "", BATCH_SIZE)
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if len(set(self.bottom_shapes)) > 1:
+            raise refusal(self, "PyTorch", "it is exported for bottoms of one shape")
+        knee = rounded(self.knee)
+        if len(bottoms) == 2:
+            template = 'F.smooth_l1_loss({x}, {y}, beta={knee}, reduction="sum") / {x}.shape[0]'
+            return code.call(template, x=bottoms[0], y=bottoms[1], knee=knee)
+        template = f"{code.function(weighted_smooth_l1_loss)}({', '.join(bottoms)}, beta={{knee}})"
+        return code.call(template, knee=knee)
+
+
+def weighted_smooth_l1_loss(predictions, targets, inside, outside=1.0, beta=1.0):
+    """Return the smooth L1 loss of weighted differences, weighted and summed up, / N."""
+    x, y = inside * predictions, inside * targets
+    losses = F.smooth_l1_loss(x, y, beta=beta, reduction="none")
+    return (outside * losses).sum() / predictions.shape[0]

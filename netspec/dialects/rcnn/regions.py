@@ -1,0 +1,38 @@
+"""Regions of an image, as the layers take them that pool the part of a map that each covers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from netspec.layers.contract.base import Layer, Shape
+
+
+class RegionPooling(Layer):
+    """Base of the layers that pool the part of a map that a region of the image covers."""
+
+    bottoms = (2, 2)
+
+    def check_regions(self, bottom_shapes: Sequence[Shape]) -> int:
+        """Return how many regions there are; refuse other bottoms than a map and regions."""
+        maps, regions = bottom_shapes
+        if len(maps) != 4:
+            raise self.error(f"found a map of shape {maps}, expected 4 axes (N, C, H, W)", "bottom", 0)
+        if regions[1:] not in ((5,), (5, 1, 1)):
+            raise self.error(f"found regions of shape {regions}, expected (R, 5): image, x1, y1, x2, y2", "bottom", 1)
+        return regions[0]
+
+    def images_of(self, regions: torch.Tensor, images: int) -> torch.Tensor:
+        """Return the image that each region (R, 5) is in; raise SpecError for one that is not in the batch."""
+        image = regions[:, 0].long()
+        wrong = image[(image < 0) | (image >= images)]
+        if len(wrong):
+            raise self.error(f"found a region in image {wrong[0]}, expected 0 to {images - 1}", "bottom", 1)
+        return image
+
+
+def whole(x: torch.Tensor) -> torch.Tensor:
+    """Return the nearest whole numbers; halves away from zero, as C's round does."""
+    whole = x.trunc()
+    return whole + x.sign() * ((x - whole).abs() >= 0.5)

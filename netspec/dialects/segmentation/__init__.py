@@ -1,0 +1,1 @@
+"""Segmentation and edges: a label for each pixel."""

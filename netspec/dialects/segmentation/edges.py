@@ -1,0 +1,81 @@
+"""Nets that find edges (HED, RCF): images with edge maps, and a loss in which edges weigh as much as all else.
+
+Forks: s9xie/hed (Xie and Tu, Holistically-Nested Edge Detection, ICCV 2015), yun-liu/rcf (Liu et al., Richer
+Convolutional Features for Edge Detection, CVPR 2017)
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from netspec.data.images import read_image
+from netspec.data.sources import Source
+from netspec.data.transformer import Transformer
+from netspec.dialects.segmentation.pairs import Array, Pair, PairSource, read_labels, read_pairs
+from netspec.layers.contract.base import Shape
+from netspec.layers.data.files import ImageData
+from netspec.layers.loss.losses import SigmoidCrossEntropyLoss
+
+
+class EdgeMaps(ImageData):
+    """Base of the two layers ImageLabelmapData: images and their edge maps, mirrored and cut alike.
+
+    A list has lines ``image edges``; both are resized bilinearly where asked.
+    """
+
+    def edges(self, gray: Array) -> Array:
+        """Return the labels of a gray image, 0 to 255."""
+        raise NotImplementedError
+
+    def open(self) -> Source | None:
+        p, draws = self.param.image_data_param, self.draws
+        pairs = self.attempt(read_pairs, p.source, self.place)
+        transformer = self.attempt(self.transformer)
+        if pairs is None or transformer is None:
+            return None
+        cursor = self.cursor(len(pairs), p.rand_skip, p.shuffle)
+        size = (p.new_height, p.new_width) if p.new_height else None
+        root, color = p.root_folder, p.is_color
+        bare = type(self.param.transform_param)()
+        bare.CopyFrom(self.param.transform_param)
+        for name in ("mean_file", "mean_value", "scale"):
+            bare.ClearField(name)
+        as_images = Transformer(bare, self.phase, self.context.at, draws.seed, draws.stream)  # of the same draws
+
+        def read(pair: Pair) -> tuple[Array, Array]:
+            return read_image(root + pair.image, color, size), read_labels(root + pair.labels, size, nearest=False)
+
+        def cut(image: Array, labels: Array, position: int) -> tuple[Array, Array]:
+            if labels.shape[1:] != image.shape[1:]:
+                found = f"the edges are {labels.shape[1]} x {labels.shape[2]}"
+                raise self.error(f"{found}, the image {image.shape[1]} x {image.shape[2]}; expected the same", "top", 1)
+            edges = self.edges(labels.astype(np.float32))
+            return image, as_images([edges], range(position, position + 1))[0]
+
+        source = PairSource(pairs, cursor, read, cut, transformer)
+        self.log_size(source, "image_labelmap_data_layer.cpp:105")
+        return source
+
+    def shape_beside(self, data: Shape) -> Shape:
+        return (data[0], 1, *data[2:])
+
+
+class Balanced(SigmoidCrossEntropyLoss):
+    """Base of the two losses: the cross entropy of each image, its edges weighed by the share of all else, and so back.
+
+    What is neither 1 nor 0 does not count. There is no normalization but by N.
+    """
+
+    of_others: ClassVar[float]  # what all that is no edge is weighed by besides
+    not_exported = "it is for training"
+
+    def forward(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+        x, targets = x.reshape(len(x), -1), targets.detach().reshape(len(x), -1)
+        edges, others = (targets == 1).to(x), (targets == 0).to(x)
+        count = (edges.sum(1, keepdim=True), others.sum(1, keepdim=True))
+        weights = (edges * count[1] + self.of_others * others * count[0]) / (count[0] + count[1])
+        return F.binary_cross_entropy_with_logits(x, targets.clamp(0, 1), weights, reduction="sum") / len(x)

@@ -1,0 +1,45 @@
+"""HED: edges are 1 where more than half of all people marked them, else 0.
+
+Both forks give Caffe's SigmoidCrossEntropyLoss another meaning, each its own, without a field that says so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from typing_extensions import override
+
+from netspec.dialects.segmentation.edges import Balanced, EdgeMaps
+from netspec.dialects.segmentation.pairs import Array
+from netspec.layers import register
+from netspec.layers.loss.losses import SigmoidCrossEntropyLoss
+
+DECLARATIONS = ""  # no field says whose the file is: it has to be named
+
+
+@register("ImageLabelmapData", "image_data_param", "transform_param", "data_param.prefetch")
+class ImageLabelmapData(EdgeMaps):
+    """Read images and their edge maps, named in a list of lines ``image edges``, mirrored and cut alike.
+
+    top[0]  transformed images (batch_size, 3 or 1, H, W)
+    top[1]  edges (batch_size, 1, H, W): 1 for gray values from 128, else 0
+    Fork: s9xie/hed, src/caffe/layers/image_labelmap_data_layer.cpp
+    """
+
+    @override
+    def edges(self, gray: Array) -> Array:
+        return np.rint(gray / 255).astype(np.float32)
+
+
+@register("SigmoidCrossEntropyLoss", "loss_param", replaces=SigmoidCrossEntropyLoss)
+class BalancedLoss(Balanced):
+    """The cross entropy of sigmoid(x) and edges, weighed in each image: an edge by the share of all else.
+
+    All else weighs the share of edges. What is neither 1 nor 0 does not count. The sum is divided by N.
+
+    bottom[0]  x (N, ...)
+    bottom[1]  edges, as many
+    top[0]     the loss, ()
+    Fork: s9xie/hed, src/caffe/layers/sigmoid_cross_entropy_loss_layer.cpp
+    """
+
+    of_others = 1.0

@@ -1,0 +1,164 @@
+"""SegNet and ENet: images with a label for each pixel, and a loss that weighs classes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from typing_extensions import override
+
+from netspec.data.images import read_image
+from netspec.data.random_words import words
+from netspec.data.sources import Source
+from netspec.data.transformer import contradictions
+from netspec.dialects.segmentation.pairs import Array, Pair, PairSource, read_labels, read_pairs
+from netspec.errors import SpecError
+from netspec.layers import register
+from netspec.layers.contract.base import Shape
+from netspec.layers.data.files import ReadingLayer
+from netspec.layers.loss import scores as losses
+from netspec.proto.schema import value
+
+DECLARATIONS = """
+message DenseImageDataParameter {
+  optional string source = 1;
+  optional uint32 batch_size = 2;
+  optional uint32 rand_skip = 3 [default = 0];
+  optional bool shuffle = 4 [default = false];
+  optional uint32 new_height = 5 [default = 0];
+  optional uint32 new_width = 6 [default = 0];
+  optional bool is_color = 7 [default = true];
+  optional string mean_file = 8;
+  optional string root_folder = 9 [default = ""];
+  optional bool mirror = 10 [default = false];
+  optional uint32 crop_width = 11 [default = 0];
+  optional uint32 crop_height = 12 [default = 0];
+  // ENet
+  optional uint32 label_divide_factor = 13 [default = 1];
+}
+extend LossParameter {
+  optional bool weight_by_label_freqs = 1003 [default = false];
+  repeated float class_weighting = 1004;
+}
+extend LayerParameter {
+  optional DenseImageDataParameter dense_image_data_param = 1180;
+}
+"""
+
+GROUP = "dense_image_data_param"
+
+
+@register("DenseImageData", GROUP, "transform_param", "data_param.prefetch")
+class DenseImageData(ReadingLayer):
+    """Read images and label images named in a list, both resized, mirrored and cut alike, at random in both phases.
+
+    Labels are resized without mixing, to a size smaller by label_divide_factor, and are not changed otherwise. A list
+    has lines ``image labels``.
+
+    top[0]  transformed images (batch_size, 3 or 1, H, W)
+    top[1]  labels (batch_size, 1, H, W); smaller by label_divide_factor
+    Fork: TimoSaemann/caffe-enet, src/caffe/layers/dense_image_data_layer.cpp
+    """
+
+    group = GROUP
+    ignores = frozenset({f"{GROUP}.mean_file"})
+
+    def wrong_settings(self) -> Iterator[SpecError]:
+        p, transform = value(self.param, GROUP), self.param.transform_param
+        for names in (("new_height", "new_width"), ("crop_height", "crop_width")):
+            if bool(getattr(p, names[0])) != bool(getattr(p, names[1])):
+                yield self.error(f"{names[0]} and {names[1]} must be given together", GROUP)
+        if p.label_divide_factor < 1 or (p.label_divide_factor > 1 and p.crop_height):
+            message = "label_divide_factor must be at least 1, and 1 where images are cut"
+            yield self.error(message, GROUP, "label_divide_factor")
+        for name in ("mirror", "crop_size"):
+            if getattr(transform, name):
+                other = "mirror" if name == "mirror" else "crop_height and crop_width"
+                message = f"{name} would not change the labels; give {other} in {GROUP}"
+                yield self.error(message, "transform_param", name)
+        yield from super().wrong_settings()
+        yield from contradictions(transform, self.context.at)
+
+    def open(self) -> Source | None:
+        p, draws = value(self.param, GROUP), self.draws
+        pairs = self.attempt(read_pairs, p.source, self.place)
+        transformer = self.attempt(self.transformer)
+        if pairs is None or transformer is None:
+            return None
+        cursor = self.cursor(len(pairs), p.rand_skip, p.shuffle)
+        size = (p.new_height, p.new_width) if p.new_height else None
+        smaller = None if size is None else (size[0] // p.label_divide_factor, size[1] // p.label_divide_factor)
+        crop, mirror, root, color = (p.crop_height, p.crop_width), p.mirror, p.root_folder, p.is_color
+
+        def read(pair: Pair) -> tuple[Array, Array]:
+            return read_image(root + pair.image, color, size), read_labels(root + pair.labels, smaller, nearest=True)
+
+        def cut(image: Array, labels: Array, position: int) -> tuple[Array, Array]:
+            mirrored, down, across, _ = words(draws.seed, f"{draws.stream}/cut", position, 1)[0].tolist()
+            if mirror and mirrored % 2:
+                image, labels = image[:, :, ::-1], labels[:, :, ::-1]
+            if not crop[0]:
+                return image, labels
+            if any(size < part for size, part in zip(image.shape[1:], crop, strict=True)):
+                raise SpecError(f"an image of {image.shape[1]} x {image.shape[2]} is smaller than the crop", self.place)
+            top, left = down % (image.shape[1] - crop[0] + 1), across % (image.shape[2] - crop[1] + 1)
+            window = (slice(None), slice(top, top + crop[0]), slice(left, left + crop[1]))
+            return image[window], labels[window]
+
+        source = PairSource(pairs, cursor, read, cut, transformer)
+        self.log_size(source, "dense_image_data_layer.cpp:121")
+        return source
+
+    def known_shape(self) -> Shape | None:
+        """Return the shape where the prototxt gives height and width."""
+        p = value(self.param, GROUP)
+        height, width = (p.crop_height, p.crop_width) if p.crop_height else (p.new_height, p.new_width)
+        return (self.batch_size, 3 if p.is_color else 1, height, width) if height else None
+
+    def shape_beside(self, data: Shape) -> Shape:
+        less = value(self.param, GROUP).label_divide_factor
+        return (data[0], 1, *(size // less for size in data[2:]))
+
+
+@register(
+    "SoftmaxWithLoss",
+    "softmax_param",
+    "loss_param",
+    "loss_param.weight_by_label_freqs",
+    "loss_param.class_weighting",
+    replaces=losses.SoftmaxWithLoss,
+    where=lambda param: value(param.loss_param, "weight_by_label_freqs"),
+)
+class SoftmaxWithLoss(losses.SoftmaxWithLoss):
+    """Caffe's SoftmaxWithLoss; with weight_by_label_freqs each prediction's loss counts class_weighting[label] times.
+
+    The sum is divided by the number of predictions that count, not by their weights.
+
+    bottom[0]  scores (N, C, ...), C at softmax_param.axis
+    bottom[1]  labels, one per prediction
+    top[0]     the loss, ()
+    top[1]     optional: the softmax, bottom[0]'s shape
+    Fork: alexgkendall/caffe-segnet, src/caffe/layers/softmax_loss_layer.cpp
+    """
+
+    not_exported = "it weighs classes, for training"
+
+    def setup(self) -> None:
+        super().setup()
+        self.weights = torch.tensor(list(value(self.param.loss_param, "class_weighting")))
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        shapes = super().reshape(bottom_shapes)
+        if len(self.weights) != self.classes:
+            message = f"found {len(self.weights)} class_weighting, expected one for each of {self.classes} classes"
+            raise self.error(message, "loss_param", "class_weighting")
+        return shapes
+
+    def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        _, label = self.scores_and_labels(scores, labels)
+        self._each = self.weights.to(scores)[label.clamp(0, self.classes - 1)]
+        return super().forward(scores, labels)
+
+    @override
+    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
+        return super().sum_up(losses * self._each, valid, exact)

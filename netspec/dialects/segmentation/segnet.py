@@ -1,0 +1,225 @@
+"""Layers of nets that segment: PSPNet's and SegNet's BN, SegNet's Upsample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from netspec.layers import Layer
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.folding import Affine, blob_in_double
+from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers.normalization import as_before, onnx_normalized, torch_batch_norm
+from netspec.proto.schema import TRAIN, value
+
+INFERENCE = 1  # BNParameter.BNMode
+SEGNET_EPS = 1e-9  # added to the variance by SegNet's BN
+
+
+class _Unpool(torch.autograd.Function):
+    """Bring each value to the pixel that its mask names; the last one stays, every one gets the pixel's gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, mask: torch.Tensor, pixels: int) -> torch.Tensor:
+        ctx.save_for_backward(mask)
+        order = torch.arange(mask.shape[2], device=mask.device).expand_as(mask)
+        nobody = torch.full((*mask.shape[:2], pixels), -1, device=mask.device)
+        last = nobody.scatter_reduce(2, mask, order, "amax")
+        return values.gather(2, last.clamp(min=0)).where(last >= 0, 0)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        (mask,) = ctx.saved_tensors
+        return grads[0].gather(2, mask), None, None
+
+
+class Upsample(Layer):
+    """Enlarge maps: by a pooling's mask, each value to where it came from (SegNet), or by repeating each pixel (YOLO).
+
+    With a mask the new size is upsample_h and upsample_w, or ``scale`` times the map's (scale_h and scale_w, 2 unless
+    given), less 1 with pad_out_h and pad_out_w. Of several values for one pixel the last stays; the others' gradient is
+    the pixel's all the same.
+
+    bottom[0]  (N, C, H, W)
+    bottom[1]  optional: the mask, a Pooling layer's second top, of the same shape; gets no gradient
+    top[0]     (N, C, H', W'); without a mask H' = scale H (1 unless given)
+    Fork: alexgkendall/caffe-segnet and eric612/MobileNet-YOLO, src/caffe/layers/upsample_layer.cpp
+    """
+
+    bottoms = (1, 2)
+    label_bottoms = frozenset({1})
+
+    def setup(self) -> None:
+        param = value(self.param, "upsample_param")
+        given = {field.name for field, _ in param.ListFields()}
+        masked = len(self.bottom_shapes) == 2
+        if not masked and given - {"scale"}:
+            extra = min(given - {"scale"})
+            raise self.error("without a mask as second bottom only scale can be set", "upsample_param", extra)
+        for pair in ("upsample_h", "upsample_w"), ("scale_h", "scale_w"):
+            alone = [name for name in pair if name in given]
+            if len(alone) == 1:
+                raise self.error(f"found {alone[0]} alone, expected {' and '.join(pair)}", "upsample_param", alone[0])
+        scale = param.scale if "scale" in given else 2 if masked else 1
+        self.scale_h, self.scale_w = (param.scale_h, param.scale_w) if "scale_h" in given else (scale, scale)
+        for name, along in (("pad_out_h", self.scale_h), ("pad_out_w", self.scale_w)):
+            if getattr(param, name) and along != 2:
+                raise self.error(f"{name} needs a scale of 2, found {along}", "upsample_param", name)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        param, shape = value(self.param, "upsample_param"), bottom_shapes[0]
+        if len(shape) != 4 or any(other != shape for other in bottom_shapes):
+            message = f"found bottoms of shapes {bottom_shapes}, expected (N, C, H, W), and the mask's the same"
+            raise self.error(message, "bottom")
+        size = (param.upsample_h, param.upsample_w)
+        if not param.HasField("upsample_h"):
+            size = (shape[2] * self.scale_h - param.pad_out_h, shape[3] * self.scale_w - param.pad_out_w)
+        if min(size) < 1:
+            raise self.error(f"the top would have no pixel, {size[0]} x {size[1]}", "upsample_param")
+        return [(*shape[:2], *size)]
+
+    def forward(self, data: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Return the enlarged maps; raise SpecError for a mask of another size."""
+        if mask is None:
+            return F.interpolate(data, self.top_shapes[0][2:], mode="nearest")
+        height, width = self.top_shapes[0][2:]
+        index = mask.detach().long()
+        if index.numel() and not 0 <= int(index.amin()) <= int(index.amax()) < height * width:
+            message = f"the mask names pixel {int(index.amax())}, the top has {height} x {width}; check the scale"
+            raise self.error(message, "bottom", 1)
+        top: torch.Tensor = _Unpool.apply(data.flatten(2), index.flatten(2), height * width)
+        return top.reshape(self.top_shapes[0])
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if len(bottoms) == 1:
+            scales = graph.constant([1.0, 1.0, float(self.scale_h), float(self.scale_w)])
+            grid = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+            return graph.node("Resize", *bottoms, "", scales, **grid)
+        for axis in (2, 3):
+            graph.size(0, axis, "its mask counts the pixels of the enlarged map")
+        values = graph.reshape(bottoms[0], [0, 0, -1])
+        mask = graph.cast(graph.reshape(bottoms[1], [0, 0, -1]), "int64")
+        pixels = graph.constant([math.prod(self.top_shapes[0][2:])])
+        shape = graph.node("Concat", graph.shape_of(bottoms[0], 0, 2), pixels, axis=0)
+        empty = graph.node("Expand", graph.constant(0.0), shape)
+        return graph.reshape_to_top(graph.node("ScatterElements", empty, mask, values, axis=2))
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        scale = (self.scale_h, self.scale_w)
+        if len(bottoms) == 1:
+            factor = self.scale_h if self.scale_h == self.scale_w else scale
+            return code.call("F.interpolate({x}, scale_factor={factor})", x=bottoms[0], factor=factor)
+        if None in code.sizes(0)[2:] and value(self.param, "upsample_param").HasField("upsample_h") is False:
+            cut = (value(self.param, "upsample_param").pad_out_h, value(self.param, "upsample_param").pad_out_w)
+            sides = [f"{{x}}.shape[{2 + k}] * {scale[k]}{' - 1' if cut[k] else ''}" for k in (0, 1)]
+            return code.call(
+                f"{code.function(unpool)}({{x}}, {{mask}}, ({', '.join(sides)}))", x=bottoms[0], mask=bottoms[1]
+            )
+        size = tuple(self.top_shapes[0][2:])
+        return code.call(
+            f"{code.function(unpool)}({{x}}, {{mask}}, {{size}})", x=bottoms[0], mask=bottoms[1], size=size
+        )
+
+
+class BN(Layer):
+    """Batch normalization and a learned slope and bias in one; PSPNet's, or SegNet's where its fields are given.
+
+    PSPNet's subtracts the batch's mean and divides by sqrt(variance + eps) in training, and by moving averages in
+    testing or where ``frozen``; these move by 1 - momentum toward the batch's mean and biased variance. SegNet's
+    (scale_filler, shift_filler, bn_mode) does so by the batch in both phases; with bn_mode INFERENCE, for which its
+    weights were changed, it has only slope and bias.
+
+    bottom[0]  (N, C, H, W); up to four axes
+    top[0]     the same shape
+    blobs[0]   slopes (1, C, 1, 1), 0 unless a filler is given
+    blobs[1]   biases (1, C, 1, 1)
+    blobs[2]   moving mean     (1, C, 1, 1)                            PSPNet's only; not learned
+    blobs[3]   moving variance (1, C, 1, 1)                            PSPNet's only; not learned
+    Fork: hszhao/PSPNet and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
+    """
+
+    def setup(self) -> None:
+        param, shape = value(self.param, "bn_param"), self.bottom_shapes[0]
+        if not 2 <= len(shape) <= 4:
+            raise self.error(f"found a bottom of shape {shape}, expected (N, C, H, W), 2 to 4 axes", "bottom")
+        given = {field.name for field, _ in param.ListFields()}
+        segnet = given & {"scale_filler", "shift_filler", "bn_mode"}
+        if segnet and given - segnet - {"engine"}:
+            other = min(given - segnet - {"engine"})
+            raise self.error(f"{other} is PSPNet's and {min(segnet)} is SegNet's; use one kind only", "bn_param", other)
+        self.channels = shape[1]
+        size = (1, self.channels, 1, 1)
+        self.add_blob(size, param.scale_filler if segnet else param.slope_filler)
+        self.add_blob(size, param.shift_filler if segnet else param.bias_filler)
+        self.by_batch = param.bn_mode != INFERENCE if segnet else self.phase == TRAIN and not param.frozen
+        self.moving = not segnet
+        self.eps: float = SEGNET_EPS if segnet else param.eps
+        if self.moving:
+            self.add_blob(size)
+            self.add_blob(size, value=float(param.frozen))
+            self.not_learned = frozenset(range(4) if param.frozen else (2, 3))
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return as_before(self, bottom_shapes, self.channels)
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the normalized values; in training also move the averages."""
+        slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (0, 1))
+        if not self.by_batch and not self.moving:
+            return data * slope + bias
+        if self.by_batch:
+            axes = (0, *range(2, data.dim()))
+            variance, mean = torch.var_mean(data, axes, correction=0, keepdim=True)
+            if self.moving:
+                self._move(mean, variance)
+        else:
+            mean, variance = (self.blob(i).detach().reshape_as(slope) for i in (2, 3))
+        return (data - mean) / (variance + self.eps).sqrt() * slope + bias
+
+    def _move(self, mean: torch.Tensor, variance: torch.Tensor) -> None:
+        momentum = value(self.param, "bn_param").momentum
+        with torch.no_grad():
+            for i, batch in ((2, mean), (3, variance)):
+                self.blob(i).mul_(momentum).add_(batch.reshape(self.blob_shapes[i]), alpha=1 - momentum)
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
+        slope, bias = graph.blob(0, shape), graph.blob(1, shape)
+        if not self.by_batch and not self.moving:
+            return graph.node("Add", graph.node("Mul", *bottoms, slope), bias)
+        if not self.by_batch:
+            blobs = [graph.blob(i, (self.channels,)) for i in range(4)]
+            return graph.node("BatchNormalization", *bottoms, *blobs, epsilon=self.eps)
+        normalized = onnx_normalized(graph, bottoms[0], len(self.bottom_shapes[0]), self.eps)
+        return graph.node("Add", graph.node("Mul", normalized, slope), bias)
+
+    def as_affine(self) -> Affine | None:
+        if self.by_batch:
+            return None
+        slope, bias = (blob_in_double(self, i).reshape(-1) for i in (0, 1))
+        if not self.moving:
+            return slope, bias
+        mean, variance = (blob_in_double(self, i).reshape(-1) for i in (2, 3))
+        scale = slope * (variance + self.eps).rsqrt()
+        return scale, bias - mean * scale
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        axes = len(self.bottom_shapes[0])
+        shape, eps = (self.channels, *(1,) * (axes - 2)), rounded(self.eps)
+        if self.by_batch or not self.moving:
+            template = "F.batch_norm({x}, None, None, training=True, eps={eps})" if self.by_batch else "{x}"
+            operands = {"y": code.parameter(0, shape, "slope"), "z": code.parameter(1, shape, "bias")}
+            return code.call(f"{template} * {{y}} + {{z}}", x=bottoms[0], eps=eps, **operands)
+        weight, bias, mean, variance = (self.blob(i).reshape(-1) for i in range(4))
+        norm = torch_batch_norm(code, axes, mean, variance, eps, weight=weight, bias=bias)
+        return code.call("{norm}({x})", norm=norm, x=bottoms[0])
+
+
+def unpool(x, mask, size):
+    """Bring each value to the pixel of a larger map that the mask names; the others are 0."""
+    empty = x.new_zeros(*x.shape[:2], size[0] * size[1])
+    return empty.scatter(2, mask.flatten(2).long(), x.flatten(2)).unflatten(2, size)

@@ -1,0 +1,189 @@
+"""SSD's PriorBox: boxes of several sizes around every pixel of a map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from netspec import log
+from netspec.dialects.boxes import (
+    Array,
+)
+from netspec.layers import Layer
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.proto.schema import value
+
+
+class PriorBox(Layer):
+    """Lay boxes of some sizes and aspect ratios around the center of every pixel of a map.
+
+    For each min_size: a square of it; with max_sizes a square of sqrt(min_size max_size); then for each aspect_ratio
+    r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centers are at
+    (index + offset) step; where they are not given, the step is image / map and the image is bottom[1].
+
+    bottom[0]  the map (N, C, H, W)
+    bottom[1]  the image (N, C', H', W'); not needed where img_size, or img_h and img_w, are given
+    top[0]     (1, 2, 4 H W K), K boxes a pixel: [0, 0] (xmin, ymin, xmax, ymax) in parts of the image, [0, 1] variances
+    Fork: src/caffe/layers/prior_box_layer.cpp
+    """
+
+    bottoms = (1, 2)
+    label_bottoms = frozenset({0, 1})
+
+    def setup(self) -> None:
+        param = value(self.param, "prior_box_param")
+        if not param.min_size or min(param.min_size) < 1:
+            raise self.error("min_size must be given and be at least 1", "prior_box_param", "min_size")
+        if param.max_size and len(param.max_size) != len(param.min_size):
+            message = f"found {len(param.max_size)} max_size, expected none or {len(param.min_size)}, one per min_size"
+            raise self.error(message, "prior_box_param", "max_size")
+        for i, (small, large) in enumerate(zip(param.min_size, param.max_size, strict=False)):
+            if large <= small:
+                message = f"max_size {large:g} must be greater than its min_size {small:g}"
+                raise self.error(message, "prior_box_param", "max_size", i)
+        if len(param.variance) not in (0, 1, 4) or any(v <= 0 for v in param.variance):
+            raise self.error("variance must be one number or four, each above 0", "prior_box_param", "variance")
+        self.variances = np.array(list(param.variance) or [0.1], np.float32) * np.ones(4, np.float32)
+        self.sizes = self._sizes(param)
+        self._warn_of_cut_sizes(param)
+        self.image = self._pair(param, "img_size", "img_h", "img_w")
+        self.step = self._pair(param, "step", "step_h", "step_w")
+        if self.image is None and len(self.bottom_shapes) < 2:
+            message = "the image is missing: give it as a second bottom, or img_size, or img_h and img_w"
+            raise self.error(message, "bottom")
+
+    def _sizes(self, param: Any) -> Array:
+        """Return width and height of the boxes of one pixel (K, 2)."""
+        ratios = [1.0]
+        for ratio in param.aspect_ratio:
+            if ratio <= 0:
+                raise self.error(f"aspect_ratio must be above 0, found {ratio:g}", "prior_box_param", "aspect_ratio")
+            if all(abs(ratio - known) >= 1e-6 for known in ratios):
+                ratios += [ratio, 1 / ratio] if param.flip else [ratio]
+        sizes = []
+        for i, small in enumerate(map(self.pixels, param.min_size)):
+            sizes.append((small, small))
+            if param.max_size:
+                sizes.append((math.sqrt(small * self.pixels(param.max_size[i])),) * 2)
+            sizes += [(small * math.sqrt(ratio), small / math.sqrt(ratio)) for ratio in ratios[1:]]
+        return np.array(sizes, np.float32)
+
+    def _warn_of_cut_sizes(self, param: Any) -> None:
+        """Say which sizes are cut: other forks and OpenCV keep them, and nets trained there find other boxes here."""
+        for name in ("min_size", "max_size"):
+            sizes = getattr(param, name)
+            cut = [f"{rounded(size):g} to {self.pixels(size):g}" for size in sizes if self.pixels(size) != size]
+            if cut:
+                place = self.context.at("prior_box_param", name, 0)
+                found = f"{place}: {name} is cut to whole pixels, as in SSD: {', '.join(cut)}"
+                log.logger.warning(f"{found}; OpenCV and some forks keep it, so a net trained there gives other boxes")
+
+    def pixels(self, size: float) -> float:
+        """Return the size that a box gets for a given ``min_size`` or ``max_size``."""
+        return int(size)
+
+    def _pair(self, param: Any, both: str, height: str, width: str) -> tuple[float, float] | None:
+        """Return (vertical, horizontal) of a setting given as one number or as two; None where it is not given."""
+        given = [name for name in (both, height, width) if param.HasField(name)]
+        if not given:
+            return None
+        if given not in ([both], [height, width]) or any(getattr(param, name) <= 0 for name in given):
+            message = f"expected {both}, or both {height} and {width}, above 0; found {' and '.join(given)}"
+            raise self.error(message, "prior_box_param", given[0])
+        return getattr(param, given[0]), getattr(param, given[-1])
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shape of the boxes; lay them."""
+        if any(len(shape) != 4 for shape in bottom_shapes):
+            raise self.error(f"found bottoms of shapes {bottom_shapes}, expected 4 axes (N, C, H, W)", "bottom")
+        height, width = bottom_shapes[0][2:]
+        image = self.image or bottom_shapes[1][2:]
+        step = self.step or (image[0] / height, image[1] / width)
+        param = value(self.param, "prior_box_param")
+        offset = np.float32(param.offset)
+        y = (np.arange(height, dtype=np.float32) + offset) * np.float32(step[0])
+        x = (np.arange(width, dtype=np.float32) + offset) * np.float32(step[1])
+        center = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)[:, :, None].astype(float)
+        half = self.sizes / 2.0
+        extent = np.array(image[::-1], float)
+        boxes = np.concatenate([(center - half) / extent, (center + half) / extent], axis=-1).astype(np.float32)
+        boxes = boxes.clip(0, 1) if param.clip else boxes
+        self.boxes = np.stack([boxes.reshape(-1), np.tile(self.variances, boxes.size // 4)])[None]
+        return [self.boxes.shape]
+
+    def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(self.boxes).to(bottoms[0])
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        image_is_free = self.image is None and None in graph.sizes(1)[2:]
+        if None not in graph.sizes(0)[2:] and not image_is_free:
+            return graph.node("Identity", graph.constant(self.boxes))
+        sides = []
+        for k in (0, 1):  # vertical, horizontal
+            count = graph.shape_of(bottoms[0], 2 + k, 3 + k)
+            if self.image:
+                extent = graph.constant([float(self.image[k])])
+            else:
+                extent = graph.cast(graph.shape_of(bottoms[1], 2 + k, 3 + k), "float32")
+            if self.step:
+                step = graph.constant([float(self.step[k])])
+            else:
+                step = graph.node("Div", extent, graph.cast(count, "float32"))
+            zero, one = graph.constant(0), graph.constant(1)
+            index = graph.cast(graph.node("Range", zero, graph.node("Squeeze", count), one), "float32")
+            offset = graph.constant(value(self.param, "prior_box_param").offset)
+            center = graph.node("Mul", graph.node("Add", index, offset), step)
+            center = graph.reshape(center, [-1, 1, 1] if k == 0 else [1, -1, 1])
+            half = graph.constant(self.sizes[:, 1 - k] / np.float32(2))
+            sides.append([graph.node("Div", graph.node(op, center, half), extent) for op in ("Sub", "Add")])
+        (top, bottom), (left, right) = sides
+        down, across = graph.shape_of(bottoms[0], 2, 3), graph.shape_of(bottoms[0], 3, 4)
+        shape = graph.node("Concat", down, across, graph.constant([len(self.sizes)]), axis=0)
+        last = graph.constant([3])
+        corners = [
+            graph.node("Unsqueeze", graph.node("Expand", side, shape), last) for side in (left, top, right, bottom)
+        ]
+        boxes = graph.node("Concat", *corners, axis=3)
+        if value(self.param, "prior_box_param").clip:
+            boxes = graph.node("Clip", boxes, graph.constant(0.0), graph.constant(1.0))
+        variances = graph.node("Expand", graph.constant(self.variances), graph.shape_of(boxes))
+        return graph.node("Concat", *(graph.reshape(part, [1, 1, -1]) for part in (boxes, variances)), axis=1)
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        param = value(self.param, "prior_box_param")
+        image = code.call("{image}", image=self.image) if self.image else code.call("{y}.shape[2:]", y=bottoms[1])
+        sizes = [(rounded(float(width)), rounded(float(height))) for width, height in self.sizes]
+        options = {
+            "sizes": sizes,
+            "variances": tuple(rounded(float(v)) for v in self.variances),
+            **({"step": self.step} if self.step else {}),
+            **({"offset": rounded(param.offset)} if param.offset != 0.5 else {}),
+            **({"clip": True} if param.clip else {}),
+        }
+        given = ", ".join(f"{name}={{{name}}}" for name in options)
+        template = f"{code.function(prior_boxes)}({{x}}, {{image}}, {given})"
+        return code.call(template, x=bottoms[0], image=image, **options)
+
+
+def prior_boxes(x, image, sizes, variances, step=None, offset=0.5, clip=False):
+    """Return boxes of some sizes (width, height) around the center of every pixel of x, in parts of the image.
+
+    (1, 2, 4 H W K) for K sizes: the boxes (xmin, ymin, xmax, ymax) and their variances.
+    """
+    height, width = x.shape[2:]
+    down, across = step or (image[0] / height, image[1] / width)
+    options = {"dtype": torch.float64, "device": x.device}
+    y = (torch.arange(height, **options) + offset) * down
+    x = (torch.arange(width, **options) + offset) * across
+    center = torch.stack(torch.broadcast_tensors(x, y[:, None]), 2)[:, :, None]
+    half = torch.tensor(sizes, **options) / 2
+    boxes = torch.cat([center - half, center + half], 3)
+    boxes = (boxes / torch.tensor([image[1], image[0]] * 2, **options)).float()
+    boxes = boxes.clamp(0, 1) if clip else boxes
+    variance = torch.tensor(variances, device=boxes.device).expand_as(boxes)
+    return torch.stack([boxes.flatten(), variance.flatten()])[None]

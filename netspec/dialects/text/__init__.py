@@ -1,0 +1,1 @@
+"""Reading text: sequences of characters, CTC."""

@@ -1,0 +1,260 @@
+"""Connectionist temporal classification for the dialect text: losses, and what is read off the scores of steps.
+
+Graves et al., Connectionist Temporal Classification, ICML 2006.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from netspec.layers import Layer
+from netspec.layers.contract.base import Shape
+from netspec.proto.schema import value
+
+LOSS, DECODER = "ctc_loss_param", "ctc_decoder_param"
+
+
+def _collapsed(classes: Iterable[int], blank: int, merge: bool) -> list[int]:
+    """Return a path's labels: without blanks, and with ``merge`` one of each run of equal ones."""
+    before, found = -1, []
+    for each in classes:
+        if each != blank and not (merge and each == before):
+            found.append(each)
+        before = each
+    return found
+
+
+def edit_distance(first: Sequence[int], second: Sequence[int]) -> int:
+    """Return the fewest insertions, deletions and replacements that make one sequence of the other."""
+    row = list(range(len(second) + 1))
+    for i, a in enumerate(first, 1):
+        above, row[0] = row[0], i
+        for j, b in enumerate(second, 1):
+            above, row[j] = row[j], min(row[j] + 1, row[j - 1] + 1, above + (a != b))
+    return row[-1]
+
+
+class CTCGreedyDecoder(Layer):
+    """Read off the most probable class of each step: without blanks, and one of each run of equal ones.
+
+    With labels, say instead how well that agrees with them: 1 - edit distance / the longer length, as a mean, and how
+    many are right. Of equal probabilities the first class counts. blank_index: -1 is the last class.
+
+    bottom[0]  probabilities or scores (T, N, C)
+    bottom[1]  optional: labels (N, L), blanks among them not counted; they end at the first negative one
+    top[0]     classes (N, T, 1, 1), -1 after the last; with labels the agreement (1, 2, 1, 1)
+    Fork: senlinuc/caffe_ocr, src/caffe/layers/ctc_decoder_layer.cpp
+    """
+
+    bottoms = (1, 2)
+    label_bottoms = frozenset({0, 1})
+    not_exported = "how long a text is follows from the values"
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        scores = bottom_shapes[0]
+        if len(scores) < 3 or any(size != 1 for size in scores[3:]):
+            raise self.error(f"found scores of shape {scores}, expected (T, N, C)", "bottom", 0)
+        if len(bottom_shapes) > 1 and bottom_shapes[1][:1] != scores[1:2]:
+            raise self.error(f"found labels of shape {bottom_shapes[1]}, expected ({scores[1]}, L)", "bottom", 1)
+        return [(1, 2, 1, 1) if len(bottom_shapes) > 1 else (scores[1], scores[0], 1, 1)]
+
+    def forward(self, scores: torch.Tensor, *labels: torch.Tensor) -> torch.Tensor:
+        """Return the classes, or how well they agree with the labels."""
+        param = value(self.param, DECODER)
+        blank = param.blank_index if param.blank_index >= 0 else scores.shape[2] - 1
+        paths = first_maxima(scores.flatten(2)).T.tolist()
+        found = [_collapsed(path, blank, param.ctc_merge_repeated) for path in paths]
+        if not labels:
+            top = scores.new_full(self.top_shapes[0], -1)
+            for row, text in zip(top, found, strict=True):
+                row[: len(text), 0, 0] = torch.tensor(text, dtype=top.dtype)
+            return top
+        wrong, right = 0.0, 0
+        for text, row in zip(found, labels[0].flatten(1).tolist(), strict=True):
+            ended = next((i for i, label in enumerate(row) if label < 0), len(row))
+            true = [int(label + 0.5) for label in row[:ended] if int(label + 0.5) != blank]
+            if true or text:
+                distance = edit_distance(true, text)
+                wrong += distance / max(len(true), len(text))
+                right += distance == 0
+        return scores.new_tensor([1 - wrong / len(found), right / len(found)]).reshape(1, 2, 1, 1)
+
+
+def first_maxima(scores: torch.Tensor) -> torch.Tensor:
+    """Return the first index of the maximum along the last axis of scores (T, N, C): (T, N)."""
+    return (scores == scores.amax(dim=2, keepdim=True)).byte().argmax(dim=2)
+
+
+class LabelsequenceAccuracy(Layer):
+    """Say how many sequences are read without a fault: the greedy decoding equals the labels without blanks.
+
+    bottom[0]  scores (T, N, C)
+    bottom[1]  labels (N, L)
+    top[0]     the share of right ones, ()
+    Fork: xmfbit/warpctc-caffe, src/caffe/layers/labelsequence_accuracy_layer.cpp
+    """
+
+    bottoms = (2, 2)
+    label_bottoms = frozenset({0, 1})
+    not_exported = "it is for tests"
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        scores, labels = bottom_shapes
+        if len(scores) < 3 or labels[:1] != scores[1:2]:
+            raise self.error(f"found shapes {scores} and {labels}, expected (T, N, C) and (N, L)", "bottom")
+        return [()]
+
+    def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        blank = value(self.param, "labelsequence_accuracy_param").blank_label
+        paths, texts = first_maxima(scores.flatten(2)).T.tolist(), labels.flatten(1).long().tolist()
+        right = [
+            _collapsed(path, blank, True) == [label for label in text if label != blank]
+            for path, text in zip(paths, texts, strict=True)
+        ]
+        return scores.new_tensor(sum(right) / len(right))
+
+
+class _Ctc(torch.autograd.Function):
+    """The mean of the costs, 0 for a text that does not fit; the gradient is that of their sum, as warp-ctc's is."""
+
+    @staticmethod
+    def forward(ctx: Any, scores: torch.Tensor, given: tuple[Any, ...], blank: int) -> torch.Tensor:
+        flat, steps, lengths = given
+        with torch.enable_grad():
+            leaf = scores.detach().requires_grad_()
+            costs = F.ctc_loss(F.log_softmax(leaf, 2), flat, steps, lengths, blank, "none", zero_infinity=True)
+            total = costs.sum()
+        ctx.save_for_backward(*(torch.autograd.grad(total, leaf) if scores.requires_grad else ()))
+        return total.detach() / len(lengths)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        return ctx.saved_tensors[0] * grads[0], None, None
+
+
+class _CtcLoss(Layer):
+    """Base of the two CTC losses: what they share is computed by :class:`_Ctc`."""
+
+    is_loss = True
+    label_bottoms = frozenset({1, 2, 3})
+    not_exported = "it is for training"
+
+    def check_scores(self, scores: Shape) -> None:
+        """Refuse scores that are not (T, N, C)."""
+        if len(scores) < 3 or any(size != 1 for size in scores[3:]):
+            raise self.error(f"found scores of shape {scores}, expected (T, N, C)", "bottom", 0)
+
+    def loss(self, scores: torch.Tensor, texts: Sequence[Sequence[int]], steps: Sequence[int], blank: int) -> Any:
+        """Return the loss of scores (T, N, C) for a text and a number of steps of each sequence."""
+        scores = scores.flatten(2)
+        classes, labels = scores.shape[2], [label for text in texts for label in text]
+        if wrong := [label for label in labels if not 0 <= label < classes]:
+            raise self.error(f"found label {wrong[0]}, expected 0 to {classes - 1}", "bottom")
+        flat = torch.tensor(labels, dtype=torch.long, device=scores.device)
+        return _Ctc.apply(scores, (flat, list(steps), [len(text) for text in texts]), blank)
+
+
+class CTCLoss(_CtcLoss):
+    """-log of the probability of a text: the sum over all paths through the steps that collapse to it, as a mean.
+
+    The gradient is that of the sum, not of the mean, as in the forks. A text that does not fit its steps costs 0.
+    Two bottoms: all steps count, and labels equal to blank_index are left out. Three: as the fork's own data are.
+
+    bottom[0]  scores (T, N, C), before the softmax
+    bottom[1]  labels (N, L); with three bottoms: 0 where a sequence begins, 1 where it goes on (T, N); with four: steps
+               of each sequence (N,)
+    bottom[2]  with three: labels (T, N), negative after the last, counted from 0 without a blank where blank_index is
+               0; with four: lengths of the texts (N,)
+    bottom[3]  with four: labels (L, N)
+    top[0]     the loss, ()
+    Fork: senlinuc/caffe_ocr, src/caffe/layers/warp_ctc_loss_layer.cpp; ChWick/caffe, ctc_loss_layer.cpp
+    """
+
+    bottoms = (2, 4)
+
+    def setup(self) -> None:
+        """Refuse what warp-ctc does not compute."""
+        param = value(self.param, LOSS)
+        if param.output_delay or param.preprocess_collapse_repeated or not param.ctc_merge_repeated:
+            raise self.error(
+                "output_delay, preprocess_collapse_repeated and ctc_merge_repeated: false are not known", LOSS
+            )
+        self.blank: int = param.blank_index
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the scalar top's shape; the bottoms must have as many sequences."""
+        scores, *others = bottom_shapes
+        self.check_scores(scores)
+        items = scores[1]
+        axes = {1: [0], 2: [1, 1], 3: [0, 0, 1]}[len(others)]
+        for i, (shape, axis) in enumerate(zip(others, axes, strict=True), 1):
+            if shape[axis : axis + 1] != (items,):
+                raise self.error(f"found shape {shape}, expected {items} sequences along axis {axis}", "bottom", i)
+        return [()]
+
+    def forward(self, scores: torch.Tensor, *others: torch.Tensor) -> torch.Tensor:
+        count, items, classes = scores.shape[:3]
+        blank = self.blank if self.blank >= 0 else classes - 1
+        rows = [other.detach().reshape(other.shape[0], -1).cpu() for other in others]
+        if len(others) == 1:
+            texts = [[int(label) for label in row if int(label) != blank] for row in rows[0].tolist()]
+            return self.loss(scores, texts, [count] * items, blank)
+        if len(others) == 3:
+            steps, lengths = (each.flatten().long().tolist() for each in rows[:2])
+            texts = [rows[2][:length, n].long().tolist() for n, length in enumerate(lengths)]
+            return self.loss(scores, texts, steps, blank)
+        shift, steps, texts = int(blank == 0), [], []
+        for goes_on, labels in zip(rows[0].T.tolist(), rows[1].T.tolist(), strict=True):
+            begun = next((t for t, c in enumerate(goes_on) if t and int(c + 0.5) == 0), count)
+            ended = next((t for t, label in enumerate(labels) if label < 0), len(labels))
+            texts.append([int(label + 0.5) + shift for label in labels[:ended]])
+            steps.append(begun if ended else 0)
+        return self.loss(scores, texts, steps, blank)
+
+
+class WarpCTCLoss(CTCLoss):
+    """CTCLoss by another name.
+
+    bottom[0]  scores (T, N, C), before the softmax
+    bottom[i]  as CTCLoss has them
+    top[0]     the loss, ()
+    Fork: senlinuc/caffe_ocr, src/caffe/layers/warp_ctc_loss_layer.cpp
+    """
+
+
+class CtcLoss(_CtcLoss):
+    """The CTC loss of xmfbit/warpctc-caffe: -log of the probability of a text, as a mean; all of time_step steps count.
+
+    The gradient is that of the sum, not of the mean, as in the fork.
+
+    bottom[0]  scores (T, N, alphabet_size), before the softmax
+    bottom[1]  labels (N, L), those equal to blank_label left out
+    top[0]     the loss, ()
+    Fork: xmfbit/warpctc-caffe, src/caffe/layers/ctc_loss_layer.cpp
+    """
+
+    bottoms = (2, 2)
+
+    def setup(self) -> None:
+        self.settings = param = value(self.param, LOSS)
+        for name in ("alphabet_size", "time_step"):
+            if getattr(param, name) < 1:
+                raise self.error(f"{name} must be given and be at least 1", LOSS, name)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        scores, labels = bottom_shapes
+        self.check_scores(scores)
+        param = self.settings
+        if labels[:1] != scores[1:2] or scores[2] != param.alphabet_size or scores[0] < param.time_step:
+            expected = f"({param.time_step}, N, {param.alphabet_size}) and (N, L)"
+            raise self.error(f"found shapes {scores} and {labels}, expected {expected}", "bottom")
+        return [()]
+
+    def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        blank = self.settings.blank_label
+        texts = [[int(label) for label in row if int(label) != blank] for row in labels.flatten(1).tolist()]
+        return self.loss(scores, texts, [self.settings.time_step] * len(texts), blank)

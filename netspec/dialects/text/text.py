@@ -1,0 +1,237 @@
+"""Reading text: connectionist temporal classification (CTC), sequences turned around, an LSTM with one bias.
+
+Forks: ChWick/caffe and senlinuc/caffe_ocr; xmfbit/warpctc-caffe; junhyukoh/caffe-lstm (Lstm). Graves et al.,
+Connectionist Temporal Classification, ICML 2006.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from netspec.dialects.text.ctc import (
+    DECODER,
+    LOSS,
+    CTCGreedyDecoder,
+    CTCLoss,
+    CtcLoss,
+    LabelsequenceAccuracy,
+    WarpCTCLoss,
+)
+from netspec.layers import Layer, register
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.proto.schema import has, value
+
+DECLARATIONS = """
+message ContinuationIndicatorParameter {
+  optional uint32 time_step = 1 [default = 0];
+  optional uint32 batch_size = 2 [default = 0];
+}
+message ReverseParameter {
+  optional int32 axis = 1 [default = 0];
+}
+message ReverseTimeParameter {
+  optional bool copy_remaining = 1 [default = false];
+}
+message CTCDecoderParameter {
+  optional int32 blank_index = 1 [default = 0];
+  optional bool ctc_merge_repeated = 2 [default = true];
+}
+message CTCLossParameter {
+  optional int32 output_delay = 1 [default = 0];
+  optional int32 blank_index = 2 [default = 0];
+  optional bool preprocess_collapse_repeated = 3 [default = false];
+  optional bool ctc_merge_repeated = 4 [default = true];
+  optional int32 loss_calculation_t = 5 [default = 0];
+  // xmfbit/warpctc-caffe
+  optional uint32 alphabet_size = 11 [default = 0];
+  optional uint32 time_step = 12 [default = 0];
+  optional int32 blank_label = 13 [default = 0];
+}
+message LabelsequenceAccuracyParameter {
+  optional int32 blank_label = 1 [default = 0];
+}
+message LSTMParameter {
+  optional uint32 num_output = 1;
+  optional float clipping_threshold = 2 [default = 0];
+  optional FillerParameter weight_filler = 3;
+  optional FillerParameter bias_filler = 4;
+  optional uint32 batch_size = 5 [default = 1];
+}
+extend LayerParameter {
+  optional ContinuationIndicatorParameter continuation_indicator_param = 1170;
+  optional ReverseParameter reverse_param = 1171;
+  optional ReverseTimeParameter reverse_time_param = 1172;
+  optional CTCDecoderParameter ctc_decoder_param = 1173;
+  optional CTCLossParameter ctc_loss_param = 1174;
+  optional LabelsequenceAccuracyParameter labelsequence_accuracy_param = 1175;
+  optional LSTMParameter lstm_param = 1176;
+}
+"""
+
+
+@register("ContinuationIndicator", "continuation_indicator_param")
+class ContinuationIndicator(Layer):
+    """Say where sequences go on, for a recurrent layer: 0 at the first step, 1 at all others.
+
+    bottom[i]  optional, not read
+    top[0]     (time_step, batch_size)
+    Fork: xmfbit/warpctc-caffe, src/caffe/layers/continuation_indicator_layer.cpp
+    """
+
+    bottoms = (0, 1)
+    label_bottoms = frozenset({0})
+
+    def setup(self) -> None:
+        param = value(self.param, "continuation_indicator_param")
+        for name in ("time_step", "batch_size"):
+            if getattr(param, name) < 1:
+                raise self.error(f"{name} must be given and be at least 1", "continuation_indicator_param", name)
+        self.size = (param.time_step, param.batch_size)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return [self.size]
+
+    def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
+        top = torch.ones(self.size, device=self.context.device)
+        top[0] = 0
+        return top
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        return graph.constant(self.forward().cpu())
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("torch.ones({size}).index_fill(0, torch.tensor([0]), 0)", size=self.size)
+
+
+@register("Reverse", "reverse_param")
+class Reverse(Layer):
+    """Turn an axis around: what was first is last. By default axis 0, the time.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: senlinuc/caffe_ocr, src/caffe/layers/reverse_layer.cpp
+    """
+
+    def setup(self) -> None:
+        self.axis = self.canonical_axis(value(self.param, "reverse_param").axis, self.bottom_shapes[0], "reverse_param")
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return data.flip(self.axis)
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        first, last, step = (graph.constant([n]) for n in (-1, -(2**31), -1))
+        return graph.node("Slice", bottoms[0], first, last, graph.constant([self.axis]), step)
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.call("{x}.flip({axis})", x=bottoms[0], axis=self.axis)
+
+
+@register("ReverseTime", "reverse_time_param")
+class ReverseTime(Layer):
+    """Turn the first steps of each sequence around; what lies behind is copied with copy_remaining, else 0.
+
+    bottom[0]  sequences (T, N, ...)
+    bottom[1]  how many steps each has (N,); gets no gradient
+    top[0]     the shape of bottom[0]
+    Fork: senlinuc/caffe_ocr, src/caffe/layers/reverse_time_layer.cpp, which leaves what lies behind unwritten
+    """
+
+    bottoms = (2, 2)
+    label_bottoms = frozenset({1})
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        data, lengths = bottom_shapes
+        if lengths != data[1:2]:
+            raise self.error(f"found lengths of shape {lengths}, expected {data[1:2]}", "bottom", 1)
+        return [data]
+
+    def forward(self, data: torch.Tensor, lengths: torch.Tensor) -> torch.Tensor:
+        steps, length = torch.arange(len(data), device=data.device)[:, None], lengths.long().clamp(0, len(data))
+        inside = steps < length
+        source = torch.where(inside, length - 1 - steps, steps)
+        extra = (1,) * (data.dim() - 2)
+        top = data.gather(0, source.reshape(*source.shape, *extra).expand_as(data))
+        copies = value(self.param, "reverse_time_param").copy_remaining
+        return top if copies else top * inside.reshape(*inside.shape, *extra)
+
+
+@register("Lstm", "lstm_param")
+class Lstm(Layer):
+    """An LSTM over all steps, from a state of zeros; its gates in the order input, forget, output, new.
+
+    With bottom[1] a sequence may go on from the last pass: where that is 0, a new one begins.
+
+    bottom[0]  (T, N, C)
+    bottom[1]  optional: 0 where a sequence begins, 1 where it goes on (T, N); gets no gradient
+    top[0]     (T, N, num_output)
+    blobs[0]   weights of the input (4 num_output, C)
+    blobs[1]   weights of the state (4 num_output, num_output)
+    blobs[2]   biases (4 num_output,)
+    Fork: junhyukoh/caffe-lstm; senlinuc/caffe_ocr, src/caffe/layers/lstm_layer_Junhyuk.cpp
+    """
+
+    bottoms = (1, 2)
+    label_bottoms = frozenset({1})
+    not_exported = "its steps are a loop"
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it goes on from one pass to the next."""
+        return len(self.bottom_shapes) > 1
+
+    def setup(self) -> None:
+        """Make the blobs; the state begins at 0."""
+        param, shape = value(self.param, "lstm_param"), self.bottom_shapes[0]
+        if param.num_output < 1:
+            raise self.error("num_output must be given and be at least 1", "lstm_param", "num_output")
+        if len(shape) != 3:
+            raise self.error(f"found a bottom of shape {shape}, expected (T, N, C)", "bottom", 0)
+        self.size, self.clip = param.num_output, param.clipping_threshold
+        for sizes, name in (((shape[2],), "weight_filler"), ((self.size,), "weight_filler"), ((), "bias_filler")):
+            self.add_blob((4 * self.size, *sizes), getattr(param, name) if has(param, name) else None)
+        self.state: tuple[torch.Tensor, ...] = ()
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        data, *begins = bottom_shapes
+        if len(data) != 3 or data[2] != self.blob_shapes[0][1]:
+            raise self.error(f"found a bottom of shape {data}, expected (T, N, {self.blob_shapes[0][1]})", "bottom", 0)
+        if begins and begins[0][:2] != data[:2]:
+            raise self.error(f"found a bottom of shape {begins[0]}, expected {data[:2]}", "bottom", 1)
+        return [(*data[:2], self.size)]
+
+    def forward(self, data: torch.Tensor, *begins: torch.Tensor) -> torch.Tensor:
+        of_input, of_state, bias = (self.blob(i) for i in range(3))
+        gates = data @ of_input.T + bias
+        zeros = data.new_zeros(2, data.shape[1], self.size)
+        h, c = self.state if begins and self.state and self.state[0].shape == zeros[0].shape else zeros.unbind()
+        goes_on = begins[0].detach().reshape(data.shape[:2]) != 0 if begins else None
+        tops = []
+        for t, gate in enumerate(gates.unbind()):
+            before = c
+            if goes_on is not None:
+                kept = goes_on[t, :, None]
+                gate, before = torch.where(kept, gate + h @ of_state.T, gate), torch.where(kept, c, 0)
+            elif t > 0:
+                gate = gate + h @ of_state.T
+            if self.clip > 0 and gate.requires_grad:
+                gate.register_hook(lambda diff: diff.clamp(-self.clip, self.clip))
+            i, f, o = gate[:, : 3 * self.size].sigmoid().chunk(3, dim=1)
+            c = f * before + i * gate[:, 3 * self.size :].tanh()
+            h = o * c.tanh()
+            tops.append(h)
+        if begins:
+            self.state = (h.detach(), c.detach())
+        return torch.stack(tops)
+
+
+register("CTCGreedyDecoder", DECODER)(CTCGreedyDecoder)
+register("LabelsequenceAccuracy", "labelsequence_accuracy_param")(LabelsequenceAccuracy)
+register("CTCLoss", LOSS)(CTCLoss)
+register("WarpCTCLoss", LOSS)(WarpCTCLoss)
+register("CtcLoss", LOSS)(CtcLoss)

@@ -1,0 +1,1 @@
+"""Video: optical flow, and stacks of frames."""

@@ -1,0 +1,136 @@
+"""A net as an engine runs it: exported once, kept in the cache, opened."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netspec import log
+from netspec.errors import SpecError
+from netspec.export.engines.cache import entry, fill, note
+from netspec.export.engines.choice import BF16, FP32, Choice
+from netspec.export.engines.key import key_of
+from netspec.export.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
+
+Export = Callable[[Path], None]  # writes the ONNX model to a path, its weights beside it
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a net is made of: its prototxt and weights, and the options that decide what is exported of it."""
+
+    files: Sequence[str | Path]
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Model:
+    """A net in an engine. ``origin`` None: what it is made of is not known, and it is not kept.
+
+    ``export`` is called where the cache has no such model; what it warns of is warned of again at each later opening.
+    Raises Unable for what the engine cannot run, and SpecError for a file that cannot be read.
+    """
+
+    def __init__(self, choice: Choice, origin: Origin | None, export: Export) -> None:
+        self.choice = choice
+        self._kept: tempfile.TemporaryDirectory[str] | None = None  # where the cache does not
+        self.folder, self._about = self._made(origin, export)
+        self._runner, precision = self._opened(choice.precision)
+        self._told = precision == FP32
+
+    def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
+        """Return the outputs, float32 by name, for inputs by name.
+
+        Raises Unable where the library fails. In bf16 the first pass measures how far outputs are from those in fp32.
+        """
+        found = _run(self._runner, inputs)
+        if not self._told:
+            self._told = True
+            self._tell_difference(inputs, found)
+        return found
+
+    def _made(self, origin: Origin | None, export: Export) -> tuple[Path, dict[str, Any]]:
+        runner = RUNNERS[self.choice.engine]
+        given = {"engine": self.choice.engine, **runner.identity()}
+
+        def make(folder: Path) -> dict[str, Any]:
+            with _warnings() as told:
+                _export(export, folder / MODEL)
+            try:
+                runner.prepare(folder)
+            except Exception as fault:  # each library has its own
+                raise Unable(reason(fault)) from None
+            return {**given, "warnings": told}
+
+        if self.choice.cache is not None and origin is not None:
+            key = key_of(origin.files, {**origin.options, **given})
+            try:
+                folder, about, made = entry(self.choice.cache, key, make)
+            except OSError as fault:
+                where = self.choice.cache
+                log.logger.warning(f"{where}: cannot be written: {fault.strerror}; the exported model is not kept")
+            else:
+                for line in () if made else about["warnings"]:
+                    log.logger.warning(line)
+                return folder, about
+        self._kept = tempfile.TemporaryDirectory(prefix="netspec-", ignore_cleanup_errors=True)
+        folder = Path(self._kept.name)
+        return folder, fill(folder, make)
+
+    def _opened(self, precision: str) -> tuple[Runner, str]:
+        try:
+            return open_runner(self.choice.engine, self.folder, precision), precision
+        except Unable as fault:
+            if precision == FP32:
+                raise
+            log.logger.warning(f"precision {precision}: {fault}; {self.choice.engine} runs it in {FP32}")
+            return open_runner(self.choice.engine, self.folder, FP32), FP32
+
+    def _tell_difference(self, inputs: Arrays, found: Arrays) -> None:
+        """Say how far bf16 is from fp32: measured once, on the first inputs, and kept with the model."""
+        if self._about.get(BF16) is None:
+            exact = _run(open_runner(self.choice.engine, self.folder, FP32), inputs)
+            self._about[BF16] = {name: _difference(found[name], value) for name, value in exact.items()}
+            with suppress(OSError):  # it is measured again
+                note(self.folder, self._about)
+        for name, value in self._about[BF16].items():
+            log.logger.warning(f"precision bf16: {name} differs from fp32 by {value:.1e} of its largest value")
+
+
+def _run(runner: Runner, inputs: Arrays) -> dict[str, np.ndarray]:
+    try:
+        return runner.run(inputs)
+    except Exception as fault:  # each library has its own
+        raise Unable(reason(fault)) from None
+
+
+def _export(export: Export, path: Path) -> None:
+    try:
+        export(path)
+    except SpecError as fault:
+        raise Unable(str(fault)) from None
+
+
+def _difference(found: np.ndarray, exact: np.ndarray) -> float:
+    if found.shape != exact.shape:
+        return float("inf")
+    return float(np.abs(found - exact).max(initial=0) / (np.abs(exact).max(initial=0) or 1))
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """Yield a list that gets the warnings of the block."""
+    told: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: told.append(record.getMessage()) if record.levelno == logging.WARNING else None
+    log.logger.addHandler(handler)
+    try:
+        yield told
+    finally:
+        log.logger.removeHandler(handler)

@@ -1,0 +1,170 @@
+"""An engine as one of the runners of a net: it computes forward passes, all else is the net's."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from netspec.data.blobs import Shape
+from netspec.export.engines.choice import TORCH, Choice
+from netspec.export.engines.export import write_model
+from netspec.export.engines.model import Model, Origin
+from netspec.export.engines.runners import Unable, tell_unable
+from netspec.export.formats.convert import Source
+from netspec.graph.options import BuildOptions
+from netspec.graph.plan import Node
+from netspec.layers.contract.learned import Stamp, is_lent, stamp
+from netspec.layers.contract.reading import reads_data
+from netspec.net.net import Net
+from netspec.proto.schema import PHASE_NAMES, TEST
+from netspec.run.shapes import fitted
+from netspec.run.walk import Result, losses_of, walk, weighted_sum
+
+Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path, with these blobs besides its outputs
+
+
+def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[str | Path]) -> Net:
+    """Let the chosen engine run a net that was read from ``path`` and ``weights``; return the net.
+
+    Torch does by choice, or where a warning says what the engine cannot do.
+    """
+    if choice.engine == TORCH:
+        tell_unable(choice, "")
+        return net
+    weights = list(weights)
+    reason = ""
+    if net.phase != TEST:
+        reason = f"it runs nets in phase TEST, this one is in {PHASE_NAMES[net.phase]}"
+    elif net.device.type != "cpu":
+        reason = f"it runs on the CPU, this net is on {net.device}"
+    if reason:
+        tell_unable(choice, reason)
+        return net
+    origin = Origin([path, *weights], {"level": net.options.level or 0, "stages": tuple(net.options.stages)})
+    net.runners.insert(0, Engine(net, choice, origin if weights else None, _writer(net, Path(path))))
+    return net
+
+
+class Engine:
+    """Runs a net by an engine, as one of its runners; it keeps the plan and the layers, which read data, of ``net``.
+
+    ``origin`` says of which files it is made, None where its parameters are random; ``write`` exports it. Outputs carry
+    no gradient; a pass whose input asks for one is torch's, and so is every pass once the engine turned out to be
+    unable. Where parameters were changed the net is exported again. While an alias of a parameter is alive
+    (``.data``, an array), a change might go unnoticed, so torch runs the net.
+    """
+
+    def __init__(self, net: Net, choice: Choice, origin: Origin | None, write: Write) -> None:
+        self._plan, self._layers, self._exact = net.plan, list(net.layers), net.options.exact
+        self._choice, self._from, self._write = choice, origin, write
+        self._losses = losses_of(net.loss_weights)
+        self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
+        layers = zip(net.plan.nodes, net.layers, strict=True)
+        ends = [node for node, layer in layers if layer.is_input or reads_data(layer)]
+        self._ends = {v: net.plan.blobs[v] for node in ends for v in node.tops}  # what no layer computes
+        self._built = {blob: net.shapes[blob] for blob in self._ends.values()}
+        self._model: Model | None = None
+        self._opened_for: tuple[Any, ...] | None = None
+        self._as_loaded = self._exported = self._stamps()
+        self._unable, self._told = False, False
+        self._fits: tuple[dict[int, Shape], dict[int, Shape]] = {}, {}  # of the inputs at the last pass, of all values
+
+    def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
+        """Run the net on the values of its inputs; None where torch has to."""
+        if self._unable or any(value.requires_grad for value in given.values()) or self._are_lent():
+            return None
+        try:
+            return self._pass(given, kept)
+        except Unable as fault:
+            tell_unable(self._choice, str(fault))
+            self._unable = True
+            return None
+
+    def _are_lent(self) -> bool:
+        """Return whether an alias could change the parameters; warn once."""
+        lent = any(is_lent(blob) for layer in self._layers for blob in layer.blobs)
+        if lent and not self._told:
+            self._told = True
+            tell_unable(self._choice, "parameters may change unseen while their memory is held, by .data or an array")
+        return lent
+
+    def _pass(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
+        names = self._plan.blobs
+        weighted = [(node.tops[j], w) for node, losses in self._losses_by_node() for j, w in losses]
+        wanted = (*sorted(kept), *(v for v, _ in weighted))
+        model = self._current(tuple(dict.fromkeys(names[v] for v in wanted)))
+        values = dict(given)
+        walk(self._readers, values, self._exact)
+        shapes = self._shapes({v: tuple(values[v].shape) for v in self._ends})
+        arrays = {names[v]: _array(values[v]) for v in self._ends}
+        found = {**arrays, **model.run(arrays)}
+        for v in wanted:
+            if shapes.get(v, found[names[v]].shape) != found[names[v]].shape:
+                raise Unable(f"{names[v]} has shape {found[names[v]].shape} there, expected {shapes[v]}")
+        values = {v: torch.from_numpy(found[names[v]]) for v in wanted}
+        loss = torch.zeros(())
+        for v, weight in weighted:
+            loss = loss + weighted_sum(values[v], weight, self._exact)
+        return loss, values
+
+    def _losses_by_node(self) -> list[tuple[Node, list[tuple[int, float]]]]:
+        """Return the nodes whose tops are losses with a name, and which of them with what weight."""
+        nodes = zip(self._plan.nodes, self._losses, strict=True)
+        return [(node, [(j, w) for j, w in losses if j < len(node.tops)]) for node, losses in nodes]
+
+    def _shapes(self, given: dict[int, Shape]) -> dict[int, Shape]:
+        """Return the shapes of the values for inputs of these. Raises SpecError where a layer cannot take them."""
+        if given != self._fits[0]:
+            self._fits = given, fitted(self._plan, self._layers, given)[1]
+        return self._fits[1]
+
+    def _stamps(self) -> tuple[Stamp, ...]:
+        return tuple(stamp(blob) for layer in self._layers for blob in layer.blobs)
+
+    def _current(self, blobs: tuple[str, ...]) -> Model:
+        """Return the model of the net as it is, with these blobs."""
+        if self._model is None or self._opened_for != (self._stamps(), blobs):
+            computed = [blob for blob in blobs if blob not in self._built]
+            self._model = Model(self._choice, self._origin(blobs), lambda path: self._write(path, computed))
+            if self._as_loaded == self._exported:
+                self._as_loaded = self._stamps()
+            self._opened_for = (self._stamps(), blobs)  # the export, too, counts as handing them out
+        return self._model
+
+    def _origin(self, blobs: tuple[str, ...]) -> Origin | None:
+        """Return what the net is made of; None where its parameters are not those of files, or no longer."""
+        self._exported = self._stamps()
+        if self._exported != self._as_loaded or (self._from is None and self._exported):
+            return None
+        files, options = (self._from.files, self._from.options) if self._from else ([], {})
+        return Origin(files, {**options, "blobs": blobs, "shapes": self._built})
+
+
+def _writer(net: Net, path: Path) -> Write:
+    """Return what exports a net as it is, read from ``path``; it does not keep the net alive."""
+    held, chosen = weakref.ref(net), net.options
+    readers = [blob for layer in net.layers if reads_data(layer) for blob in layer.param.top]
+
+    def write(to: Path, blobs: Sequence[str]) -> None:
+        original = held()
+        assert original is not None, "it is run by what calls this"
+        if readers:
+            shapes = {blob: original.shapes[blob] for blob in readers}
+            given = BuildOptions(level=chosen.level, stages=chosen.stages, given_shapes=shapes)
+            copy = Source(path, options=given).net()
+            copy.share_weights_with(original)
+            original = copy
+        write_model(original, to, blobs)
+        gc.collect()  # the writer's parts refer to each other, and to arrays that share the parameters' memory
+
+    return write
+
+
+def _array(value: torch.Tensor) -> np.ndarray:
+    return np.asarray(value.detach().cpu().numpy(), np.float32)

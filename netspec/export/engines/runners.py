@@ -1,0 +1,179 @@
+"""The libraries that run an exported model: how each prepares it once, opens it, and runs it.
+
+The weights are in a file beside the model, which both libraries map into memory instead of reading it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections import OrderedDict
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from netspec import log
+from netspec.export.engines.choice import BF16, FP32, ONNXRUNTIME, OPENVINO, Choice
+from netspec.export.engines.key import processor
+from netspec.export.engines.signal_stack import signal_stack_kept
+
+MODEL, OPTIMIZED = "net.onnx", "optimized.onnx"
+MOST_SHAPES = 4  # for which a model stays compiled
+Arrays = Mapping[str, np.ndarray]
+
+
+class Unable(Exception):
+    """An engine cannot run this net, or not in this way; the text says why."""
+
+
+def tell_unable(choice: Choice, reason: str) -> None:
+    """Warn that torch runs a net in the place of the chosen engine, or in fp32, if there is a reason."""
+    if reason:
+        log.logger.warning(f"engine {choice.engine}: {reason}; torch runs the net")
+    if choice.precision != FP32:
+        log.logger.warning(f"precision {choice.precision}: torch runs the net in {FP32}")
+
+
+class Runner(Protocol):
+    """An open model."""
+
+    def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
+        """Return the outputs by name, for inputs by name."""
+        ...
+
+
+def threads() -> int:
+    """Return how many threads a pass may use: as many as torch would."""
+    if torch := sys.modules.get("torch"):
+        return torch.get_num_threads()
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    if told.isdigit() and int(told) > 0:
+        return int(told)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class OnnxRuntime:
+    """onnxruntime on the CPU. Its own optimizations of a model are done once, for its version and for the processor."""
+
+    def __init__(self, folder: Path) -> None:
+        import onnxruntime
+
+        options = self._options(onnxruntime)
+        options.intra_op_num_threads = threads()
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL  # they are done
+        self._session = onnxruntime.InferenceSession(
+            str(folder / OPTIMIZED), options, providers=["CPUExecutionProvider"]
+        )
+        self._names = [output.name for output in self._session.get_outputs()]
+        self._inputs = {given.name for given in self._session.get_inputs()}
+
+    @staticmethod
+    def identity() -> dict[str, str]:
+        """Return what a prepared model depends on."""
+        import onnxruntime
+
+        return {"onnxruntime": onnxruntime.__version__, "processor": processor()}
+
+    @classmethod
+    def prepare(cls, folder: Path) -> None:
+        """Optimize the model in a folder; the one that was exported goes."""
+        import onnxruntime
+
+        options = cls._options(onnxruntime)
+        options.optimized_model_filepath = str(folder / OPTIMIZED)
+        for key, value in (("file_name", f"{OPTIMIZED}.data"), ("min_size_in_bytes", "1024")):
+            options.add_session_config_entry(f"session.optimized_model_external_initializers_{key}", value)
+        onnxruntime.InferenceSession(str(folder / MODEL), options, providers=["CPUExecutionProvider"])
+        for path in folder.glob(f"{MODEL}*"):
+            path.unlink()
+
+    def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
+        """See :class:`Runner`."""
+        given = {name: np.ascontiguousarray(value) for name, value in inputs.items() if name in self._inputs}
+        found: Any = self._session.run(self._names, given)
+        return dict(zip(self._names, found, strict=True))
+
+    @staticmethod
+    def _options(library: Any) -> Any:
+        options = library.SessionOptions()
+        options.log_severity_level = 3  # errors
+        return options
+
+
+class OpenVino:
+    """OpenVINO on the CPU; a model is compiled for each set of input shapes."""
+
+    def __init__(self, folder: Path, precision: str) -> None:
+        import openvino
+
+        self._core = openvino.Core()
+        if precision == BF16:
+            with signal_stack_kept():
+                able = self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+            if BF16.upper() not in able:
+                raise Unable("this CPU has no bf16")
+        self._path, self._precision = folder / MODEL, "bf16" if precision == BF16 else "f32"
+        self._compiled: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
+
+    @staticmethod
+    def identity() -> dict[str, str]:
+        """Return what a prepared model depends on."""
+        import openvino
+
+        return {"openvino": openvino.__version__}
+
+    @staticmethod
+    def prepare(folder: Path) -> None:
+        """Leave the model in a folder as it was exported."""
+
+    def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
+        """See :class:`Runner`."""
+        key = tuple((name, value.shape) for name, value in sorted(inputs.items()))
+        if key not in self._compiled:
+            self._compiled[key] = self._compile(inputs)
+            if len(self._compiled) > MOST_SHAPES:
+                self._compiled.popitem(last=False)
+        self._compiled.move_to_end(key)
+        request, wanted, outputs = self._compiled[key]
+        given = {name: np.ascontiguousarray(value) for name, value in inputs.items() if name in wanted}
+        found = request.infer(given, share_inputs=True)
+        return {name: np.array(found[name]) for name in outputs}
+
+    def _compile(self, inputs: Arrays) -> tuple[Any, set[str], list[str]]:
+        model = self._core.read_model(str(self._path))
+        wanted = {given.any_name for given in model.inputs}
+        outputs = [name for output in model.outputs for name in output.names]
+        model.reshape({name: list(value.shape) for name, value in inputs.items() if name in wanted})
+        settings = {
+            "INFERENCE_PRECISION_HINT": self._precision,
+            "INFERENCE_NUM_THREADS": threads(),
+            "PERFORMANCE_HINT": "LATENCY",
+        }
+        with signal_stack_kept():
+            compiled = self._core.compile_model(model, "CPU", settings)
+        return compiled.create_infer_request(), wanted, outputs
+
+
+RUNNERS: dict[str, type[OnnxRuntime] | type[OpenVino]] = {ONNXRUNTIME: OnnxRuntime, OPENVINO: OpenVino}
+
+
+def open_runner(engine: str, folder: Path, precision: str) -> Runner:
+    """Return a runner for the model in a folder. Raises Unable where its library cannot run it."""
+    try:
+        if engine == OPENVINO:
+            return OpenVino(folder, precision)
+        if precision == BF16:
+            raise Unable(f"{engine} has no bf16 here")
+        return OnnxRuntime(folder)
+    except Unable:
+        raise
+    except Exception as fault:  # each library has its own
+        raise Unable(reason(fault)) from None
+
+
+def reason(fault: Exception) -> str:
+    """Return a library's words in one line, not too long."""
+    text = " ".join(str(fault).split()) or type(fault).__name__
+    return text if len(text) <= 200 else f"{text[:197]}..."

@@ -1,0 +1,125 @@
+"""``netspec export`` and ``netspec fold``: from the user's files to files of another form."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+from netspec.errors import SpecError, Where
+from netspec.export.formats.deploy import fold, with_inputs, write_caffe
+from netspec.export.formats.onnx import export_onnx
+from netspec.export.formats.preprocess import Preprocess
+from netspec.export.formats.pt2 import export_pt2
+from netspec.export.formats.torch import export_torch, write_tensors
+from netspec.graph.filter import with_state
+from netspec.graph.options import BuildOptions
+from netspec.graph.prune import prune
+from netspec.layers.contract.folding import passes_on
+from netspec.net.build import build_net
+from netspec.net.net import Net
+from netspec.net.weights import load_weights
+from netspec.proto.schema import PHASES
+from netspec.proto.text import parse_net
+from netspec.terminal.version import version
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is exported: a net's prototxt, for a phase, and its weights, some files in a row.
+
+    Of ``options`` the level and stages count, the shapes of the tops of data layers and of inputs, and whether Python
+    layers may run. ``blobs``: only what computes these is exported. Without ``labels`` nothing that needs labels is:
+    losses, accuracies.
+    """
+
+    file: Path
+    weights: Sequence[Path] = ()
+    phase: str = "TEST"
+    options: BuildOptions = field(default_factory=BuildOptions)
+    blobs: Sequence[str] = ()
+    labels: bool = True
+
+    def net(self) -> Net:
+        """Return the net with its weights; layers that read data are inputs. Raises SpecError."""
+        message, source = parse_net(self.file)
+        message = with_state(message, PHASES[self.phase], self.options.level, self.options.stages)
+        message, source = with_inputs(message, source, self.options, self.labels)
+        if self.blobs:
+            message, source = prune(message, source, self.blobs, {})
+        net = build_net(message, source, replace(self.options, seed=0))
+        if self.weights:
+            load_weights(net, self.weights)
+        return net
+
+    def metadata(self) -> dict[str, str]:
+        """Return where an exported net comes from."""
+        told = {"prototxt": self.file.name, "prototxt.sha256": _sha256(self.file), "phase": self.phase}
+        if self.weights:
+            told["weights"] = ",".join(path.name for path in self.weights)
+            told["weights.sha256"] = ",".join(_sha256(path) for path in self.weights)
+        if self.options.level:
+            told["level"] = str(self.options.level)
+        if any(self.options.stages):
+            told["stages"] = ",".join(self.options.stages)
+        return {**told, "version": version()}
+
+    @property
+    def origin(self) -> str:
+        """Say in a few words where an exported net comes from."""
+        return " and ".join([self.file.name, *(path.name for path in self.weights)])
+
+
+def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | None = None) -> list[str]:
+    """Write a net as ``onnx``, ``torch``, ``pt2`` or ``safetensors``; return notes for its user, in lines.
+
+    Raises SpecError for any error in the files, and for a layer that cannot be exported.
+    """
+    if not out.parent.is_dir():
+        raise SpecError(f"there is no folder {out.parent}; make it first", Where(str(out)))
+    net = source.net()
+    if target == "onnx":
+        if preprocess and preprocess.blob not in net.inputs:
+            raise SpecError(
+                f'no input "{preprocess.blob}" in this net; it has: {", ".join(net.inputs)}', Where(str(source.file))
+            )
+        return export_onnx(net, out, source.metadata(), preprocess)
+    if target == "torch":
+        return export_torch(net, out, source.origin)
+    if target == "pt2":
+        return export_pt2(net, out)
+    write_tensors(blob_tensors(net), out, source.metadata())
+    return []
+
+
+def blob_tensors(net: Net) -> dict[str, torch.Tensor]:
+    """Return the learned blobs of a net in Caffe's order, as ``layer.index``; what layers share as its owner's."""
+    found: dict[str, torch.Tensor] = {}
+    seen: set[int] = set()
+    for layer in net.layers:
+        for j, blob in enumerate(layer.blobs):
+            if id(blob) not in seen:
+                found[f"{layer.param.name}.{j}"] = layer.blob(j).detach().cpu().contiguous()
+            seen.add(id(blob))
+    return found
+
+
+def fold_files(source: Source, prefix: Path) -> tuple[int, int]:
+    """Write the folded net as PREFIX.prototxt and PREFIX.caffemodel; return how many layers there were and are."""
+    if not prefix.parent.is_dir():
+        raise SpecError(f"there is no folder {prefix.parent}; make it first", Where(str(prefix)))
+    net = source.net()
+    message = fold(net)
+    write_caffe(message, prefix)
+    splits = sum(passes_on(layer) for layer in net.layers)
+    return len(net.layers) - splits, len(message.layer)
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None

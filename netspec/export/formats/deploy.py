@@ -1,0 +1,158 @@
+"""A net as it is shipped: inputs for data layers, no labels and losses, BatchNorm and Scale in the weights.
+
+The result is a NetParameter with its weights, for Caffe or any reader of its files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from netspec.data import blobs
+from netspec.files.whole_file import whole_file
+from netspec.graph.filter import filter_net
+from netspec.graph.fold import origins
+from netspec.graph.inputs import add_input
+from netspec.graph.options import BuildOptions
+from netspec.layers.contract.folding import passes_on
+from netspec.layers.contract.reading import reads_data
+from netspec.net.build import build_net
+from netspec.net.given_shapes import not_to_be_given
+from netspec.net.net import Net
+from netspec.proto.schema import NetParameter, ParamSpec
+from netspec.proto.source_map import SourceMap
+from netspec.proto.text import write_text
+from netspec.proto.upgrade.rewrite import copy_without
+from netspec.run.fold import Fold, find_folds
+
+
+def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool = True) -> tuple[Any, SourceMap]:
+    """Return a net in which layers that read data are Input layers; ``options`` has the shapes of their tops.
+
+    Without ``labels`` every top of such a layer but the first is left out, and so is what needs one of them: losses
+    and accuracies; the scores that they compared become outputs. The net's own ``state`` says which layers it has.
+    Raises SpecError for faults of the net, and where a shape is given for a blob that no such layer makes.
+    """
+    filtered, source = filter_net(net, source)
+    for fault in not_to_be_given(options.given_shapes, [filtered], source.file):
+        raise fault
+    probe = build_net(filtered, source, replace(options, device="meta", seed=0, open_data=False))
+    built = {layer.param.name: layer for layer in probe.layers}
+    result = copy_without(filtered, {"layer"})
+    places, missing = [], set()
+    for i, layer in enumerate(filtered.layer):
+        if missing & set(layer.bottom):
+            missing.update(layer.top)
+            continue
+        missing.difference_update(layer.top)
+        if not reads_data(built[layer.name]):
+            result.layer.add().CopyFrom(layer)
+            places.append(source.layers[i])
+            continue
+        kept = list(layer.top) if labels else list(layer.top)[:1]
+        missing.update(list(layer.top)[len(kept) :])
+        add_input(result, layer.name, dict(zip(kept, built[layer.name].top_shapes, strict=False)))
+        places.append(source.layers[i])
+    return result, source.with_layers(places)
+
+
+def fold(net: Net) -> NetParameter:
+    """Return a net with its weights, folded, without Splits, Dropouts and others that only pass their bottom on.
+
+    netspec/run/fold.py says what is folded. Blobs keep their names where they still exist, outputs always do;
+    layers that share parameters share them still where folding left them equal.
+    """
+    folds = find_folds(net.plan, list(net.layers))
+    plan = net.plan
+    passes = [passes_on(layer) for layer in net.layers]
+    origin = origins(plan, passes)
+    names = _names(net, origin)
+    gone = {i for each in folds for i in each.chain.folded}
+    absorbed = {each.chain.keeper: each for each in folds}
+    last = {each.chain.keeper: each.chain.last for each in folds}
+    first = {each.chain.keeper: min(each.chain.keeper, *each.chain.folded) for each in folds}
+    result = NetParameter(name=net.name)
+    for i, layer in enumerate(net.layers):
+        if i in gone:
+            continue
+        tops = [v for v in plan.nodes[last.get(i, i)].tops if not (passes[i] and v not in names)]
+        if passes[i] and not tops:
+            continue
+        written = result.layer.add()
+        written.CopyFrom(absorbed[i].absorbed.param if i in absorbed else layer.param)
+        for field in ("bottom", "top", "include", "exclude", "phase", "param", "propagate_down", "blobs"):
+            written.ClearField(field)
+        written.bottom.extend(names[origin[v]] for v in plan.nodes[first.get(i, i)].bottoms)
+        written.top.extend(names[v] for v in tops)
+        values = absorbed[i].absorbed.blobs if i in absorbed else tuple(layer.blob(j) for j in range(len(layer.blobs)))
+        written.param.extend(_shared_names(net, i, absorbed))
+        for blob in values:
+            written.blobs.append(blobs.from_array(blob.detach().cpu().float().numpy()))
+    return result
+
+
+def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
+    """Return the names of the values that are left.
+
+    A value that only the net's caller reads, under another name, takes that; where other layers read it too, it is no
+    output by its own name, and the layer that passes it on stays.
+    """
+    plan = net.plan
+    names = {v: blob for v, blob in enumerate(plan.blobs) if origin[v] == v}
+    taken = {v for v in plan.outputs.values() if origin[v] == v}
+    taken.update(
+        origin[v]
+        for node, layer in zip(plan.nodes, net.layers, strict=True)
+        if not passes_on(layer)
+        for v in node.bottoms
+    )
+    taken.update(v for node, layer in zip(plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops)
+    for name, v in plan.outputs.items():
+        if origin[v] != v and origin[v] in taken:
+            names[v] = name
+        elif origin[v] != v:
+            names[origin[v]] = name
+            taken.add(origin[v])
+    return names
+
+
+def _shared_names(net: Net, index: int, absorbed: Mapping[int, Fold]) -> list[Any]:
+    """Return the ``param { name }`` of a layer that still shares its blobs, all of them or none."""
+    layer, node = net.layers[index], net.plan.nodes[index]
+    named = [spec.name for spec in node.params]
+    if not any(named):
+        return []
+    sharers = [
+        i
+        for i, other in enumerate(net.layers)
+        if {id(blob) for blob in other.blobs} & {id(blob) for blob in layer.blobs}
+    ]
+    if len(sharers) < 2:
+        return []
+    values = [absorbed[i].absorbed.blobs if i in absorbed else tuple(net.layers[i].blobs) for i in sharers]
+    for others in values[1:]:
+        if len(others) != len(values[0]) or not all(map(_equal, others, values[0])):
+            return []
+    names = [*named, *[""] * (len(values[0]) - len(named))]
+    return [ParamSpec(name=name or f"{named[0]}_{j}") for j, name in enumerate(names)]
+
+
+def _equal(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return a.shape == b.shape and a.dtype == b.dtype and bool(torch.equal(a, b))
+
+
+def write_caffe(message: NetParameter, prefix: str | Path) -> tuple[Path, Path]:
+    """Write PREFIX.prototxt and PREFIX.caffemodel of a net with its weights; return both paths."""
+    prototxt, weights = (Path(f"{prefix}.{ending}") for ending in ("prototxt", "caffemodel"))
+    text = NetParameter()
+    text.CopyFrom(message)
+    for layer in text.layer:
+        del layer.blobs[:]
+    with whole_file(prototxt) as unfinished, whole_file(weights) as unfinished_weights:
+        unfinished.write_text(write_text(text))
+        unfinished_weights.write_bytes(message.SerializeToString(deterministic=True))
+    return prototxt, weights

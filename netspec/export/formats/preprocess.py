@@ -1,0 +1,98 @@
+"""What is done to an image before the net sees it, put into the exported model.
+
+Caffe: Transformer.preprocess (python/caffe/io.py), DataTransformer::Transform (src/caffe/data_transformer.cpp)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from netspec.data.mean import center
+from netspec.errors import SpecError
+from netspec.layers.contract.targets import Sizes
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """The steps before input ``blob``, in this order: crop, swap, raw_scale, mean, scale.
+
+    ``crop``: images may be larger than the input, the middle is taken. ``swap``: the channels come in reverse order,
+    RGB for a net that was trained with BGR. ``raw_scale`` multiplies, ``mean`` is subtracted, ``scale`` multiplies;
+    ``mean`` is one number for each channel, or an array (C, H, W) of the input's size. ``uint8``: images are bytes.
+    """
+
+    blob: str = "data"
+    mean: np.ndarray | None = None
+    scale: float = 1.0
+    raw_scale: float = 1.0
+    swap: bool = False
+    crop: bool = False
+    uint8: bool = False
+
+    @property
+    def changes_images(self) -> bool:
+        """Whether there is any step at all."""
+        return self.mean is not None or (self.scale, self.raw_scale) != (1, 1) or self.swap or self.crop or self.uint8
+
+    @property
+    def description(self) -> str:
+        """Say in a line what the exported model takes."""
+        steps = [
+            *(["the middle part of the net's size is taken"] if self.crop else []),
+            *(["the channels are reversed"] if self.swap else []),
+            *([f"multiplied by {self.raw_scale:g}"] if self.raw_scale != 1 else []),
+            *(["the mean is subtracted"] if self.mean is not None else []),
+            *([f"multiplied by {self.scale:g}"] if self.scale != 1 else []),
+        ]
+        kind = "uint8" if self.uint8 else "float32"
+        order = "RGB for a net of BGR images" if self.swap else "channels in the net's order"
+        return f"{self.blob}: {kind} (N, C, H, W), {order}; inside the model: {', then '.join(steps) or 'nothing else'}"
+
+    def mean_for(self, shape: Sizes) -> np.ndarray | None:
+        """Return the mean, shaped to be subtracted from an input (N, C, H, W) of this shape."""
+        if self.mean is None:
+            return None
+        mean = np.asarray(self.mean, np.float32)
+        _, channels, height, width = shape
+        if mean.ndim == 1 and len(mean) in (1, channels):
+            return mean.reshape(-1, 1, 1)
+        if mean.ndim == 3 and mean.shape[0] == channels and height is not None and width is not None:
+            if mean.shape[1] < height or mean.shape[2] < width:
+                found = f"found a mean of {mean.shape[1]} x {mean.shape[2]} pixels"
+                raise SpecError(f"{found}, expected at least {height} x {width}")
+            return center(mean, height, width)
+        raise SpecError(
+            f"--mean: found a mean of shape {mean.shape}, expected one number for each of the {channels} channels, "
+            f"or an image of the size of {self.blob}, {shape[1:]}"
+        )
+
+    def to_onnx(self, graph: Any, value: str, shape: Sizes) -> tuple[Any, list[int | str | None], str]:
+        """Write the steps for an input of this shape; return its dtype, its sizes (None: the net's), and the result."""
+        if len(shape) != 4:
+            raise SpecError(f"{self.blob} has shape {shape}, expected images (N, C, H, W)")
+        if self.uint8:
+            value = graph.cast(value, "float32")
+        sizes: list[int | str | None] = [None] * 4
+        if self.crop:
+            value = self._crop(graph, value, shape)
+            sizes[2:] = ["image_H", "image_W"]
+        if self.swap:
+            value = graph.node("Gather", value, graph.constant(list(range(shape[1] or 0))[::-1]), axis=1)
+        if self.raw_scale != 1:
+            value = graph.node("Mul", value, graph.constant(float(self.raw_scale)))
+        mean = self.mean_for(shape)
+        if mean is not None:
+            value = graph.node("Sub", value, graph.constant(mean))
+        if self.scale != 1:
+            value = graph.node("Mul", value, graph.constant(float(self.scale)))
+        return np.uint8 if self.uint8 else np.float32, sizes, value
+
+    def _crop(self, graph: Any, value: str, shape: Sizes) -> str:
+        if shape[2] is None or shape[3] is None:
+            raise SpecError(f"--crop: the height and width of {self.blob} are free, so there is no size to crop to")
+        size = graph.constant([shape[2], shape[3]])
+        start = graph.node("Div", graph.node("Sub", graph.shape_of(value, 2, 4), size), graph.constant([2, 2]))
+        return graph.node("Slice", value, start, graph.node("Add", start, size), graph.constant([2, 3]))

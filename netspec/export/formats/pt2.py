@@ -1,0 +1,168 @@
+"""``--to pt2``: a net as a torch.export archive, which computes what the exported source does.
+
+No source is written and run for it: the expressions of the layers are parsed and computed one by one.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import io
+import math
+import operator
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from netspec.errors import SpecError, Where
+from netspec.export.formats.inputs import check_shapes
+from netspec.export.formats.shapes import NetShapes, input_shapes, settled
+from netspec.export.formats.source import MARK, Program, joined, legal, unique
+from netspec.export.formats.torch_code import write_program
+from netspec.files.whole_file import whole_file
+from netspec.net.net import Net
+
+OPERATORS: dict[type, Callable[..., Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.USub: operator.neg,
+    ast.NotEq: operator.ne,
+}
+
+
+def export_pt2(net: Net, path: str | Path) -> list[str]:
+    """Write a net as a torch.export archive; return notes for its user.
+
+    The sizes are free as in the source where torch.export can follow them, or else the batch alone, or none.
+    Raises SpecError where torch.export cannot take the net, and where it cannot be written.
+    """
+    module, shapes = _made(net)
+    inputs = [v for node, layer in zip(net.plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops]
+    notes = list(shapes.fixed)
+    for names in _choices([free.name for free in shapes.free if not free.counted]):
+        dims = {free.name: torch.export.Dim.AUTO for free in shapes.free if free.name in names}
+        axes = {axis: free.name for free in shapes.free for axis in free.axes if free.name in dims}
+        dynamic = [
+            {axis: dims[axes[v, axis]] for axis in range(len(shapes.built[v])) if (v, axis) in axes} for v in inputs
+        ]
+        example = []
+        for v in inputs:  # a size of 1 would be taken for a constant
+            sizes = [max(2, size) if (v, axis) in axes else size for axis, size in enumerate(shapes.built[v])]
+            example.append(torch.zeros(sizes))
+        try:
+            program = torch.export.export(module, tuple(example), dynamic_shapes=tuple(dynamic), strict=False)
+        except Exception as fault:
+            reason = str(fault).strip().splitlines()
+            if not names:
+                raise SpecError(
+                    f"torch.export cannot take it: {reason[0] if reason else fault}", Where(str(path))
+                ) from fault
+            continue
+        with whole_file(path) as unfinished:
+            buffer = io.BytesIO()
+            torch.export.save(program, buffer)
+            unfinished.write_bytes(buffer.getvalue())
+        fixed = [free.name for free in shapes.free if not free.counted and free.name not in names]
+        return [*notes, *([f"torch.export fixes the sizes {joined(fixed)}"] if fixed else [])]
+    raise AssertionError("the last choice has no free size")
+
+
+def _choices(names: list[str]) -> list[list[str]]:
+    """Return which sizes to leave free, the most first."""
+    return [*([names] if len(names) > 1 else []), *([["N"]] if "N" in names else []), []]
+
+
+def torch_module(net: Net) -> nn.Module:
+    """Return a module that computes what the exported source does, with its weights, for inference."""
+    return _made(net)[0]
+
+
+def _made(net: Net) -> tuple[nn.Module, NetShapes]:
+    program, shapes = settled(net, lambda shapes: write_program(net, shapes))
+    return _ProgramModule(program, input_shapes(net, shapes)).eval(), shapes
+
+
+class _ProgramModule(nn.Module):
+    """A program whose expressions are computed one by one."""
+
+    def __init__(self, program: Program, expected: Mapping[str, tuple[int | str, ...]]) -> None:
+        super().__init__()
+        self.program, self.expected = program, expected
+        self.attributes = program.attributes()
+        libraries = {"torch": torch, "nn": nn, "F": F, "math": math}
+        self.known = {**libraries, **program.functions, **{f"n{i}": n for i, (_, n) in enumerate(program.numbers)}}
+        state = {}
+        for m, attribute in self.attributes.items():
+            module = program.modules[m]
+            made = _value(_parsed(module.constructor({})), libraries)
+            if module.kind == "buffer":
+                self.register_buffer(attribute, made)
+            else:
+                setattr(self, attribute, made)
+            state.update(module.tensors(attribute))
+        self.load_state_dict(state)
+        self.steps = [(statement.targets, _parsed(statement.expression)) for statement in program.statements]
+
+        taken = set(program.functions)
+        arguments = [unique(legal(program.names[v], "blob_"), taken) for v in program.inputs]
+        kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        self.signature = inspect.Signature([inspect.Parameter(name, kind) for name in arguments])
+
+        def forward(*inputs: torch.Tensor, **named: torch.Tensor) -> Any:
+            return self._outputs(*self.signature.bind(*inputs, **named).args)
+
+        forward.__signature__ = self.signature  # pyright: ignore[reportFunctionMemberAccess]
+        self.forward = forward
+
+    def _outputs(self, *inputs: torch.Tensor) -> Any:
+        """Return the output, or a dict of the outputs if there are several."""
+        program = self.program
+        check_shapes({program.names[v]: x.shape for v, x in zip(program.inputs, inputs, strict=True)}, self.expected)
+        names = {**self.known, "self": self, **{f"v{v}": x for v, x in zip(program.inputs, inputs, strict=True)}}
+        names.update({f"m{m}": getattr(self, attribute) for m, attribute in self.attributes.items()})
+        for targets, expression in self.steps:
+            made = _value(expression, names)
+            names.update({f"v{v}": x for v, x in zip(targets, made if len(targets) > 1 else (made,), strict=True)})
+        outputs = {name: names[f"v{v}"] for name, v in program.outputs.items()}
+        return outputs if len(outputs) != 1 else next(iter(outputs.values()))
+
+
+def _parsed(expression: str) -> ast.expr:
+    """Return the tree of an expression, in which names such as v3 stand for its marks."""
+    return ast.parse(MARK.sub(r"\1\2", expression), mode="eval").body
+
+
+def _value(node: ast.AST | None, names: Mapping[str, Any]) -> Any:
+    """Return the value of an expression. It knows what layers write; nothing else can be said in it."""
+    match node:
+        case None | ast.Constant():
+            return None if node is None else node.value
+        case ast.Name():
+            return names[node.id]
+        case ast.Attribute():
+            return getattr(_value(node.value, names), node.attr)
+        case ast.Tuple():
+            return tuple(_value(each, names) for each in node.elts)
+        case ast.List():
+            return [_value(each, names) for each in node.elts]
+        case ast.Subscript():
+            return _value(node.value, names)[_value(node.slice, names)]
+        case ast.Slice():
+            return slice(_value(node.lower, names), _value(node.upper, names), _value(node.step, names))
+        case ast.UnaryOp():
+            return OPERATORS[type(node.op)](_value(node.operand, names))
+        case ast.BinOp():
+            return OPERATORS[type(node.op)](_value(node.left, names), _value(node.right, names))
+        case ast.Compare(ops=[operation], comparators=[right]):
+            return OPERATORS[type(operation)](_value(node.left, names), _value(right, names))
+        case ast.Call():
+            arguments = [_value(each, names) for each in node.args]
+            options = {keyword.arg: _value(keyword.value, names) for keyword in node.keywords if keyword.arg}
+            return _value(node.func, names)(*arguments, **options)
+    raise AssertionError(f"a layer wrote {ast.dump(node)}")

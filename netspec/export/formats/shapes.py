@@ -1,0 +1,186 @@
+"""Which sizes of an exported net its caller may choose: the batch, height and width, where the net allows it.
+
+Each is tried: the shapes of all blobs are computed as if Caffe's net had been reshaped to inputs of other sizes. What
+changes is free; what makes a layer refuse is fixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+from netspec.data.blobs import Shape
+from netspec.errors import SpecError, Where
+from netspec.layers.contract.targets import Sizes
+from netspec.net.net import Net
+
+Shapes = tuple[Shape, ...]  # by value number of the Plan
+Axis = tuple[int, int]  # value number, axis
+T = TypeVar("T")
+WORDS = {"N": "batch", "H": "height", "W": "width"}
+
+
+def _other_sizes(size: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return sizes of which one must be possible for a size to be called free, and more to find what varies."""
+    return (2 * size, 3 * size, size + 32), (size + 7, size + 1)
+
+
+@dataclass(frozen=True)
+class FreeSize:
+    """A size that is known when the exported net runs.
+
+    ``axes`` have it, each of an input, or of the top of a layer that counts what it finds (``counted``). ``tried`` are
+    the shapes of all values at some other sizes than ``size``, which the net was built with.
+    """
+
+    name: str
+    size: int
+    axes: tuple[Axis, ...]
+    tried: tuple[Shapes, ...]
+    counted: bool = False
+
+
+@dataclass(frozen=True)
+class NetShapes:
+    """The shapes of all values, as the net was built, and which of their sizes are free.
+
+    ``fixed`` has a line for the user for each batch, height and width of an input that is not free.
+    """
+
+    built: Shapes
+    free: tuple[FreeSize, ...]
+    fixed: tuple[str, ...] = ()
+
+    def sizes(self, value: int) -> Sizes:
+        """Return the shape of a value; None where it varies."""
+        return tuple(None if self.chosen(value, axis) else size for axis, size in enumerate(self.built[value]))
+
+    def chosen(self, value: int, axis: int) -> list[FreeSize]:
+        """Return the free sizes on which the size of an axis depends."""
+        size = self.built[value][axis]
+        return [free for free in self.free if any(shapes[value][axis] != size for shapes in free.tried)]
+
+    def same(self, first: Axis, second: Axis) -> bool:
+        """Return whether two axes have one size, whatever is chosen."""
+        every = [self.built, *(shapes for free in self.free for shapes in free.tried)]
+        return all(shapes[first[0]][first[1]] == shapes[second[0]][second[1]] for shapes in every)
+
+    def name(self, value: int, axis: int) -> str:
+        """Return the name of the free size that an axis has, or ``?`` where its size only depends on one."""
+        return next((free.name for free in self.free if self.same(free.axes[0], (value, axis))), "?")
+
+    def without(self, fixed: FreeSize, why: str) -> NetShapes:
+        """Return the shapes with one size fixed, for a reason."""
+        free = tuple(other for other in self.free if other is not fixed)
+        return NetShapes(self.built, free, (*self.fixed, _line(fixed.name, fixed.size, why)))
+
+
+def _line(name: str, size: int, why: str) -> str:
+    kind, _, blob = name.partition("_")
+    return f"the {WORDS[kind]}{f' of {blob}' if blob else ''} is fixed at {size}: {why}"
+
+
+class Fixed(Exception):
+    """A layer needs the size of an axis of a value as a number."""
+
+    def __init__(self, value: int, axis: int, why: str) -> None:
+        super().__init__(why)
+        self.value, self.axis, self.why = value, axis, why
+
+
+def settled(net: Net, write: Callable[[NetShapes], T]) -> tuple[T, NetShapes]:
+    """Return what ``write`` makes of a net's shapes, and those: fewer are free each time that it raises Fixed."""
+    shapes = find_shapes(net)
+    while True:
+        try:
+            return write(shapes), shapes
+        except Fixed as fixed:
+            for free in shapes.chosen(fixed.value, fixed.axis):
+                if free.counted:
+                    raise SpecError(f"cannot be exported: {fixed.why}", Where(net.plan.source.file)) from None
+                shapes = shapes.without(free, fixed.why)
+
+
+def find_shapes(net: Net) -> NetShapes:
+    """Return the shapes of the values of a net, with every size free that Caffe's net could be reshaped to."""
+    built = _propagate(net, {})
+    free, fixed = [], []
+    for name, axes in _input_sizes(net).items():
+        size = built[axes[0][0]][axes[0][1]]
+        tried, fault = _try(net, axes, size)
+        if fault is None:
+            free.append(FreeSize(name, size, axes, tried))
+        else:
+            culprit = fault.where and fault.where.layer
+            fixed.append(_line(name, size, f"{fault.where} takes no other" if culprit else str(fault)))
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        if layer.counted_axis is not None:
+            axes = tuple((v, layer.counted_axis) for v in node.tops)
+            size = built[axes[0][0]][axes[0][1]]
+            tried, fault = _try(net, axes, size)
+            if fault is not None:
+                raise fault
+            free.append(FreeSize(f"N_{node.name}", size, axes, tried, counted=True))
+    _propagate(net, {})  # layers keep the geometry that they saw last
+    return NetShapes(built, tuple(free), tuple(fixed))
+
+
+def input_shapes(net: Net, shapes: NetShapes) -> dict[str, tuple[int | str, ...]]:
+    """Return what inputs the net takes, by blob: for each size its number, or a name where it is free.
+
+    Inputs that have one name for a size must agree about it, as Caffe's layers want it.
+    """
+    found: dict[str, tuple[int | str, ...]] = {}
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        for v in node.tops if layer.is_input else ():
+            sizes: list[int | str] = list(shapes.built[v])
+            for free in shapes.free:
+                for axis in (axis for value, axis in free.axes if value == v and not free.counted):
+                    shared = any(value != v for value, _ in free.axes)
+                    alone = shared and _try(net, ((v, axis),), free.size)[1] is None
+                    sizes[axis] = f"{free.name}_{net.plan.blobs[v]}" if alone else free.name
+            found[net.plan.blobs[v]] = tuple(sizes)
+    _propagate(net, {})
+    return found
+
+
+def _input_sizes(net: Net) -> dict[str, tuple[Axis, ...]]:
+    """Return the sizes of the inputs that might be free, by name: equal ones of one kind are one."""
+    found: dict[tuple[str, int], list[Axis]] = {}
+    names: dict[tuple[str, int], str] = {}
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        for v, shape in zip(node.tops, layer.top_shapes, strict=True) if layer.is_input else ():
+            kinds = {"N": 0, "H": 2, "W": 3} if len(shape) == 4 else {"N": 0} if shape else {}
+            for kind, axis in kinds.items():
+                key = (kind, shape[axis])
+                found.setdefault(key, []).append((v, axis))
+                taken = kind in names.values()
+                names.setdefault(key, f"{kind}_{net.plan.blobs[v]}" if taken else kind)
+    return {names[key]: tuple(axes) for key, axes in found.items()}
+
+
+def _try(net: Net, axes: tuple[Axis, ...], size: int) -> tuple[tuple[Shapes, ...], SpecError | None]:
+    """Return the shapes for other sizes of these axes, and the fault where none is possible."""
+    tried, faults = [], []
+    for sizes in _other_sizes(size):
+        for other in sizes:
+            try:
+                tried.append(_propagate(net, dict.fromkeys(axes, other)))
+            except SpecError as fault:
+                faults.append(fault)
+        if not tried:
+            return (), faults[0]
+    return tuple(tried), None
+
+
+def _propagate(net: Net, given: Mapping[Axis, int]) -> Shapes:
+    """Return the shapes of all values where some axes have the sizes given."""
+    shapes: list[Shape] = []
+    for node, layer in zip(net.plan.nodes, net.layers, strict=True):
+        bottoms = [shapes[v] for v in node.bottoms]
+        tops = layer.top_shapes if layer.is_input else [layer.possible(shape) for shape in layer.reshape(bottoms)]
+        for v, shape in zip(node.tops, tops, strict=False):
+            assert v == len(shapes), "values are numbered in the order in which they are written"
+            shapes.append(tuple(given.get((v, axis), size) for axis, size in enumerate(shape)))
+    return tuple(shapes)

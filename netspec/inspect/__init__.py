@@ -1,0 +1,1 @@
+"""Ways to look at nets, trainings and their files without changing them."""

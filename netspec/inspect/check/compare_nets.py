@@ -1,0 +1,203 @@
+"""Two nets: their layers by name, what each reads, what it is set to, with whom it shares parameters."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from netspec import log
+from netspec.graph.filter import filter_net, with_state
+from netspec.graph.plan import Node, Plan, make_plan
+from netspec.inspect.check.difference import Difference, Differences, child, differences, labeled
+from netspec.proto.schema import PHASE_NAMES, TEST, TRAIN, NetParameter, ParamSpec
+from netspec.proto.source_map import SourceMap
+
+_WIRING = ("name", "bottom", "top", "param", "blobs", "phase", "include", "exclude", "propagate_down", "loss_weight")
+_NOT_THE_NET = ("layer", "layers", "state", "input", "input_shape", "input_dim")
+LOSS = "Loss"  # how the types of layers end whose first top has loss weight 1 where none is given
+Key = tuple[str, int]  # a layer's name, and which of the layers of that name it is
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A net in one state."""
+
+    plan: Plan
+    keys: dict[Key, int]  # the number of each layer in the plan
+    makers: dict[int, tuple[Key, int]]  # the layer and the top that make each value
+
+
+def compare_nets(first: tuple[NetParameter, SourceMap], second: tuple[NetParameter, SourceMap]) -> Differences:
+    """Yield what differs in phase TRAIN, in phase TEST, or in both."""
+    by_phase = []
+    for phase in (TRAIN, TEST):
+        one, other = ((with_state(net, phase), source) for net, source in (first, second))
+        by_phase.append({str(each): each for each in compare_in_state(one, other)})
+    for text, each in {**by_phase[0], **by_phase[1]}.items():
+        only = [PHASE_NAMES[k] for k, found in enumerate(by_phase) if text in found]
+        yield each if len(only) == 2 else replace(each, message=f"in phase {only[0]} {each.message}")
+    yield from _rules(first, second)
+
+
+def compare_in_state(first: tuple[NetParameter, SourceMap], second: tuple[NetParameter, SourceMap]) -> Differences:
+    """Yield what differs between two nets whose ``state`` is set."""
+    (net, source), (other_net, other_source) = second, first
+    yield from differences(other_net, net, source.net, other_source.net, _NOT_THE_NET)
+    old, new = (_seen(*each) for each in (first, second))
+    names = _matched(old, new)
+    for key, i in old.keys.items():
+        if key not in names:
+            where = old.plan.source.at(i, layer=key[0], type=old.plan.nodes[i].type)
+            yield Difference(where, "is only here, not in the second net")
+    back = {to: key for key, to in names.items()}
+    for key, i in new.keys.items():
+        if key in back:
+            yield from _layers(old, new, old.keys[back[key]], i, names)
+        else:
+            where = new.plan.source.at(i, layer=key[0], type=new.plan.nodes[i].type)
+            yield Difference(where, "is only here, not in the first net")
+
+
+def _seen(net: NetParameter, source: SourceMap) -> _Seen:
+    with log.silent():
+        filtered, placed = filter_net(net, source)
+    plan = make_plan(filtered, placed.telling(lambda fault: None))
+    keys = _keys(node.name for node in plan.nodes)
+    makers = {v: (key, j) for key, node in zip(keys, plan.nodes, strict=True) for j, v in enumerate(node.tops)}
+    return _Seen(plan, {key: i for i, key in enumerate(keys)}, makers)
+
+
+def _keys(names: Iterable[str]) -> list[Key]:
+    counts: Counter[str] = Counter()
+    keys = []
+    for name in names:
+        keys.append((name, counts[name]))
+        counts[name] += 1
+    return keys
+
+
+def _matched(old: _Seen, new: _Seen) -> dict[Key, Key]:
+    """Return which layer of the second net is which of the first: by name; of the others those set alike, in order."""
+    names = {key: key for key in old.keys if key in new.keys}
+    left = [key for key in new.keys if key not in names]
+    for key in old.keys:
+        if key in names:
+            continue
+        for candidate in left:
+            if _alike(old, old.keys[key], new, new.keys[candidate]):
+                names[key] = candidate
+                left.remove(candidate)
+                break
+    return names
+
+
+def _alike(old: _Seen, i: int, new: _Seen, j: int) -> bool:
+    one, other = old.plan.net.layer[i], new.plan.net.layer[j]
+    place = old.plan.source.layers[i]
+    return one.type == other.type and not any(differences(one, other, place, place, _WIRING))
+
+
+def _layers(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
+    """Yield what differs between two layers that belong together."""
+    one, other = old.plan.net.layer[i], new.plan.net.layer[j]
+    there, here = old.plan.source.layers[i], new.plan.source.layers[j]
+    found = [
+        *_own(old.plan.nodes[i], new.plan.nodes[j], one, other, here, there),
+        *differences(one, other, here, there, _WIRING),
+        *_reads(old, new, i, j, names),
+        *_params(old, new, i, j, names),
+    ]
+    for each in found:
+        yield labeled(each, other)
+
+
+def _own(old: Node, new: Node, one: Any, other: Any, here: Any, there: Any) -> Differences:
+    if one.name != other.name:
+        yield Difference(here.find("name"), f'was called "{one.name}"', there.find("name"))
+    for k, (a, b) in enumerate(zip(one.top, other.top, strict=False)):
+        if a != b and not (k < len(old.in_place) and old.in_place[k]) and not new.in_place[k]:
+            yield Difference(here.find("top", k), f'top {k} is "{b}", was "{a}"', there.find("top", k))
+    if len(one.top) != len(other.top):
+        yield Difference(here.find("top"), f"{len(other.top)} tops, were {len(one.top)}", there.find("top"))
+    weights = [list(layer.loss_weight) or [1.0] * layer.type.endswith(LOSS) for layer in (one, other)]
+    if weights[0] != weights[1]:
+        was, now = (" ".join(f"{w:g}" for w in each) or "absent" for each in weights)
+        yield Difference(here.find("loss_weight"), f"loss_weight is {now}, was {was}", there.find("loss_weight"))
+    if old.blocked != new.blocked and len(old.blocked) == len(new.blocked):
+        was, now = (" ".join("false" if each else "true" for each in node.blocked) for node in (old, new))
+        yield Difference(
+            here.find("propagate_down"), f"propagate_down is {now}, was {was}", there.find("propagate_down")
+        )
+
+
+def _reads(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
+    """Yield other inputs: those that another layer, or another of its tops, has made."""
+    before, after = old.plan.nodes[i], new.plan.nodes[j]
+    there, here = old.plan.source.layers[i], new.plan.source.layers[j]
+    if len(before.bottoms) != len(after.bottoms):
+        message = f"{len(after.bottoms)} bottoms, were {len(before.bottoms)}"
+        yield Difference(here.find("bottom"), message, there.find("bottom"))
+    for k, (a, b) in enumerate(zip(before.bottoms, after.bottoms, strict=False)):
+        maker, top = old.makers.get(a, (("", 0), 0))
+        was = (names.get(maker, maker), top) if a >= 0 else None
+        now = new.makers.get(b)
+        if was != now:
+            told = f"bottom {k} is {_told(new, now)}, was {_told(old, old.makers.get(a))}"
+            yield Difference(here.find("bottom", k), told, there.find("bottom", k))
+
+
+def _told(seen: _Seen, maker: tuple[Key, int] | None) -> str:
+    if maker is None:
+        return "a blob that no layer makes"
+    (name, _), top = maker
+    blob = seen.plan.net.layer[seen.keys[maker[0]]].top[top]
+    return f'"{blob}" of layer "{name}"'
+
+
+def _params(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
+    """Yield other multipliers, and parameters that are shared with others than before."""
+    one, other = old.plan.net.layer[i], new.plan.net.layer[j]
+    there, here = old.plan.source.layers[i], new.plan.source.layers[j]
+    for k in range(max(len(one.param), len(other.param))):
+        specs = [layer.param[k] if k < len(layer.param) else ParamSpec() for layer in (one, other)]
+        places = child(here, "param", k), child(there, "param", k)
+        for each in differences(specs[0], specs[1], *places, ignored=("name",)):
+            yield replace(each, message=f"param {k}: {each.message}")
+        was, now = _owner(old, i, k), _owner(new, j, k)
+        if (was and (names.get(was[0], was[0]), was[1])) != now:
+            told = f"param {k} is {_shared(now)}, was {_shared(was)}"
+            yield Difference(places[0].where, told, places[1].where)
+
+
+def _owner(seen: _Seen, i: int, k: int) -> tuple[Key, int] | None:
+    params = seen.plan.nodes[i].params
+    owner = params[k].owner if k < len(params) else None
+    if owner is None:
+        return None
+    return next(key for key, number in seen.keys.items() if number == owner[0]), owner[1]
+
+
+def _shared(owner: tuple[Key, int] | None) -> str:
+    return f'that of layer "{owner[0][0]}"' if owner else "the layer's own"
+
+
+def _rules(first: tuple[NetParameter, SourceMap], second: tuple[NetParameter, SourceMap]) -> Differences:
+    """Yield other rules about levels and stages: phases are looked at by what they give."""
+    old = {key: i for i, key in enumerate(_keys(layer.name for layer in first[0].layer))}
+    for j, key in enumerate(_keys(layer.name for layer in second[0].layer)):
+        i, layer = old.get(key), second[0].layer[j]
+        if i is None:
+            continue
+        for name in ("include", "exclude"):
+            was, now = (sorted(_levels(getattr(each, name))) for each in (first[0].layer[i], layer))
+            if was != now:
+                where = second[1].at(j, name, layer=layer.name, type=layer.type)
+                yield Difference(where, f"{name} has other levels or stages", first[1].at(i, name))
+
+
+def _levels(rules: Any) -> Iterator[bytes]:
+    for rule in rules:
+        if rule.stage or rule.not_stage or rule.HasField("min_level") or rule.HasField("max_level"):
+            yield rule.SerializeToString(deterministic=True)

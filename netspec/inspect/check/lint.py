@@ -1,0 +1,57 @@
+"""``netspec lint``: what the rules find in a file, in all its phases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from netspec.errors import SpecError, UnknownShape
+from netspec.graph.options import BuildOptions
+from netspec.inspect.check.check import ON_META, Checked, check_file
+from netspec.inspect.check.findings import Finding
+from netspec.net.net import Net
+from netspec.proto.schema import TEST, TRAIN, PhaseValue
+
+MISSING_DATA = "missing-data"
+
+
+@dataclass
+class Linted:
+    """What is found in a file.
+
+    ``faults`` keep a net from being built. ``unknown`` ask for shapes; until they are given, rules that need them are
+    not applied. A file that is not ``readable`` has faults only. ``nets`` are what was built.
+    """
+
+    found: list[Finding] = field(default_factory=list)
+    faults: list[SpecError] = field(default_factory=list)
+    unknown: list[SpecError] = field(default_factory=list)
+    readable: bool = True
+    nets: list[Net] = field(default_factory=list)
+
+
+def lint_file(path: str | Path, options: BuildOptions = ON_META) -> Linted:
+    """Apply the rules to a net in both phases, or to a solver and its nets; arguments as for check_file.
+
+    A phase for which a net has no data layer is left out where the other has one.
+    """
+
+    def check(phase: PhaseValue) -> list[Checked]:
+        return check_file(path, phase, options)
+
+    parts = check(TRAIN)
+    if len(parts) == 1 and parts[0].net is not None:
+        phases = [parts[0], *check(TEST)]
+        parts = [part for part in phases if not _lacks_data(part)] or phases
+    faults = {str(fault): fault for part in parts for fault in part.faults}.values()
+    return Linted(
+        list({str(found): found for part in parts for found in part.advice}.values()),
+        [fault for fault in faults if not isinstance(fault, UnknownShape)],
+        [fault for fault in faults if isinstance(fault, UnknownShape)],
+        any(part.net is not None for part in parts),
+        [part.net for part in parts if part.net is not None],
+    )
+
+
+def _lacks_data(part: Checked) -> bool:
+    return any(found.rule == MISSING_DATA for found in part.advice)

@@ -1,0 +1,252 @@
+"""The rules for nets. Their docstrings say why they are there; ``netspec lint --rules`` prints them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from netspec.errors import Where
+from netspec.graph.plan import Plan
+from netspec.inspect.check.findings import NET, PLAN, TEXT, Said, rule
+from netspec.layers import layer_class
+from netspec.net.net import Net
+from netspec.proto.schema import TEST, TRAIN, NetParameter, fields_of
+from netspec.proto.source_map import SourceMap
+
+BEFORE_NET = ("mean_value", "mean_file", "scale")  # of transform_param: what changes all images alike
+
+
+@rule("transform-differs", TEXT)
+def _transforms(net: NetParameter, source: SourceMap) -> Said:
+    """A net should be tested on what it is trained on.
+
+    The layers that make the same blob in the two phases should subtract the same mean and multiply by the same scale.
+    """
+    first: dict[str, int] = {}
+    for i, layer in enumerate(net.layer):
+        if layer.bottom or not layer.top or not layer.HasField("transform_param"):
+            continue
+        other = first.setdefault(layer.top[0], i)
+        for name in BEFORE_NET:
+            here, there = (_plain(getattr(net.layer[k].transform_param, name)) for k in (i, other))
+            if here != there:
+                line = source.layers[other].where.line
+                yield (
+                    source.at(i, "transform_param", name, layer=layer.name, type=layer.type),
+                    f'{name} is {_told(here)} here, and {_told(there)} in line {line}, where "{layer.top[0]}" of '
+                    "another phase is read; give both the same",
+                )
+
+
+@rule("missing-data", PLAN)
+def _missing_data(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """A phase whose data layers are all left out computes nothing."""
+    readers = [i for i, layer in enumerate(net.layer) if not layer.bottom and layer.type != "Input"]
+    if readers and plan.nodes and all(node.bottoms for node in plan.nodes):
+        layer = net.layer[readers[0]]
+        place = source.at(readers[0], layer=layer.name, type=layer.type)
+        yield place, "no data layer is left in this phase; add one with include { phase: ... }"
+
+
+@rule("unused-blob", PLAN)
+def _unused(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """In a net with a loss, a blob that no layer reads costs time, and its reader may be missing.
+
+    Losses and scores are printed, so they are used. ``Silence`` takes what is not wanted.
+    """
+    if not any(map(any, _loss_weights(plan))):
+        return  # a deploy net: its outputs are its purpose
+    weights = _loss_weights(plan)
+    for i, node in enumerate(plan.nodes):
+        cls = layer_class(node.type)
+        if cls is None or cls.label_bottoms or cls.is_loss:
+            continue
+        for j, v in enumerate(node.tops):
+            name = plan.blobs[v]
+            if plan.outputs.get(name) == v and not any(weights[i][j : j + 1]):
+                yield _place(plan, i), f'no layer uses blob "{name}"; remove it, or add a Silence layer'
+
+
+@rule("loss-without-weight", PLAN)
+def _weightless(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """A loss of weight 0 is computed and printed, but nothing is learned from it."""
+    for i, weights in enumerate(_loss_weights(plan) if _is_training(plan) else ()):
+        cls = layer_class(plan.nodes[i].type)
+        if cls is not None and cls.is_loss and not any(weights):
+            yield _place(plan, i, "loss_weight"), "nothing is learned from a loss of weight 0; give it another weight"
+
+
+@rule("batchnorm-without-scale", PLAN)
+def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """Caffe's BatchNorm only normalizes; other frameworks' layers of that name also scale and shift."""
+    readers: dict[int, set[str]] = {}
+    for node in plan.nodes:
+        for v in node.bottoms:
+            readers.setdefault(v, set()).add(node.type)
+    for i, node in enumerate(plan.nodes):
+        if node.type == "BatchNorm" and node.tops and "Scale" not in readers.get(node.tops[0], set()):
+            yield _place(plan, i), "no Scale layer follows; Caffe's BatchNorm itself does not scale and shift"
+
+
+@rule("bias-before-batchnorm", PLAN)
+def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """BatchNorm subtracts the mean, and with it any bias added before: such a bias has no effect."""
+    makers = {v: i for i, node in enumerate(plan.nodes) for v in node.tops}
+    for node in plan.nodes if _is_training(plan) else ():
+        i = makers.get(node.bottoms[0], -1) if node.type == "BatchNorm" and node.bottoms else -1
+        for name, param in own_settings(plan.net.layer[i]) if i >= 0 else ():
+            fields = fields_of(param.DESCRIPTOR)
+            if "weight_filler" in fields and "bias_term" in fields and param.bias_term:
+                message = f'its bias is subtracted again by BatchNorm "{node.name}"; set bias_term: false'
+                yield _place(plan, i, name), message
+
+
+@rule("global-stats-in-training", PLAN)
+def _global_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """With use_global_stats: true a training neither uses the statistics of its batches nor updates the stored ones.
+
+    A net from scratch then learns without normalization. To fine-tune with fixed statistics it is right.
+    """
+    for i, node in enumerate(plan.nodes if _is_training(plan) else ()):
+        if node.type == "BatchNorm" and plan.net.layer[i].batch_norm_param.use_global_stats:
+            place = _place(plan, i, "batch_norm_param", "use_global_stats")
+            yield place, "use_global_stats is true in a training; leave it out, and each phase does what it should"
+
+
+@rule("batch-stats-in-test", PLAN)
+def _batch_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """With use_global_stats: false a test's result depends on which images share a batch."""
+    for i, node in enumerate(plan.nodes if plan.net.state.phase == TEST else ()):
+        param = plan.net.layer[i].batch_norm_param
+        if node.type == "BatchNorm" and param.HasField("use_global_stats") and not param.use_global_stats:
+            place = _place(plan, i, "batch_norm_param", "use_global_stats")
+            yield place, "use_global_stats is false in phase TEST; leave it out, and each phase does what it should"
+
+
+@rule("zero-weights", PLAN)
+def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """Without a weight_filler all weights begin at 0, and pass no gradient on.
+
+    A training that starts from trained weights needs no filler.
+    """
+    for i, node in enumerate(plan.nodes if _is_training(plan) else ()):
+        if node.params and (node.params[0].owner or not node.params[0].lr_mult):
+            continue
+        for name, param in own_settings(plan.net.layer[i]):
+            fields = fields_of(param.DESCRIPTOR)
+            if "weight_filler" in fields and not fields["weight_filler"].present(param):
+                yield _place(plan, i, name), 'its weights begin at 0; add weight_filler { type: "xavier" } or another'
+
+
+@rule("softmax-twice", PLAN)
+def _softmax_twice(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+    """SoftmaxWithLoss computes the softmax of what it reads: a Softmax layer before it flattens the gradient."""
+    makers = {v: i for i, node in enumerate(plan.nodes) for v in node.tops}
+    for i, node in enumerate(plan.nodes):
+        maker = makers.get(node.bottoms[0], -1) if node.type == "SoftmaxWithLoss" and node.bottoms else -1
+        if maker >= 0 and plan.nodes[maker].type == "Softmax":
+            name = plan.nodes[maker].name
+            yield _place(plan, i), f'it reads Softmax "{name}", and computes a softmax itself; read what "{name}" reads'
+
+
+@rule("towers-not-shared", NET)
+def _towers(net: Net) -> Said:
+    """The towers that a ContrastiveLoss compares should share all their parameters."""
+    producer = {v: i for i, node in enumerate(net.plan.nodes) for v in node.tops}
+
+    def upstream(v: int) -> set[int]:
+        found: set[int] = set()
+        pending = [v]
+        while pending:
+            i = producer[pending.pop()]
+            if i not in found:
+                found.add(i)
+                pending.extend(net.plan.nodes[i].bottoms)
+        return found
+
+    for node in net.plan.nodes:
+        if node.type != "ContrastiveLoss":
+            continue
+        first, second = (upstream(v) for v in node.bottoms[:2])
+        shared = {id(blob) for i in first for blob in net.layers[i].blobs}
+        for i in sorted(second - first):
+            count = sum(id(blob) not in shared for blob in net.layers[i].blobs)
+            if count:
+                total = len(net.layers[i].blobs)
+                yield (
+                    _place(net.plan, i),
+                    f"{count} of its {total} parameter blobs are not shared with the other tower of "
+                    f'"{node.name}"; give them the same param {{ name }}',
+                )
+
+
+@rule("loss-learns-nothing", NET)
+def _losses(net: Net) -> Said:
+    """A loss that depends on no learnable parameter teaches nothing."""
+    for i, weights in enumerate(net.loss_weights if net.phase == TRAIN else ()):
+        if any(weights) and not net.backward_plan.layers[i]:
+            yield (
+                _place(net.plan, i),
+                "this loss depends on no learnable parameter; is an lr_mult 0?",
+            )
+
+
+@rule("never-learns", NET)
+def _never_learns(net: Net) -> Said:
+    """A layer with a learning rate that no loss depends on keeps its first weights through the training."""
+    if net.phase != TRAIN or not any(map(any, net.loss_weights)):
+        return
+    learned = {item.layer for item in net.learnable if item.lr_mult}
+    for i, node in enumerate(net.plan.nodes):
+        if node.name in learned and not net.backward_plan.layers[i] and net.layers[i].blob_shapes:
+            yield _place(net.plan, i), "no loss depends on it, so it learns nothing; set lr_mult: 0, or use its blob"
+
+
+@rule("same-name", NET)
+def _namesakes(net: Net) -> Said:
+    """Saved weights are assigned to layers by name."""
+    names: set[str] = set()
+    for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
+        if node.name in names and layer.blob_shapes:
+            yield (
+                _place(net.plan, i),
+                "an earlier layer has the same name; loaded weights go to that layer only; rename one",
+            )
+        names.add(node.name)
+
+
+def _loss_weights(plan: Plan) -> list[list[float]]:
+    """Return the loss weights of each layer's tops, as far as types are known."""
+    weights = []
+    for node, layer in zip(plan.nodes, plan.net.layer, strict=True):
+        cls = layer_class(node.type)
+        usual = [1.0] if cls is not None and cls.is_loss else []
+        weights.append(list(layer.loss_weight) or usual)
+    return weights
+
+
+def _is_training(plan: Plan) -> bool:
+    """Say whether something is learned: phase TRAIN, and a loss."""
+    classes = (layer_class(node.type) for node in plan.nodes)
+    has_loss = any(cls is not None and cls.is_loss for cls in classes) or any(map(any, _loss_weights(plan)))
+    return plan.net.state.phase == TRAIN and has_loss
+
+
+def own_settings(layer: Any) -> Iterator[tuple[str, Any]]:
+    """Yield a layer's settings of its own: the names of its fields and their messages."""
+    for name, field in fields_of(layer.DESCRIPTOR).items():
+        if name.endswith("_param") and not field.repeated and field.present(layer):
+            yield name, field.get(layer)
+
+
+def _place(plan: Plan, i: int, *path: str) -> Where:
+    return plan.source.at(i, *path, layer=plan.nodes[i].name, type=plan.nodes[i].type)
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, (str, float, int)) else tuple(value)
+
+
+def _told(value: Any) -> str:
+    values = value if isinstance(value, tuple) else (value,)
+    return " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in values) or "absent"

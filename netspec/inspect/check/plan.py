@@ -1,0 +1,60 @@
+"""How a net of phase TEST runs without gradients, as text: which layers run together, by which kernels."""
+
+from __future__ import annotations
+
+import torch
+
+from netspec.graph.steps import PASSES, Step
+from netspec.layers.contract.fused import has_bfloat16
+from netspec.net.net import Net
+from netspec.proto.schema import TRAIN
+
+KINDS = {
+    "packed": "by oneDNN, weights laid out in advance, channels side by side",
+    "exact": "sums in Caffe's order (--exact)",
+    "prepared": "by torch's kernels",
+    "as is": "like a layer in training: its parameters may be written to",
+    "by value": "like a layer in training: the shapes follow from values",
+}
+
+_BFLOAT16 = {True: "yes", False: "no", None: "unknown"}
+
+
+def plan_text(net: Net) -> str:
+    """Return one line per step, and what the kinds of steps mean; data is not opened.
+
+    The net must have been built with memory for its weights.
+    """
+    bfloat16 = f"bfloat16 on this CPU: {_BFLOAT16[has_bfloat16()]}"
+    if net.phase == TRAIN:
+        why = net.training_step()
+        how = f"each pass goes through autograd: {why}" if isinstance(why, str) else "by kernels prepared once"
+        return f"no passes: nets run layer by layer in phase TRAIN. Training in fp32, {how}; {bfloat16}"
+    if net.prepared is None:
+        return f"no passes: nets run layer by layer where passes are switched off; {bfloat16}"
+    given = tuple(
+        (v, shape, torch.float32)
+        for node, layer in zip(net.plan.nodes, net.layers, strict=True)
+        if not node.bottoms
+        for v, shape in zip(node.tops, layer.top_shapes, strict=False)
+    )
+    program = net.prepared.program(given, frozenset(net.plan.outputs.values()))
+    steps = program.schedule.steps
+    used = [kind for kind in KINDS if kind in program.kinds]
+    names = [_name(net, step) for step in steps]
+    width = max((len(kind) for kind in used), default=0)
+    passes = ", ".join(name for name in PASSES if name in net.prepared.passes)
+    layers = sum(bool(node.bottoms) for node in net.plan.nodes)
+    return "\n".join(
+        [
+            f"{layers} layers run as {len(steps)} steps; passes: {passes}; {bfloat16}",
+            *(f"  {kind:{width}}  {name}" for kind, name in zip(program.kinds, names, strict=True)),
+            *(f"{kind}: {KINDS[kind]}" for kind in used),
+        ]
+    )
+
+
+def _name(net: Net, step: Step) -> str:
+    members = [step.node, *(step.chain.folded if step.chain else ())]
+    members = sorted(members) + ([step.finish] if step.finish is not None else [])
+    return " + ".join(net.plan.nodes[i].name for i in members)

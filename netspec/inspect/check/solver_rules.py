@@ -1,0 +1,137 @@
+"""The rules for solvers. Their docstrings say why they are there; ``netspec lint --rules`` prints them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from netspec.inspect.check.findings import SETTINGS, SOLVER, Said, rule
+from netspec.inspect.check.net_rules import own_settings
+from netspec.net.net import Net
+from netspec.proto.source_map import Place
+
+FAR = 0.1  # share of the records that a test may skip, or read twice
+#: The settings that each rate policy, and each update rule, reads.
+POLICY_SETTINGS = {
+    "step": ("gamma", "stepsize"),
+    "exp": ("gamma",),
+    "inv": ("gamma", "power"),
+    "multistep": ("gamma", "stepvalue"),
+    "poly": ("power",),
+    "sigmoid": ("gamma", "stepsize"),
+}
+RULE_SETTINGS = {
+    "adagrad": ("delta",),
+    "rmsprop": ("delta", "rms_decay"),
+    "adadelta": ("delta",),
+    "adam": ("delta", "momentum2"),
+}
+
+
+@rule("no-snapshot", SETTINGS)
+def _snapshots(solver: Any, node: Place) -> Said:
+    """A training without a snapshot leaves no weights behind."""
+    if solver.snapshot > solver.max_iter:
+        message = f"snapshot {solver.snapshot} is more than max_iter {solver.max_iter}: no effect; make it smaller"
+        yield node.find("snapshot"), message
+    elif not solver.snapshot and not solver.snapshot_after_train:
+        yield node.where, "no snapshot is taken; set snapshot, or snapshot_after_train: true"
+
+
+@rule("no-effect", SETTINGS)
+def _settings(solver: Any, node: Place) -> Said:
+    """A setting that the chosen policy or rule does not read may be meant for another one."""
+    for name in settings_without_effect(solver):
+        message = f"{name} has no effect with type {solver.type} and lr_policy {solver.lr_policy}; remove it"
+        yield node.find(name), message
+
+
+@rule("step-after-end", SETTINGS)
+def _steps(solver: Any, node: Place) -> Said:
+    """A step of the learning rate after the last iteration never comes."""
+    steps = {"step": ("stepsize", [solver.stepsize]), "multistep": ("stepvalue", solver.stepvalue)}
+    name, values = steps.get(solver.lr_policy, ("", []))
+    for k, value in enumerate(values):
+        if value >= solver.max_iter > 0:
+            message = f"{name} {value} is not below max_iter {solver.max_iter}: that step never comes; change either"
+            yield node.find(name, k), message
+
+
+@rule("test-after-end", SETTINGS)
+def _tests(solver: Any, node: Place) -> Said:
+    """A test that comes after the last iteration is run only at the start, if at all."""
+    if solver.test_iter and solver.test_interval > solver.max_iter:
+        message = f"test_interval {solver.test_interval} is more than max_iter {solver.max_iter}; make it smaller"
+        yield node.find("test_interval"), message
+
+
+@rule("test-size", SOLVER)
+def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+    """A test should read each record of its data once.
+
+    Known where the data is open (``--data``); a tenth more or less is allowed.
+    """
+    for k, net in enumerate(nets[1:]):
+        for layer in net.layers:
+            records = getattr(layer, "num_records", 0)
+            if records:
+                batch, iterations = layer.top_shapes[0][0], solver.test_iter[k]
+                read = iterations * batch
+                if abs(read - records) > FAR * records:
+                    found = f'test_iter {iterations} x batch {batch} = {read}, but layer "{layer.param.name}" has'
+                    message = f"{found} {records} records; set test_iter: {-(-records // batch)}"
+                    yield node.find("test_iter", k), message
+                break
+
+
+@rule("tested-on-training-data", SOLVER)
+def _same_data(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+    """A test over what the net learns from does not say how good it is on anything else.
+
+    A data layer without a phase is read in phase TEST too: by `netspec test`, or by `lmdb-build compare`.
+    """
+    trained = {os.path.realpath(source): layer for _, layer, _, source in _sources(nets[0])} if nets else {}
+    for net in nets[1:]:
+        for i, layer, field, source in _sources(net):
+            if os.path.realpath(source) in trained:
+                place = net.plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
+                yield place, f'the test reads "{source}", which the net is trained on; name another database'
+    if len(nets) == 1 and (solver.net or solver.HasField("net_param")):
+        for i, layer, field, source in _sources(nets[0]):
+            if not layer.include and not layer.exclude:
+                place = nets[0].plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
+                message = f'a test would read "{source}" too, which the net is trained on; give phase TEST a data layer'
+                yield place, message
+
+
+def _sources(net: Net) -> Iterator[tuple[int, Any, str, str]]:
+    """Yield number, layer, settings and source of the layers that read a database or a list."""
+    for i, layer in enumerate(net.plan.net.layer):
+        for name, param in own_settings(layer) if not layer.bottom else ():
+            if source := getattr(param, "source", ""):
+                yield i, layer, name, source
+
+
+@rule("untrained-in-test", SOLVER)
+def _untrained(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+    """A test net gets its weights from the training net, layer by layer, by name.
+
+    A layer that the training net does not have is tested with random weights.
+    """
+    trained = {layer.param.name for layer in nets[0].layers if layer.blob_shapes} if nets else set()
+    for net in nets[1:]:
+        for i, layer in enumerate(net.layers):
+            if layer.blob_shapes and layer.param.name not in trained:
+                where = net.plan.source.at(i, layer=layer.param.name, type=layer.param.type)
+                yield where, "is tested with random weights: the training net has no layer of this name; rename one"
+
+
+def settings_without_effect(solver: Any) -> Iterator[str]:
+    """Yield the names of the settings that the solver's policy and rule do not read."""
+    for table, chosen in ((POLICY_SETTINGS, solver.lr_policy), (RULE_SETTINGS, solver.type.lower())):
+        used = table.get(chosen, ())
+        for name in dict.fromkeys(name for names in table.values() for name in names):
+            given = len(getattr(solver, name)) if name == "stepvalue" else solver.HasField(name)
+            if given and name not in used:
+                yield name

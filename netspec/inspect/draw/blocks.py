@@ -1,0 +1,111 @@
+"""Parts of a net that repeat one after the other, such as the blocks of a residual net."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from netspec.inspect.draw.diagram import Diagram, Output
+
+LEAST_SAVED = 4  # boxes that folding must spare
+
+
+@dataclass(frozen=True)
+class Block:
+    """``copies`` times the ``length`` boxes from ``first`` on, each copy fed by one blob and giving one.
+
+    ``entry`` is what the first copy reads; ``exit`` is a box of the first copy and its top: what each copy gives.
+    """
+
+    first: int
+    length: int
+    copies: int
+    entry: Output
+    exit: Output
+
+    @property
+    def boxes(self) -> range:
+        """The boxes of all copies."""
+        return range(self.first, self.first + self.length * self.copies)
+
+    @property
+    def last(self) -> Output:
+        """What the last copy gives."""
+        return self.exit[0] + self.length * (self.copies - 1), self.exit[1]
+
+
+def find_blocks(diagram: Diagram) -> list[Block]:
+    """Return what repeats, in order; the repetitions that spare most boxes are taken first, and none overlap."""
+    found: list[Block] = []
+    kinds: dict[object, int] = {}
+    same = [
+        kinds.setdefault((box.type, box.same, box.shapes, bool(box.owner), box.work), len(kinds))
+        for box in diagram.boxes
+    ]
+    readers: dict[Output, list[int]] = {}
+    for k, outputs in enumerate(diagram.reads):
+        for output in outputs:
+            readers.setdefault(output, []).append(k)
+    candidates = []
+    for length in range(1, len(same) // 2 + 1):
+        run = 0
+        for k in range(len(same) - length - 1, -1, -1):
+            run = run + 1 if same[k] == same[k + length] else 0
+            copies = 1 + run // length
+            if (copies - 1) * length >= LEAST_SAVED:
+                candidates.append((-(copies - 1) * length, length, k, copies))
+    taken: set[int] = set()
+    for _, length, first, copies in sorted(candidates):
+        if taken.intersection(range(first, first + length)):
+            continue
+        block = _longest(diagram, readers, first, length, copies)
+        if block and (block.copies - 1) * length >= LEAST_SAVED and not taken.intersection(block.boxes):
+            found.append(block)
+            taken.update(block.boxes)
+    return sorted(found, key=lambda block: block.first)
+
+
+def _longest(diagram: Diagram, readers: dict[Output, list[int]], first: int, length: int, copies: int) -> Block | None:
+    """Return the block with as many copies as are wired alike, one behind the other."""
+    within = range(first, first + length)
+    entries = {output for k in within for output in diagram.reads[k] if output[0] < first}
+    given = {
+        (k, j)
+        for k in within
+        for j in range(len(diagram.tops[k]))
+        if any(reader >= within.stop for reader in readers.get((k, j), ()))
+    }
+    unread = [(k, j) for k in within for j in range(len(diagram.tops[k])) if not readers.get((k, j))]
+    if len(entries) != 1 or len(given) != 1 or unread:
+        return None
+    (entry,), (exit_,) = entries, given
+    whole = 1
+    for copy in range(1, copies):
+        if not _alike(diagram, readers, first, length, copy, entry, exit_):
+            break
+        whole = copy + 1
+    return Block(first, length, whole, entry, exit_)
+
+
+def _alike(
+    diagram: Diagram,
+    readers: dict[Output, list[int]],
+    first: int,
+    length: int,
+    copy: int,
+    entry: Output,
+    exit_: Output,
+) -> bool:
+    """Say whether a copy is wired as the first one, with the exit of the copy before it as its entry."""
+    shift = copy * length
+    before = (exit_[0] + shift - length, exit_[1])
+    for k in range(first, first + length):
+        wanted = [before if output == entry else (output[0] + shift, output[1]) for output in diagram.reads[k]]
+        if list(diagram.reads[k + shift]) != wanted:
+            return False
+        for j in range(len(diagram.tops[k])):
+            end = first + length + shift
+            leaves = any(reader >= end for reader in readers.get((k + shift, j), ()))
+            if leaves != ((k, j) == exit_) and not ((k, j) == exit_ and not readers.get((k + shift, j))):
+                return False
+    # What the copy before gives must be read by this copy only.
+    return all(reader < first + length + shift for reader in readers.get(before, ()))

@@ -1,0 +1,258 @@
+"""What a picture of a net shows: its layers as boxes, its blobs as wires, with shapes and costs.
+
+Both phases are in one diagram. A layer that computes in place, on a blob that nobody else reads before, belongs to the
+box of the layer that made the blob.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from netspec import log
+from netspec.errors import SpecError, Where
+from netspec.graph.filter import filter_net, with_state
+from netspec.graph.options import BuildOptions
+from netspec.graph.plan import Node, Plan, make_plan
+from netspec.inspect.draw.settings import settings_text
+from netspec.layers import layer_class
+from netspec.layers.contract.base import Layer, Shape
+from netspec.net.build import build_filtered
+from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue
+from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.text import write_text
+
+Output = tuple[int, int]  # a box and which of its tops
+
+
+@dataclass(frozen=True)
+class Attached:
+    """A layer in place, in the box of the layer whose top it changes."""
+
+    name: str
+    type: str
+    kind: str
+    settings: str
+    phases: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A layer.
+
+    ``kind`` is the room of netspec.layers that has it. ``phases`` are those that it is in, empty for all that are
+    drawn. ``weights`` is how many numbers it learns that are its own, ``owner`` the layer whose parameters it uses,
+    ``work`` its multiply-adds in one forward pass, ``text`` its prototxt with that of the attached layers. ``same``
+    is equal in layers that differ in names only.
+    """
+
+    name: str
+    type: str
+    kind: str
+    settings: str
+    phases: tuple[str, ...]
+    where: Where
+    text: str
+    same: str
+    weights: int = 0
+    owner: str = ""
+    work: int = 0
+    attached: tuple[Attached, ...] = ()
+    shapes: tuple[str, ...] = ()  # of its tops
+
+
+@dataclass(frozen=True)
+class Diagram:
+    """Boxes in the net's order, and the outputs that each reads, in the order of its bottoms.
+
+    ``faults`` are what keeps parts of the net from being built: shapes and costs are missing there.
+    """
+
+    name: str
+    boxes: tuple[Box, ...]
+    reads: tuple[tuple[Output, ...], ...]
+    tops: tuple[tuple[str, ...], ...]
+    faults: tuple[SpecError, ...] = ()
+
+
+@dataclass
+class _Seen:
+    """A net in one phase: ``numbers[i]`` is which layer of the file layer ``i`` of the plan is."""
+
+    phase: str
+    plan: Plan
+    numbers: list[int]
+    layers: Mapping[int, Layer]  # the built ones, by their number in the file
+
+
+def diagram_of(
+    net: NetParameter,
+    source: SourceMap,
+    phases: Sequence[PhaseValue],
+    options: BuildOptions | None = None,
+) -> Diagram:
+    """Return the diagram of an upgraded net in the given phases; nothing is written, and no memory is used."""
+    faults: list[SpecError] = []
+    options = replace(options or BuildOptions(open_data=False), device="meta", seed=0, write_files=False, passes=())
+    with log.silent():
+        source = source.telling(faults.append)
+        seen = [
+            _look(with_state(net, phase, options.level, options.stages), source, PHASE_NAMES[phase], options)
+            for phase in phases
+        ]
+    return _merged(net, source, seen, tuple({str(fault): fault for fault in faults}.values()))
+
+
+def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOptions) -> _Seen:
+    """Filter, plan and build a net in its state."""
+    numbered = source.with_layers(Place(Where(str(k))) for k in range(len(net.layer)))
+    filtered, numbers = filter_net(net, numbered)
+    numbers = [int(place.where.file) for place in numbers.layers]
+    placed = source.with_layers(source.layers[k] for k in numbers)
+    # A fault of the wiring is reported by the build, which plans again, with splits.
+    plan = make_plan(filtered, placed.telling(lambda fault: None))
+    waiting: dict[str, list[int]] = {}
+    for number, layer in zip(numbers, filtered.layer, strict=True):
+        waiting.setdefault(layer.name, []).append(number)
+    layers: dict[int, Layer] = {}
+    try:
+        built: Sequence[Any] = list(build_filtered(filtered, placed, options).layers)
+    except SpecError as fault:
+        source.report(fault)
+        built = ()
+    for layer in built:
+        if waiting.get(layer.param.name):  # the others are Split layers
+            layers[waiting[layer.param.name].pop(0)] = layer
+    return _Seen(phase, plan, numbers, layers)
+
+
+def _merged(net: NetParameter, source: SourceMap, seen: Sequence[_Seen], faults: tuple[SpecError, ...]) -> Diagram:
+    """Return the phases in one diagram."""
+    phases_of: dict[int, list[str]] = {}
+    apart: set[int] = set()  # layers that are boxes of their own in some phase
+    for one in seen:
+        for number in one.numbers:
+            phases_of.setdefault(number, []).append(one.phase)
+        apart.update(number for number, alone in zip(one.numbers, _alone(one.plan), strict=True) if alone)
+    index = {number: k for k, number in enumerate(sorted(apart))}
+    reads: list[list[Output]] = [[] for _ in index]
+    attached: list[dict[int, None]] = [{} for _ in index]
+    for one in seen:
+        origin: dict[int, Output] = {}
+        for number, node in zip(one.numbers, one.plan.nodes, strict=True):
+            sources = [origin[v] for v in node.bottoms if v in origin]
+            if number not in index:
+                origin[node.tops[0]] = sources[0]
+                attached[sources[0][0]][number] = None
+                continue
+            k = index[number]
+            reads[k] += [output for output in sources if output not in reads[k]]
+            origin.update({v: (k, j) for j, v in enumerate(node.tops)})
+    drawn = [one.phase for one in seen]
+
+    def phases(number: int) -> tuple[str, ...]:
+        return () if phases_of[number] == drawn else tuple(phases_of[number])
+
+    boxes = []
+    for number, k in index.items():
+        layer = net.layer[number]
+        inside = sorted(attached[k])
+        box = Box(
+            layer.name,
+            layer.type,
+            kind_of(layer.type),
+            settings_text(layer),
+            phases(number),
+            source.at(number, layer=layer.name, type=layer.type),
+            "".join(_text(net.layer[m]) for m in (number, *inside)),
+            "\n".join(f"{phases(m)}{_without_names(net.layer[m])}" for m in (number, *inside)),
+            attached=tuple(
+                Attached(other.name, other.type, kind_of(other.type), settings_text(other), phases(m))
+                for m in inside
+                for other in [net.layer[m]]
+            ),
+        )
+        boxes.append(_with_costs(box, [number, *inside], seen, len(layer.top)))
+    tops = tuple(tuple(net.layer[number].top) for number in index)
+    return Diagram(net.name, tuple(boxes), tuple(map(tuple, reads)), tops, faults)
+
+
+def _alone(plan: Plan) -> list[bool]:
+    """Say of each layer whether it is a box of its own.
+
+    It is not where it computes in place what only it reads, and its bottom is the one top of its maker.
+    """
+    readers = [0] * len(plan.blobs)
+    maker: dict[int, int] = {}
+    for node in plan.nodes:
+        for v in node.bottoms:
+            if v >= 0:
+                readers[v] += 1
+    alone = []
+    for i, node in enumerate(plan.nodes):
+        inside = node.in_place == (True,) and len(node.bottoms) == 1 and node.bottoms[0] in maker
+        inside = inside and readers[node.bottoms[0]] == 1 and len(plan.nodes[maker[node.bottoms[0]]].tops) == 1
+        alone.append(not inside)
+        maker.update(dict.fromkeys(node.tops, i))
+    return alone
+
+
+def _with_costs(box: Box, numbers: Sequence[int], seen: Sequence[_Seen], tops: int) -> Box:
+    """Return the box with shapes, weights and work; where the phases differ, the work is that of the first."""
+    shapes: list[list[Shape]] = [[] for _ in range(tops)]
+    work, weights, owner = 0, 0, ""
+    for one in reversed(seen):
+        nodes = {number: one.plan.nodes[one.numbers.index(number)] for number in numbers if number in one.numbers}
+        owners = [one.plan.nodes[param.owner[0]].name for n in nodes.values() for param in n.params if param.owner]
+        owner = owners[0] if owners else owner
+        layers = {number: one.layers[number] for number in nodes if number in one.layers}
+        for j, shape in enumerate(layers[numbers[0]].top_shapes[:tops] if numbers[0] in layers else ()):
+            shapes[j].insert(0, tuple(shape))
+        if layers:
+            work = sum(layer.multiply_adds() for layer in layers.values())
+            weights = sum(_own_weights(nodes[number], layer) for number, layer in layers.items())
+    return replace(box, shapes=tuple(map(_shape_text, shapes)), work=work, weights=weights, owner=owner)
+
+
+def _own_weights(node: Node, layer: Layer) -> int:
+    shared = {j for j, param in enumerate(node.params) if param.owner}
+    return sum(math.prod(shape) for j, shape in enumerate(layer.blob_shapes) if j not in shared)
+
+
+def _shape_text(shapes: Sequence[Shape]) -> str:
+    """Return ``64×1×28×28``; of phases that differ ``64|100×1×28×28``; empty where it is unknown."""
+    if not shapes:
+        return ""
+    if len({len(shape) for shape in shapes}) > 1:
+        return " | ".join(dict.fromkeys(map(_one_shape, shapes)))
+    return _one_shape(["|".join(dict.fromkeys(map(str, sizes))) for sizes in zip(*shapes, strict=True)])
+
+
+def _one_shape(sizes: Sequence[object]) -> str:
+    return "×".join(map(str, sizes)) or "scalar"
+
+
+def kind_of(type_name: str) -> str:
+    """Return the room of netspec.layers that has a type, e.g. "vision.convolution"; "dialect"; or empty."""
+    cls = layer_class(type_name)
+    if cls is None:
+        return ""
+    package, _, room = cls.__module__.removeprefix("netspec.").partition(".")
+    return room if package == "layers" else "dialect"
+
+
+def _text(layer: Any) -> str:
+    return "layer {\n" + "".join(f"  {line}\n" for line in write_text(layer).splitlines()) + "}\n"
+
+
+def _without_names(layer: Any) -> str:
+    """Return a layer's prototxt without the names of itself, its blobs and its parameters."""
+    bare = type(layer)()
+    bare.CopyFrom(layer)
+    for name in ("name", "bottom", "top", "blobs"):
+        bare.ClearField(name)
+    for param in bare.param:
+        param.name = "shared" if param.name else ""
+    return write_text(bare)

@@ -1,0 +1,77 @@
+"""Curves of trainings as one HTML file: the picture, boxes that hide runs and curves, a cursor, a table of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from netspec.inspect.draw.html import page
+from netspec.inspect.draw.style import COLORS, svg
+from netspec.inspect.draw.training import MOST_POINTS
+from netspec.inspect.logs.curve import Curve, thinned
+from netspec.inspect.logs.run import Run
+from netspec.inspect.logs.summary import summary
+
+_PARTS = (("raw", "training, as logged"), ("smooth", "training, smoothed"), ("test", "tests"), ("rate", "rate"))
+_FEW = 6  # test outputs that the cursor reads
+
+
+def training_page(runs: Sequence[Run], figure: Figure, title: str) -> str:
+    """Return the page; ``figure`` is the picture of the runs. It needs nothing from elsewhere."""
+    told = [summary(run) for run in runs]
+    columns = list(dict.fromkeys(name for line in told for name in line))
+    shown = [
+        {
+            "name": run.name,
+            "color": COLORS[number % len(COLORS)],
+            "cells": [line.get(column, "") for column in columns],
+        }
+        for number, (run, line) in enumerate(zip(runs, told, strict=True))
+    ]
+    drawing = svg(figure)
+    return page(
+        "training_page.html.jinja",
+        title=title,
+        runs=shown,
+        parts=_PARTS,
+        columns=columns,
+        svg=Markup(drawing[drawing.index("<svg") :]),
+        description=describe(runs),
+        curves={**_horizontal(figure), "runs": [_curves(run, k) for k, run in enumerate(runs)]},
+    )
+
+
+def _horizontal(figure: Figure) -> dict[str, float]:
+    """Return where the panels begin and end, as shares of the picture's width, and the iterations that are there."""
+    panel = figure.axes[0]
+    place, (first, last) = panel.get_position(), panel.get_xlim()
+    return {"left": place.x0, "right": place.x1, "first": first, "last": last}
+
+
+def _curves(run: Run, number: int) -> dict[str, object]:
+    """Return the curves that the cursor reads, as points (iteration, value); None is a value that is not finite."""
+    named = [("loss", run.loss), ("learning rate", run.rate)]
+    for net, curves in run.tests.items():
+        named += [(f"{run.test_label(net)} {name}", curve) for name, curve in list(curves.items())[:_FEW]]
+    return {
+        "name": run.name,
+        "color": COLORS[number % len(COLORS)],
+        "curves": [(name, _points(curve)) for name, curve in named],
+    }
+
+
+def _points(curve: Curve) -> list[tuple[int, float | None]]:
+    x, y = thinned(*curve.arrays(), MOST_POINTS)
+    return [(int(at), float(value) if np.isfinite(value) else None) for at, value in zip(x, y, strict=True)]
+
+
+def describe(runs: Sequence[Run]) -> str:
+    """Return in words what the picture shows."""
+    lines = []
+    for run in runs:
+        cells = ", ".join(f"{name} {value}" for name, value in summary(run).items())
+        lines.append(f"{run.name}: {cells}")
+    return "Curves over iterations. " + ". ".join(lines) + "."

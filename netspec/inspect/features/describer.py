@@ -1,0 +1,60 @@
+"""One image in, one descriptor out: a net as the ``describe`` callable of a loop-closure detector."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from netspec.export.engines.choice import Choice
+from netspec.graph.options import BuildOptions
+from netspec.inspect.features.images import ImageNet
+from netspec.inspect.features.scaling import Steps
+from netspec.inspect.features.views import read_zooms
+from netspec.proto.binary import split_paths
+
+
+class Describer:
+    """A callable that returns blob ``blob`` of a net for an image given as its blob ``input``.
+
+    The net is the prototxt ``model`` in phase TEST, cut down to what computes the blob. ``weights`` are one file, or
+    several with commas between them. The pixels are scaled as its data layer's transform_param says or, where any of
+    these is given, by ``swap``, ``raw_scale``, ``mean`` and ``scale``, in this order
+    (:class:`netspec.inspect.features.scaling.Steps`); each may be text, as on the command line.
+    ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how many. ``engine`` and ``precision`` say
+    what runs the net (docs/engines.md), ``cache`` which folder keeps its model. Raises SpecError for faults of the
+    files.
+
+        >>> describe = Describer("deploy.prototxt", "x.caffemodel", blob="feat")
+        >>> describe(numpy.zeros((48, 64, 3), numpy.uint8)).shape
+        (4,)
+    """
+
+    def __init__(
+        self,
+        model: str | Path,
+        weights: str | Path,
+        blob: str = "feat",
+        input: str = "data",
+        device: str = "cpu",
+        zooms: str | float = "1",
+        mean: str | float | Sequence[float] | np.ndarray | None = None,
+        scale: str | float = 1.0,
+        raw_scale: str | float = 1.0,
+        swap: str | bool = False,
+        engine: str = "torch",
+        precision: str = "fp32",
+        cache: str | Path | None = None,
+    ) -> None:
+        steps = Steps.of(mean, scale, raw_scale, swap)
+        choice = Choice.of(engine, precision, cache)
+        views = read_zooms(zooms)
+        self.image_net = ImageNet(
+            model, split_paths(weights), blob, input, None, views, steps, choice, BuildOptions(str(device))
+        )
+        self.views = len(self.image_net.zooms)
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Return the descriptor (views D,) float32 of an image (H, W, 3) or (H, W), uint8, BGR, of any size."""
+        return self.image_net([image])[0]

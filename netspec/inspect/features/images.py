@@ -1,0 +1,228 @@
+"""A blob of a net for image files, as users of Caffe compute it with pycaffe. The file format: docs/features.md."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from netspec import log
+from netspec.data.blobs import Shape
+from netspec.data.datum import decode_pixels, planar
+from netspec.errors import SpecError, Where
+from netspec.export.engines.choice import TORCH, Choice
+from netspec.export.engines.model import Model, Origin
+from netspec.export.engines.runners import Unable, tell_unable
+from netspec.files.image_list import ImageList
+from netspec.files.opencv import cv2
+from netspec.graph.filter import filter_net, with_state
+from netspec.graph.inputs import is_input, shapes_of_input
+from netspec.graph.options import BuildOptions
+from netspec.graph.prune import prune
+from netspec.inspect.features.scaling import Steps, scaling_of
+from netspec.inspect.features.views import middle
+from netspec.proto.binary import read_net_binary
+from netspec.proto.schema import TEST, NetParameter
+from netspec.proto.source_map import SourceMap
+from netspec.proto.text import parse_net, write_text
+
+if TYPE_CHECKING:
+    import torch
+
+    from netspec.inspect.features.records import Progress
+    from netspec.net.net import Net
+
+BATCH = 16  # images per forward pass
+
+
+class ImageNet:
+    """The part of a net that computes ``blob`` from images in ``input_blob``, and what is done to their pixels before.
+
+    The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
+    None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning;
+    something in them must fit. ``steps``, if any are given, are done to the pixels in the place of what the data
+    layer's transform_param says. ``choice`` is the engine that runs the net: with another than torch, whose model the
+    cache has, torch is not imported. Raises SpecError for faults of the files; warns where the weights were trained on
+    other pixels. (Its parameters are many: what one command line says of images, blob by blob.)
+    """
+
+    def __init__(
+        self,
+        model: str | Path,
+        weights: Sequence[str | Path],
+        blob: str,
+        input_blob: str,
+        shape: Shape | None = None,
+        zooms: Sequence[float] = (1.0,),
+        steps: Steps | None = None,
+        choice: Choice | None = None,
+        options: BuildOptions | None = None,
+    ) -> None:
+        options = replace(options or BuildOptions(), seed=0)
+        net, source = parse_net(model)
+        net, source = filter_net(with_state(net, TEST), source)
+        before, before_source = prune(net, source, [input_blob], {})
+        shape = shape or _shape_of(input_blob, before, before_source, options)
+        if len(shape) != 4 or shape[1] not in (1, 3):
+            message = f'input blob "{input_blob}" has shape {tuple(shape)}, expected N x 1 or 3 x H x W for images'
+            raise SpecError(message, Where(source.file))
+        self.blob, self.input, self.file = blob, input_blob, source.file
+        self.shape: Shape = tuple(shape[1:])
+        self.zooms = tuple(zooms)
+        transforming, steps = [layer for layer in before.layer if layer.HasField("transform_param")], steps or Steps()
+        self.scaling = scaling_of(steps, transforming[0] if transforming else None, self.shape, source.file)
+        after, after_source = prune(net, source, [blob], {input_blob: shape})
+
+        def build() -> Net:
+            built = _build(after, after_source, weights, options)
+            for path in weights:
+                if not transforming and not steps:
+                    readers = [layer.name for layer in after.layer if input_blob in layer.bottom]
+                    _warn_of_other_pixels(path, model, readers)
+            return built
+
+        self._build, self._net, self._model = build, None, None
+        self._choice = choice or Choice()
+        made_of = {"blob": blob, "input": input_blob, "shape": shape, "strict": options.strict, "scaled": bool(steps)}
+        self._open(Origin([model, *weights], made_of), options.device)
+
+    def _open(self, origin: Origin, device: str) -> None:
+        """Open the model of the chosen engine, or let torch run the net."""
+        if self._choice.engine == TORCH or device != "cpu":
+            self._use_torch("" if self._choice.engine == TORCH else f"it runs on the CPU, this net is on {device}")
+            return
+        try:
+            self._model = Model(self._choice, origin, self._export)
+        except Unable as fault:
+            self._use_torch(str(fault))
+
+    def _use_torch(self, reason: str) -> None:
+        """Run the net by torch; ``reason`` says why the chosen engine does not."""
+        tell_unable(self._choice, reason)
+        self._model, self._net = None, self._build()
+        self._net.keep = [self.blob]
+
+    def _export(self, path: Path) -> None:
+        from netspec.export.engines.export import write_model
+
+        write_model(self._build(), path)
+
+    def __call__(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the blob (N, V D) float32, views in order, of images (H, W, 3) or (H, W), uint8, BGR, of any size."""
+        return self.values(self.inputs(images)).reshape(len(images), -1)
+
+    def inputs(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return what the net gets of images: the input blob (N V, C, H, W) float32, the views of each in order."""
+        views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
+        return self.scaling(np.stack(views)).astype(np.float32)
+
+    def values(self, data: np.ndarray) -> np.ndarray:
+        """Return the blob (N V, ...) float32 in its own shape, of what :meth:`inputs` returned."""
+        if self._model is not None:
+            try:
+                return self._model.run({self.input: data})[self.blob]
+            except Unable as fault:
+                self._use_torch(str(fault))
+        import torch
+
+        with torch.no_grad():
+            return self.differentiable(torch.from_numpy(data)).cpu().numpy()
+
+    def differentiable(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the blob as torch computes it, so that its gradient can be taken; of another engine there is none."""
+        assert self._net is not None, "torch runs this net"
+        self._net(**{self.input: data})
+        return self._net.blobs[self.blob]
+
+
+def extract_images(describe: ImageNet, images: ImageList, progress: Progress = iter) -> dict[str, np.ndarray]:
+    """Return the arrays of a features.npz: features, names, seconds_per_image; also stamps and zooms, if any.
+
+    The seconds include everything from file to feature: reading, resizing, the net.
+    """
+    parts = []
+    begin = time.perf_counter()
+    for start in progress(range(0, len(images.paths), BATCH)):
+        parts.append(describe([read_pixels(path, describe.shape[0]) for path in images.paths[start : start + BATCH]]))
+    seconds = (time.perf_counter() - begin) / len(images.paths)
+    arrays = {
+        "features": np.concatenate(parts),
+        "names": np.array(images.names),
+        "seconds_per_image": np.array(seconds),
+    }
+    if images.stamps is not None:
+        arrays["stamps"] = images.stamps
+    if describe.zooms != (1.0,):
+        arrays["zooms"] = np.array(describe.zooms)
+    return arrays
+
+
+def _shape_of(blob: str, net: NetParameter, source: SourceMap, options: BuildOptions) -> Shape:
+    """Return the shape of a blob of a net; data is opened, but no memory for blobs is used."""
+    if len(net.layer) == 1 and is_input(net.layer[0]) and (known := shapes_of_input(net.layer[0]).get(blob)):
+        return known  # torch is not needed
+    from netspec.net.build import build_filtered
+
+    built = build_filtered(net, source, replace(options, device="meta"))
+    built.close()
+    return built.shapes[blob]
+
+
+def _build(net: NetParameter, source: SourceMap, weights: Sequence[str | Path], options: BuildOptions) -> Net:
+    from netspec.net.build import build_filtered
+    from netspec.net.weights import load_weights
+
+    built = build_filtered(net, source, options)
+    if weights:
+        load_weights(built, weights, options.strict, some=True)
+    return built
+
+
+def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Sequence[str]) -> None:
+    """Warn if a .caffemodel contains a transform_param, but the net that gets its weights does not scale pixels.
+
+    ``readers`` are the layers of that net that read the input. If the trained net lacks one of them (a Power layer in a
+    deploy file, say), it is assumed to replace the transform_param. An HDF5 file contains no settings.
+    """
+    import h5py
+
+    if h5py.is_hdf5(weights):
+        return
+    trained = read_net_binary(weights).layer
+    if not set(readers) <= {layer.name for layer in trained}:
+        return
+    for layer in trained:
+        p = layer.transform_param
+        if p.scale != 1 or p.mean_value or p.mean_file:
+            settings = " ".join(write_text(p).split())
+            log.logger.warning(
+                f"{weights} was trained with transform_param {{ {settings} }}, but {model} has no transform_param: its "
+                "pixels stay 0 to 255; use the training prototxt as the model"
+            )
+            return
+
+
+def read_pixels(path: Path, channels: int) -> np.ndarray:
+    """Return an image file as (H, W, 3) BGR for three ``channels``, else as (H, W), uint8. Raises SpecError."""
+    try:
+        return decode_pixels(path.read_bytes(), channels == 3)
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
+    except ValueError as fault:
+        raise SpecError(str(fault), Where(str(path))) from None
+
+
+def fitted(image: np.ndarray, shape: Shape) -> np.ndarray:
+    """Return an image (H, W, 3) BGR or (H, W), uint8, as ``shape`` (C, H, W): resized (bilinear), in color or gray."""
+    channels, height, width = shape
+    if channels == 3 and image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    elif channels == 1 and image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if image.shape[:2] != (height, width):
+        image = cv2.resize(image, (width, height))
+    return planar(image)

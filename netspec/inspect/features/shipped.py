@@ -1,0 +1,44 @@
+"""The nets that come with the package, by name, as describers for a loop-closure detector.
+
+``prototxt/`` is their one source: building the wheel copies it into this package (setup.py); in an editable
+installation or a checkout it lies beside the package. The entry points ``loopclosure.describers`` of pyproject.toml
+name the functions here. To recommend another net, change :data:`DEFAULT` or :data:`SMALL`, and what setup.py copies
+follows.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from netspec.errors import SpecError
+
+# Folders of prototxt/ with deploy.prototxt and NAME.caffemodel, NAME that of the folder, SOURCE.md and perhaps LICENSE.
+DEFAULT = "many_negatives/places"
+SMALL = "many_negatives/siamese_words_256"
+
+
+def folder(net: str = "") -> Path:
+    """Return the folder of a net that comes with the package, ``siamese_8`` or one in a folder of ``prototxt/``."""
+    package = Path(__file__).parents[2]
+    for nets in (package / "prototxt", package.parent / "prototxt"):
+        if (nets / net).is_dir():
+            return nets / net
+    raise SpecError(f'the net "{net}" is not installed; expected {package / "prototxt" / net}')
+
+
+def default(**options: Any) -> Any:
+    """Return the recommended net as a :class:`~netspec.inspect.features.describer.Describer` with these keywords."""
+    return _describer(DEFAULT, options)
+
+
+def small(**options: Any) -> Any:
+    """Return the net for small computers, likewise."""
+    return _describer(SMALL, options)
+
+
+def _describer(net: str, options: dict[str, Any]) -> Any:
+    from netspec.inspect.features.describer import Describer  # setup.py reads this file, and has no torch
+
+    files = folder(net)
+    return Describer(files / "deploy.prototxt", files / f"{files.name}.caffemodel", **options)

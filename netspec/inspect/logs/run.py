@@ -1,0 +1,251 @@
+"""The log of a training, line by line: what ``caffe train`` and ``netspec train`` write to stderr.
+
+Caffe: src/caffe/solver.cpp, src/caffe/solvers/sgd_solver.cpp; the sentences differ a little from version to version.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import stat
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from netspec.errors import SpecError, Where
+from netspec.inspect.logs.curve import Curve
+
+RUNNING, DONE, STOPPED, FAILED = "running", "done", "stopped early", "failed"
+
+# `I1121 00:36:27.939015 12135 solver.cpp:239] ...`; newer versions of glog write the year too.
+_COUNT = "([0-9]{1,10})(?![0-9])"  # an int of 32 bits
+_PREFIX = re.compile(rf"([IWEF])(?:\d{{4}})?(\d\d)(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{{6}}) +{_COUNT} (\S+?)\] ?(.*)")
+_LOSS = re.compile(rf"Iteration {_COUNT}(?: \((\S+) iter/s[^)]*\))?[^=]*, loss = (\S+)")
+_RATE = re.compile(rf"Iteration {_COUNT}, lr = (\S+)")
+_TESTING = re.compile(rf"Iteration {_COUNT}, Testing net(?: \(#{_COUNT}\))?")
+_OUTPUT = re.compile(rf"(Train|Test) net output #{_COUNT}: (.*) = (\S+?)(?: \(\* .* loss\))?$")
+_SCORE = re.compile(rf"Test score #{_COUNT}: (\S+)")  # until 2014
+_TEST_LOSS = re.compile(r"Test loss: (\S+)")
+_WAITING = re.compile(r"Waiting for data: (\S+) %")
+_SNAPSHOT = re.compile(rf"Snapshotting to (?:.* file )?(\S+_iter_{_COUNT}(?:\.caffemodel\S*)?)")
+_SETTING = re.compile(r"(max_iter|display|test_interval|average_loss|type|net|snapshot_prefix): (.*)")
+# Python's, a signal's, and netspec's own: `solver.prototxt:3:1: ...`.
+_FAULT = re.compile(r"Traceback |\*\*\* .*SIG|\S[^:]*:\d+:\d+: |there is not enough memory")
+_WINDOWS = {"1.#QNAN": "nan", "-1.#IND": "nan", "1.#INF": "inf", "-1.#INF": "-inf"}
+_YEAR = 366 * 86400.0
+_GREATEST = float(np.finfo(np.float32).max)
+
+
+@dataclass
+class Run:
+    """What a log tells of a training.
+
+    ``loss`` is averaged over ``average_loss`` iterations; ``train`` and ``tests`` hold the outputs of the training net
+    and, by the number of the test net, of the test nets: name -> curve. Of a blob of several numbers, the second is
+    ``name[1]``. ``losses`` are the names of outputs that have a loss weight. ``speed`` is in iterations per second,
+    ``waiting`` the share of time in which the net waited for data, in percent. ``times`` are seconds since the first
+    line, at the iterations of ``loss``.
+    """
+
+    name: str
+    loss: Curve = field(default_factory=Curve)
+    rate: Curve = field(default_factory=Curve)
+    train: dict[str, Curve] = field(default_factory=dict)
+    tests: dict[int, dict[str, Curve]] = field(default_factory=dict)
+    losses: set[str] = field(default_factory=set)
+    speed: Curve = field(default_factory=Curve)
+    waiting: Curve = field(default_factory=Curve)
+    times: Curve = field(default_factory=Curve)
+    snapshots: list[tuple[int, str]] = field(default_factory=list)
+    settings: dict[str, str] = field(default_factory=dict)
+    state: str = RUNNING
+    process: int | None = None
+    fault: str = ""
+
+    @property
+    def iteration(self) -> int:
+        """The last iteration that the log names."""
+        curves = (self.loss, self.rate, *(curve for net in self.tests.values() for curve in net.values()))
+        return max((curve.iterations[-1] for curve in curves if len(curve)), default=0)
+
+    @property
+    def max_iter(self) -> int | None:
+        """How many iterations the solver is to do, where the log says it."""
+        found = self.settings.get("max_iter", "")
+        return int(found) if re.fullmatch(_COUNT, found) else None
+
+    def test_label(self, net: int) -> str:
+        """Return what a test net is called: "test" where it is the only one."""
+        return "test" if len(self.tests) == 1 else f"test net {net}"
+
+    def curves(self) -> list[Curve]:
+        """Return all curves."""
+        tests = [curve for net in self.tests.values() for curve in net.values()]
+        return [self.loss, self.rate, self.speed, self.waiting, self.times, *self.train.values(), *tests]
+
+
+class LogReader:
+    """Reads a log line by line into ``run``; a training that is resumed in the same log replaces what it repeats."""
+
+    def __init__(self, name: str) -> None:
+        self.run = Run(name)
+        self._position = 0  # the iteration of the last line
+        self._net = 0  # the test net that is tested
+        self._first: float | None = None
+        self._last = 0.0
+        self._names: dict[tuple[str, int, int], tuple[str, str]] = {}
+        self._in_settings = False
+
+    def feed(self, line: str) -> None:
+        """Read one line."""
+        line = line.rstrip("\r\n")
+        prefix = _PREFIX.search(line)
+        if not prefix:
+            if self._in_settings and (found := _SETTING.match(line)):
+                self.run.settings[found[1]] = found[2].strip().strip('"')
+            elif _FAULT.match(line):
+                self._end(FAILED, line)
+            else:
+                self._read(line, None)  # where GLOG_log_prefix=false left out the beginning of the lines
+            return
+        message = prefix[10]
+        self._in_settings = message.startswith("Initializing solver from parameters")
+        if self._in_settings:
+            self.run.state, self.run.fault, self.run.process = RUNNING, "", int(prefix[8])
+        self._read(message, self._seconds(prefix))
+        if prefix[1] == "F":
+            self._end(FAILED, message)
+
+    def _read(self, message: str, seconds: float | None) -> None:
+        run = self.run
+        if found := _LOSS.search(message):
+            iteration = self._at(found[1])
+            run.loss.add(iteration, _number(found[3]))
+            if seconds is not None:
+                run.times.add(iteration, seconds)
+            if found[2]:
+                run.speed.add(iteration, _number(found[2]))
+        elif found := _OUTPUT.search(message):
+            self._output(found[1], int(found[2]), found[3], found[4], "loss)" in message)
+        elif found := _RATE.search(message):
+            run.rate.add(self._at(found[1]), _number(found[2]))
+        elif found := _TESTING.search(message):
+            self._at(found[1])
+            self._net = int(found[2] or 0)
+        elif found := _SCORE.search(message):
+            self._output("Test", int(found[1]), f"score {found[1]}", found[2], False)
+        elif found := _TEST_LOSS.match(message):
+            self._output("Test", -1, "test loss", found[1], True)
+        elif found := _WAITING.match(message):
+            run.waiting.add(self._position, _number(found[1]))
+        elif found := _SNAPSHOT.search(message):
+            run.snapshots.append((int(found[2]), found[1]))
+        elif message.startswith("Optimization stopped early"):
+            self._end(STOPPED)
+        elif message.startswith("Optimization Done") and run.state == RUNNING:
+            self._end(DONE)
+
+    def _at(self, text: str) -> int:
+        """Return the iteration of a line; where it is before that of the last line, the training was resumed."""
+        iteration = int(text)
+        if iteration < self._position:
+            for curve in self.run.curves():
+                curve.cut(iteration)
+        self._position = iteration
+        return iteration
+
+    def _output(self, phase: str, number: int, blob: str, value: str, is_loss: bool) -> None:
+        net = self._net if phase == "Test" else -1
+        place = (phase, net, number)
+        if place not in self._names or self._names[place][0] != blob:
+            before = sum(known[0] == blob for at, known in self._names.items() if at[:2] == place[:2] and at < place)
+            self._names[place] = (blob, f"{blob}[{before}]" if before else blob)
+        name = self._names[place][1]
+        curves = self.run.train if net < 0 else self.run.tests.setdefault(net, {})
+        curves.setdefault(name, Curve()).add(self._position, _number(value))
+        if is_loss:
+            self.run.losses.add(name)
+
+    def _seconds(self, prefix: re.Match[str]) -> float:
+        """Return the seconds since the first line; logs of Caffe's time have no year."""
+        month, day, hour, minute, second, micros = (int(prefix[k]) for k in range(2, 8))
+        try:
+            now = datetime(2000, month, day, hour, minute, second, micros).timestamp()
+        except ValueError:
+            return self._last
+        if self._first is None:
+            self._first = now
+        seconds = now - self._first
+        while seconds < self._last - _YEAR / 2:
+            seconds += _YEAR
+        self._last = seconds
+        return seconds
+
+    def _end(self, state: str, fault: str = "") -> None:
+        self.run.state, self.run.fault = state, fault
+
+
+class Follower:
+    """Reads a log that grows: ``run`` has what was there at the last :meth:`poll`, which grew at ``changed`` [s]."""
+
+    def __init__(self, path: str | Path, name: str = "") -> None:
+        self._path, self._name = Path(path), name or str(path)
+        self.changed = 0.0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._reader, self._offset, self._rest, self._file = LogReader(self._name), 0, b"", 0
+
+    @property
+    def run(self) -> Run:
+        """What was read so far."""
+        return self._reader.run
+
+    def poll(self) -> bool:
+        """Read what is new, and return whether there was any. Raises SpecError if the file cannot be read.
+
+        A file that was replaced or cut is read again from its start.
+        """
+        try:
+            with open(self._path, "rb") as file:
+                status = os.fstat(file.fileno())
+                if stat.S_ISREG(status.st_mode):  # what comes through a pipe is there once
+                    if status.st_size < self._offset or (self._file and status.st_ino != self._file):
+                        self._begin()
+                    file.seek(self._offset)
+                self._file, self.changed = status.st_ino, status.st_mtime
+                new = file.read()
+        except OSError as fault:
+            raise SpecError(f"cannot be read: {fault.strerror}", Where(str(self._path))) from None
+        self._offset += len(new)
+        *lines, self._rest = (self._rest + new).split(b"\n")
+        for line in lines:
+            self._reader.feed(line.decode(errors="replace"))
+        return bool(new)
+
+    def end(self) -> None:
+        """Read the last line, which has no end."""
+        self._reader.feed(self._rest.decode(errors="replace"))
+
+
+def read_log(path: str | Path, name: str = "") -> Run:
+    """Return the training of a log. Raises SpecError if the file cannot be read or holds no training."""
+    follower = Follower(path, name)
+    follower.poll()
+    follower.end()
+    if not any(len(curve) for curve in follower.run.curves()):
+        advice = "expected what `netspec train` or `caffe train` writes to stderr (2> train.log), with display above 0"
+        raise SpecError(f"holds no iteration of a training; {advice}", Where(str(path)))
+    return follower.run
+
+
+def _number(text: str) -> float:
+    """Read a float of 32 bits: what is greater is infinite; what is no number is NaN."""
+    try:
+        value = float(_WINDOWS.get(text.rstrip(","), text.rstrip(",")))
+    except ValueError:
+        return math.nan
+    return math.copysign(math.inf, value) if abs(value) > _GREATEST else value

@@ -1,0 +1,248 @@
+"""What every layer is: a module built from a LayerParameter and the shapes of its bottoms.
+
+A layer is complete when its constructor returns: its learnable blobs exist and are filled, and ``top_shapes`` says,
+by integer arithmetic alone, what ``forward`` will return.
+
+A new layer, a dialect's too, needs ``setup`` (where it has anything to read or learn), ``reshape`` and ``forward``.
+``construct``, and ``ReadingLayer.open``, exist only so that a line of the log stands where Caffe's does: Caffe opens a
+database in a layer's constructor, before it logs the layer's bottoms and tops, and reads its first record after that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, ClassVar
+
+import torch
+from typing_extensions import override
+
+from netspec.data.blobs import Shape
+from netspec.errors import SpecError
+from netspec.exact import switch
+from netspec.files.limits import amount, is_out_of_memory, memory
+from netspec.layers.contract import fillers
+from netspec.layers.contract.context import Context
+from netspec.layers.contract.learned import Learned, values_of
+
+MOST_AXES = 32  # of a blob of Caffe's (kMaxBlobAxes)
+MOST = 2**31 - 1  # numbers that a blob of Caffe's can hold (Blob::Reshape)
+
+
+def shape_string(shape: Sequence[int]) -> str:
+    """Return a shape as Caffe prints it, ``64 20 24 24 (737280)`` (Caffe: Blob::shape_string)."""
+    return "".join(f"{d} " for d in shape) + f"({math.prod(shape)})"
+
+
+_PLAIN = frozenset({bool, int, float, str, tuple, list})
+_NO_BLOBS = torch.nn.ParameterList()  # of all layers without blobs; stays empty
+
+
+class Layer(torch.nn.Module):
+    """Base of all layers. A subclass declares its counts, then implements ``setup``, ``reshape`` and ``forward``.
+
+    ``setup()`` reads ``self.param``, refuses what is wrong (``raise self.error(...)``) and adds the learnable blobs;
+    ``self.bottom_shapes`` is known. ``reshape(bottom_shapes)`` returns the tops' shapes; it runs in the constructor and
+    again whenever bottoms of other shapes arrive. ``forward(*bottoms)`` returns a tensor, or a tuple, one per top.
+
+    Caffe: include/caffe/layer.hpp
+    """
+
+    type: ClassVar[str] = ""
+    bottoms: ClassVar[tuple[int, int | None]] = (1, 1)  # fewest and most (None: any number)
+    tops: ClassVar[tuple[int, int | None]] = (1, 1)
+    same_tops: ClassVar[bool] = False  # as many tops as bottoms
+    is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
+    is_input: ClassVar[bool] = False  # its tops are given by the caller
+    label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
+    reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
+    ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
+    shares: frozenset[str] = frozenset()  # of "data", "diff": its tops lie where its bottom lies, in Caffe's memory
+    default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
+    not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
+    counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
+    promises: ClassVar[bool] = True  # its tops have the shapes that ``reshape`` returned, but for ``counted_axis``
+
+    def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
+        super().__init__()
+        self.param = param
+        self.context = context or Context()
+        self.phase: int = param.phase if param.HasField("phase") else self.context.phase
+        self.bottom_shapes: list[Shape] = [tuple(s) for s in bottom_shapes]
+        self.num_tops: int = max(len(param.top), self.tops[0] if self.is_loss else 0)
+        self.blobs = _NO_BLOBS
+        self.blob_shapes: list[Shape] = []
+        self.construct()
+        self.context.created()
+        self.refuse(self._wrong_counts())
+        self.setup()
+        self.top_shapes: list[Shape] = self._reshaped(self.bottom_shapes)
+        self._kept_promise = False  # whether a pass at the present shapes gave tops of ``top_shapes``
+
+    @override
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set plain values, which a module need not register, without its search for what they may be: it is slow."""
+        if type(value) in _PLAIN:
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
+    def construct(self) -> None:
+        """Do what Caffe does in the layer's constructor, where that shows in the log."""
+
+    def setup(self) -> None:
+        """Read the parameters and add the learnable blobs."""
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the shapes of the tops for bottoms of these shapes; may keep geometry on ``self``."""
+        raise self.error(f"class {type(self).__name__} does not define reshape(bottom_shapes); write it", "type")
+
+    def forward(self, *bottoms: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        raise self.error(f"class {type(self).__name__} does not define forward(*bottoms); write it", "type")
+
+    @property
+    def small(self) -> bool | None:
+        """Whether the layer is so small, at its present shapes, that Caffe's order of sums costs next to nothing.
+
+        None: it has no sums that ``exact: small`` is about.
+        """
+        return None
+
+    def is_exact(self, bottom: torch.Tensor, small: bool | None = False) -> bool:
+        """Return whether to compute in Caffe's order: :func:`netspec.exact.switch.applies`, for one type of numbers."""
+        applies = switch.applies(self.context.options.exact, bottom, bool(small))
+        return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
+
+    def close(self) -> None:
+        """Close files and stop threads, if the layer has any."""
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of one forward pass at the present shapes (0 where they are not counted)."""
+        return 0
+
+    def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Reshape if the bottoms' shapes changed, run ``forward``, return a tuple."""
+        self.fit([tuple(b.shape) for b in bottoms])
+        try:
+            tops = self(*bottoms)
+        except (MemoryError, RuntimeError) as fault:
+            if is_out_of_memory(fault):
+                there = f"this machine has {amount(memory())}"
+                raise self.error(f"its pass needs more memory than there is; {there}") from None
+            raise
+        tops = tops if isinstance(tops, tuple) else (tops,)
+        if not self._kept_promise:
+            self.check_promise(tops)
+            self._kept_promise = True
+        return tops
+
+    def check_promise(self, tops: Sequence[torch.Tensor]) -> None:
+        """Raise SpecError where a pass returned tops of other shapes than ``reshape`` did."""
+        found = [tuple(top.shape) if isinstance(top, torch.Tensor) else None for top in tops]
+        if self.promises and list(map(self._counted, found)) != list(map(self._counted, self.top_shapes)):
+            one, other = (" and ".join(map(str, shapes)) or "no top" for shapes in (found, self.top_shapes))
+            raise self.error(f"forward returned a top of shape {one}, but reshape promised {other}", "type")
+
+    def _counted(self, shape: Shape | None) -> Shape | None:
+        """Return a shape without the size that only a pass finds out."""
+        axis = self.counted_axis
+        return shape if shape is None or axis is None else (*shape[:axis], *shape[axis + 1 :])
+
+    def fit(self, bottom_shapes: list[Shape]) -> None:
+        """Reshape for bottoms of these shapes, if they are others than before."""
+        if bottom_shapes != self.bottom_shapes:
+            self.bottom_shapes, self._kept_promise = bottom_shapes, False
+            try:
+                self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
+            except SpecError:
+                self.bottom_shapes = []  # whatever comes next is checked again
+                raise
+
+    def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
+        """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""
+        axes, device = self.possible(shape), self.context.device
+        self.context.take(4 * math.prod(axes))
+        data: torch.Tensor | None = None
+        if filler is not None:
+            try:
+                if device.type == "meta":
+                    fillers.check(filler, axes)
+                else:
+                    data = fillers.fill(filler, axes, self.context.random.on("cpu")).to(device)
+            except ValueError as fault:
+                self.context.report(self.error(str(fault), *self._path_to(filler)))
+        if not self.blobs:
+            self.blobs = torch.nn.ParameterList()
+        self.blobs.append(Learned(fillers.constant(axes, value, device) if data is None else data))
+        self.blob_shapes.append(tuple(shape))
+
+    def blob(self, index: int) -> torch.Tensor:
+        """Return learnable blob ``index`` in this layer's shape (a PERMISSIVE sharer's owner may have another)."""
+        tensor = self.blobs[index]
+        return tensor if tensor.shape == self.blob_shapes[index] else tensor.view(self.blob_shapes[index])
+
+    def values(self) -> list[torch.Tensor]:
+        """Return the values of all learnable blobs, in this layer's shapes, without gradients, for reading."""
+        return [values_of(self.blob(j)) for j in range(len(self.blobs))]
+
+    def possible(self, shape: Sequence[int]) -> Shape:
+        """Return a shape as a tuple; refuse one with a negative size, or of more axes or numbers than Caffe's."""
+        if min(shape, default=0) < 0:
+            raise self.error(f"found shape {tuple(shape)}, expected no negative size")
+        if len(shape) > MOST_AXES:
+            raise self.error(f"found a blob of {len(shape):,} axes, expected at most {MOST_AXES}")
+        if math.prod(shape) > MOST:
+            raise self.error(f"found shape {tuple(shape)}, {math.prod(shape):,} numbers, expected at most {MOST:,}")
+        return tuple(shape)
+
+    def _reshaped(self, bottom_shapes: list[Shape]) -> list[Shape]:
+        """Return what ``reshape`` says, if that is one possible shape for each top."""
+        shapes: Any = self.reshape(bottom_shapes)
+        if not isinstance(shapes, Sequence) or not all(isinstance(shape, Sequence) for shape in shapes):
+            raise self.error(f"reshape returned {shapes!r}, expected one shape for each top, such as [(2, 3)]", "type")
+        if len(shapes) != self.num_tops:
+            raise self.error(f"reshape returned {len(shapes)} shape(s), expected {self.num_tops}, one for each top")
+        return [self.possible(shape) for shape in shapes]
+
+    def refuse(self, faults: Iterable[SpecError]) -> None:
+        """Report all of these errors; if there are any, the layer is not built."""
+        found = list(faults)
+        for fault in found[:-1]:
+            self.context.report(fault)
+        if found:
+            raise found[-1]
+
+    def error(self, message: str, *path: str | int) -> SpecError:
+        """Return a SpecError at a field of this layer, e.g. ``self.error("...", "pooling_param", "kernel_size")``."""
+        return SpecError(message, self.context.at(*path))
+
+    def canonical_axis(self, axis: int, shape: Shape, *path: str | int) -> int:
+        """Return ``axis`` counted from the front; negative ones count from the end (Caffe: CanonicalAxisIndex)."""
+        if not -len(shape) <= axis < len(shape):
+            raise self.error(f"axis {axis} is out of range for a blob of {len(shape)} axes, shape {shape}", *path)
+        return axis % len(shape)
+
+    def _path_to(self, message: Any) -> tuple[str, ...]:
+        """Return where one of the layer's fields has this message: ``("convolution_param", "weight_filler")``."""
+        for outer, settings in self.param.ListFields():
+            for inner, value in settings.ListFields() if hasattr(settings, "ListFields") else ():
+                if value is message:
+                    return outer.name, inner.name
+        return ()
+
+    def _wrong_counts(self) -> Iterator[SpecError]:
+        for found, (least, most), what in (
+            (len(self.bottom_shapes), self.bottoms, "bottom"),
+            (self.num_tops, self.tops, "top"),
+        ):
+            if found < least or (most is not None and found > most):
+                if most is None:
+                    wanted = f"at least {least}"
+                else:
+                    wanted = str(least) if least == most else f"{least} to {most}"
+                yield self.error(f"found {found} {what} blob(s), expected {wanted}", what)
+        if self.same_tops and self.num_tops != len(self.bottom_shapes):
+            yield self.error(
+                f"found {self.num_tops} top blob(s) for {len(self.bottom_shapes)} bottom blob(s), expected as many",
+                "top",
+            )

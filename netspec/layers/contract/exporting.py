@@ -1,0 +1,37 @@
+"""How a layer is written in another form: netspec/export asks, with a writer of netspec/layers/contract/targets.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from netspec.errors import SpecError
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.offers import offered
+from netspec.layers.contract.targets import OnnxGraph, TorchCode
+
+
+class Exported(Protocol):
+    """A layer that can be exported. What it writes must compute what ``forward`` computes, at every free size."""
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
+        """Write the layer into an ONNX graph, given the values of its bottoms; return those of its tops."""
+        ...
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+        """Write the layer as source for PyTorch, given the expressions of its bottoms; return those of its tops."""
+        ...
+
+
+def export(layer: Layer, writer: OnnxGraph | TorchCode, target: str, *bottoms: str) -> str | Sequence[str]:
+    """Write a layer for ``ONNX`` or ``PyTorch``; return the values of its tops. Raises SpecError where it cannot be."""
+    write = offered(layer, "to_onnx" if target == "ONNX" else "to_torch")
+    if write is None:
+        raise refusal(layer, target)
+    return write(writer, *bottoms)
+
+
+def refusal(layer: Layer, target: str, reason: str = "") -> SpecError:
+    """Return the error of a layer that cannot be exported: for this reason, or the one its class has."""
+    reason = reason or getattr(layer, "not_exported", "its class does not define it")
+    return layer.error(f"cannot be exported to {target}: {reason}")

@@ -1,0 +1,131 @@
+"""Kernels of oneDNN that torch's compiler uses: weights laid out in advance, an activation in the same pass.
+
+They take and return maps whose channels lie side by side (channels_last). Where torch does not have them, the usual
+functions do the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+
+from netspec.exact.products import Filter
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.learned import values_of
+from netspec.layers.contract.preparing import RELU, Kernel, Preparation, finished
+
+_NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
+
+
+def _ops() -> Any:
+    return torch.ops.mkldnn
+
+
+def suits(weight: torch.Tensor) -> bool:
+    """Return whether there are such kernels for weights like these."""
+    here = weight.device.type == "cpu" and weight.dtype == torch.float32 and weight.numel() > 0
+    return here and torch.backends.mkldnn.is_available() and all(hasattr(_ops(), name) for name in _NEEDED)
+
+
+def has_bfloat16() -> bool | None:
+    """Return whether the CPU multiplies bfloat16 numbers, None where torch cannot tell."""
+    found = [getattr(torch.cpu, name, None) for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported")]
+    return any(test() for test in found if test) if any(found) else None
+
+
+def convolution(
+    shape: Shape,
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    sliding: Filter,
+    group: int,
+    how: Preparation,
+) -> Kernel:
+    """Return a convolution of maps (N, C, H, W) by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
+    geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]
+    weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
+    bias = _kept(bias, how)
+    call, relu = _ops()._convolution_pointwise.default, how.finish == RELU
+    arguments = (*geometry, "relu" if relu else "none", [], "")
+
+    def kernel(maps: torch.Tensor) -> torch.Tensor:
+        return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *arguments)
+
+    return finished(kernel, None if relu else how.finish)
+
+
+def deconvolution(
+    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Preparation
+) -> Kernel:
+    """Return a transposed convolution of maps (N, C, H, W) by fixed weights (C, num_output, kernel_h, kernel_w).
+
+    An activation is another pass here: in the same one oneDNN falls back to a slow kernel.
+    """
+    geometry = [list(sliding.pad), [0, 0], list(sliding.stride), list(sliding.dilation), 1]
+    call = _ops()._convolution_transpose_pointwise.default
+    weight = _laid_out(_ops()._reorder_convolution_transpose_weight, weight, geometry, shape, how)
+    bias = _kept(bias, how)
+
+    def kernel(maps: torch.Tensor) -> torch.Tensor:
+        return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *geometry, "none", [], "")
+
+    return finished(kernel, how.finish)
+
+
+def spread_by_channel(
+    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Preparation
+) -> Kernel:
+    """Return a transposed convolution by weights (C, 1, kernel_h, kernel_w), each channel of (N, C, H, W) by itself.
+
+    oneDNN's own is slow. A convolution does the same on maps with ``stride`` - 1 zeros between the pixels, with the
+    filters turned around.
+    """
+    (count, channels, *size), (down, across) = shape, sliding.stride
+    framed = (count, channels, (size[0] - 1) * down + 1, (size[1] - 1) * across + 1)
+    zeros = partial(values_of(weight).new_zeros, framed)
+    frame = how.memo(f"frame {framed}", lambda: zeros().contiguous(memory_format=torch.channels_last))
+    pixels = frame[:, :, ::down, ::across]
+    axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
+    turned = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
+    apart = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
+    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, apart)
+
+    def kernel(maps: torch.Tensor) -> torch.Tensor:
+        pixels.copy_(maps)
+        return convolve(frame)
+
+    return kernel
+
+
+def _kept(bias: torch.Tensor | None, how: Preparation) -> torch.Tensor | None:
+    return None if bias is None else how.memo("bias", values_of(bias).clone)
+
+
+def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape: Shape, how: Preparation) -> Any:
+    """Return filters as oneDNN wants them for maps of this shape; in another layout it may be ten times as slow.
+
+    Shapes that want the same layout share it.
+    """
+    name = f"{reorder} {tuple(weight.shape)} {geometry}"
+
+    def make() -> torch.Tensor:
+        filters = values_of(weight).contiguous(memory_format=torch.channels_last)
+        laid_out = reorder(filters, *geometry, list(shape))
+        layout = getattr(_ops(), "_get_mkldnn_serialized_md", None)
+        return how.memo(f"{name} {layout(laid_out).tolist()}", lambda: laid_out) if layout else laid_out
+
+    return how.memo(f"{name} {shape}", make)
+
+
+def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernel:
+    """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
+    name = f"rows {tuple(weight.shape)} {weight.stride()}"  # of a shared matrix one layer may take the transpose
+    weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
+    bias = _kept(bias, how)
+    call, relu = _ops()._linear_pointwise.default, how.finish == RELU
+    arguments = ("relu" if relu else "none", [], "")
+    return finished(lambda vectors: call(vectors, weight, bias, *arguments), None if relu else how.finish)

@@ -1,0 +1,32 @@
+"""Layers whose gradient follows from what lies in memory when the backward pass comes, as Caffe's does."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.offers import offered
+
+NOTHING: frozenset[str] = frozenset()
+
+
+class OwnGradient(Protocol):
+    """A layer of one bottom and top whose gradient reads memory: see netspec/run/in_place.py."""
+
+    gradient_reads: frozenset[str]  # of "bottom", "sign" (of it), "top"
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """Return the bottom's gradient as Caffe computes it, step by step, from the data in memory at backward."""
+        ...
+
+
+def gradient_reads(layer: Layer) -> frozenset[str]:
+    """Return what a layer's gradient reads, nothing where autograd keeps what it needs."""
+    return getattr(layer, "gradient_reads", NOTHING)
+
+
+def gradient_from_memory(layer: Layer, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+    """Return the gradient of a layer's bottom; for layers whose gradient reads something."""
+    return offered(layer, "caffes_gradient")(bottom, top, diff)

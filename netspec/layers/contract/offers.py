@@ -1,0 +1,39 @@
+"""What a layer may offer beside its forward pass, each thing by an attribute that the class defines.
+
+exporting.py  to_onnx, to_torch: the layer in another form
+preparing.py  prepare, finishing, run_with, and facts about memory: faster passes without gradients
+training.py   prepare_training: faster passes with gradients
+folding.py    as_affine, absorb, absorb_before, passes_on: one layer does the work of others
+gradients.py  caffes_gradient: the gradient from what lies in memory
+reading.py    running_state, restart, and the like: records, and what goes on from one pass to the next
+
+:class:`netspec.layers.contract.base.Layer` knows none of them. One function finds what is offered: :func:`offered`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from netspec.layers.contract.base import Layer
+
+
+@cache
+def _has(cls: type[Layer], name: str) -> bool:
+    """Return whether a class has an attribute that was defined for the forward pass of this class.
+
+    A subclass that replaces ``forward`` does not inherit what its base class offers for the old one.
+    """
+    owner = next((each for each in cls.__mro__ if name in vars(each)), None)
+    return owner is not None and getattr(owner, "forward", Layer.forward) in (cls.forward, Layer.forward)
+
+
+def offered(layer: Layer, name: str) -> Any:
+    """Return an attribute that tells of a layer's forward pass, or does the same; None where its class has none."""
+    return getattr(layer, name) if _has(type(layer), name) else None
+
+
+def call(layer: Layer, name: str, *arguments: Any) -> Any:
+    """Return what an offered method returns; None where the class has none."""
+    method = offered(layer, name)
+    return None if method is None else method(*arguments)

@@ -1,0 +1,110 @@
+"""Nets as graphs. Caffe: python/caffe/test/test_draw.py."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf import text_format
+
+import netspec.compat.pycaffe.draw as draw
+from each import each, last_parts
+from netspec.compat.pycaffe.proto import caffe_pb2
+from netspec.errors import SpecError
+from paths import ROOT
+
+pydot = pytest.importorskip("pydot")
+
+NET = """
+name: "small"
+layer { name: "mnist" type: "Data" top: "data" top: "label" data_param { batch_size: 64 } include { phase: TRAIN } }
+layer { name: "input" type: "Input" top: "data" include { phase: TEST } }
+layer { name: "conv/1" type: "Convolution" bottom: "data" top: "conv" param { lr_mult: 2 }
+  convolution_param { num_output: 20 kernel_size: 5 pad: 1 } }
+layer { name: "relu" type: "ReLU" bottom: "conv" top: "conv" }
+layer { name: "pool" type: "Pooling" bottom: "conv" top: "pool" pooling_param { pool: AVE kernel_size: 3 stride: 2 } }
+layer { name: "ip" type: "InnerProduct" bottom: "pool" top: "ip" inner_product_param { num_output: 10 } }
+layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" exclude { phase: TEST } }
+"""
+
+
+@pytest.fixture
+def net():
+    return text_format.Parse(NET, caffe_pb2.NetParameter())
+
+
+def names(graph: Any) -> set[str]:
+    return {node.get_name().strip('"') for node in graph.get_nodes()}
+
+
+def test_layers_and_blobs_are_nodes_with_edges_between_them(net) -> None:
+    graph = draw.get_pydot_graph(net, "TB")
+    assert {"data", "label", "conv", "pool", "ip", "loss", "relu (ReLU)"} <= names(graph)
+    assert "conv/1 (Convolution) kernel size: 5 stride: 1 pad: 1" in names(graph)
+    assert "pool (Pooling AVE) kernel size: 3 stride: 2 pad: 0" in names(graph)
+    labels = {(e.get_source().strip('"'), e.get_destination().strip('"')): e.get_label() for e in graph.get_edges()}
+    assert labels["mnist (Data)", "data"] == "Batch 64"
+    assert labels["ip (InnerProduct)", "ip"] == "10"
+    assert labels["conv", "pool (Pooling AVE) kernel size: 3 stride: 2 pad: 0"] == '""'
+    assert graph.get_rankdir() == "TB"
+
+
+def test_sideways_the_words_stand_below_each_other(net) -> None:
+    assert r"pool\n(Pooling AVE)\nkernel size: 3\nstride: 2\npad: 0" in names(draw.get_pydot_graph(net, "LR"))
+
+
+def test_edges_may_go_without_labels(net) -> None:
+    assert {edge.get_label() for edge in draw.get_pydot_graph(net, "LR", label_edges=False).get_edges()} == {'""'}
+
+
+def test_a_phase_leaves_the_others_layers_out(net) -> None:
+    train = names(draw.get_pydot_graph(net, "TB", phase=caffe_pb2.TRAIN))
+    test = names(draw.get_pydot_graph(net, "TB", phase=caffe_pb2.TEST))
+    assert ("mnist (Data)" in train, "mnist (Data)" in test) == (True, False)
+    assert ("input (Input)" in train, "input (Input)" in test) == (False, True)
+    assert ("loss (SoftmaxWithLoss)" in train, "loss (SoftmaxWithLoss)" in test) == (True, False)
+
+
+def test_rules_of_both_kinds_are_refused(net) -> None:
+    net.layer[0].exclude.add(phase=caffe_pb2.TEST)
+    with pytest.raises(ValueError, match="layer mnist has both include and exclude specified"):
+        draw.get_pydot_graph(net, "TB", phase=caffe_pb2.TRAIN)
+
+
+def test_multipliers_of_the_learning_rate(net) -> None:
+    assert "conv/1 (Convolution) kernel size: 5 stride: 1 pad: 1 lr mult: 2.0, 1.0" in names(
+        draw.get_pydot_graph(net, "TB", display_lrm=True)
+    )
+    with pytest.raises(ValueError, match="ReLU layers do not have a learning rate multiplier"):
+        draw.get_layer_lr_mult(net.layer[3])
+
+
+@pytest.mark.slow
+def test_graphviz_text_needs_no_graphviz(net, tmp_path: Path) -> None:
+    draw.draw_net_to_file(net, str(tmp_path / "net.dot"), "BT")
+    (read,) = pydot.graph_from_dot_file(str(tmp_path / "net.dot"))
+    assert names(read) >= {"data", "ip"}
+    assert len(read.get_edges()) == sum(len(layer.bottom) + len(layer.top) for layer in net.layer)
+
+
+def test_without_graphviz_the_picture_is_our_own(net, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    draw.draw_net_to_file(net, str(tmp_path / "net.png"))
+    assert (tmp_path / "net.png").read_bytes()[:4] == b"\x89PNG"
+    assert b"conv/1" in draw.draw_net(net, "LR", "svg", caffe_pb2.TRAIN)
+    with pytest.raises(SpecError, match=r"drawing a \.pdf needs Graphviz' program dot: install graphviz"):
+        draw.draw_net(net, "LR", "pdf")
+
+
+def test_without_pydot_one_line_says_what_to_install(net, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pydot", None)
+    with pytest.raises(ImportError, match=r"^caffe\.draw needs pydot: pip install pydot, or "):
+        draw.get_pydot_graph(net, "LR")
+
+
+@pytest.mark.slow
+@each("path", sorted(path for path in ROOT.glob("prototxt/**/*.prototxt") if "solver" not in path.name), last_parts)
+def test_every_net_of_the_project_is_drawn(path: Path) -> None:
+    drawn = text_format.Parse(path.read_text(), caffe_pb2.NetParameter())
+    graph = draw.get_pydot_graph(drawn, "LR")
+    assert len(graph.get_edges()) == sum(len(layer.bottom) + len(layer.top) for layer in drawn.layer)

@@ -1,0 +1,123 @@
+"""What BVLC Caffe computed, computed again through caffe.Net and the solvers: their passes are not netspec's own."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netspec.pycaffe as caffe
+from each import each
+from golden_cases import (
+    EVERY,
+    SAMPLED,
+    LayerCase,
+    assert_arrays,
+    assert_same_layers,
+    assert_training,
+    lay_out_examples,
+    promised,
+    set_parameters,
+)
+from netspec.compat.pycaffe import mode
+from netspec.compat.pycaffe.solver import Solver
+from paths import GOLDEN
+from pycaffe_cases import compute
+
+pytestmark = pytest.mark.slow
+
+LAYERS = sorted((GOLDEN / "layers").iterdir())
+TRAININGS = sorted(folder.name for folder in (GOLDEN / "train").iterdir())
+EXAMPLES = sorted(folder.name for folder in (GOLDEN / "examples" / "runs").iterdir())
+TOLERANCE = 1e-5  # of the largest element
+
+
+@pytest.fixture
+def exact() -> Iterator[Callable[[str], None]]:
+    before = mode.exact()
+    yield mode.set_exact
+    mode.set_exact(before)
+
+
+@each("folder", LAYERS)
+def test_blobs_hold_what_caffes_held(folder: Path) -> None:
+    case = LayerCase(folder)
+    found = compute(case)
+    assert set(found) == {key for key in case.golden if key.split("/")[0] not in ("in", "param_init", "topdiff")}
+    assert {value.dtype for value in found.values()} == {np.dtype(np.float32)}
+    assert_arrays(found, case.golden, TOLERANCE)
+
+
+@each("folder", LAYERS)
+def test_blobs_hold_caffes_bits(folder: Path, exact: Callable[[str], None], same_blas: bool) -> None:
+    if "all" not in promised(folder):
+        pytest.skip("not even netspec's own passes promise it")
+    exact("all")
+    case = LayerCase(folder)
+    assert_arrays(compute(case), case.golden, 0 if same_blas else TOLERANCE)
+
+
+@pytest.mark.parametrize("case", TRAININGS)
+def test_solvers_follow_caffe(
+    case: str, work_in: Callable[..., Path], exact: Callable[[str], None], same_blas: bool
+) -> None:
+    """A loop of step(1), as scripts have it: losses, final weights and test losses."""
+    work_in(f"train/{case}")
+    exact("all")
+    golden = np.load(f"{case}/trajectory.npz")
+    solver = caffe.get_solver(f"{case}/solver.prototxt")
+    solver.net.copy_from(f"{case}/init.caffemodel")
+    found = []
+    for _ in golden["loss"]:
+        solver.step(1)
+        found.append(float(solver.net.blobs["loss"].data))
+    solver.test_nets[0].share_with(solver.net)
+    tested = [float(solver.test_nets[0].forward()["loss"]) for _ in golden["test/loss"]]
+    assert solver.iter == len(golden["loss"])
+    results = {"test/loss": tested, **{key: sampled(solver, key, "data") for key in golden if key.startswith("final/")}}
+    if solver.param.iter_size == 1:  # else the file has the mean of several passes
+        results["loss"] = found
+    assert_training(results, golden, same_blas, 0.25 if case in ("adadelta", "rmsprop") else 1e-2)
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return lay_out_examples(tmp_path_factory.mktemp("examples"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", EXAMPLES)
+def test_caffes_examples(
+    run: str,
+    folder: Path,
+    exact: Callable[[str], None],
+    same_blas: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """LeNet, the autoencoder and the Siamese net: outputs, and what was subtracted from the weights first."""
+    monkeypatch.chdir(folder)
+    exact("all")
+    meta = json.loads(Path(f"examples/runs/{run}/meta.json").read_text())
+    golden = np.load(f"examples/runs/{run}/trajectory.npz")
+    solver = caffe.get_solver(f"examples/runs/{run}/solver.prototxt")
+    solver.param.test_initialization = False
+    for name in meta["init"]:
+        set_parameters(solver.net.passes.net, np.load(f"examples/init/{name}.npz"))
+    solver.step(1)
+    updates = {key: sampled(solver, key, "diff") for key in golden.files if key.startswith("update/")}
+    assert_same_layers(updates, golden, 1e-4)
+    outputs = [{name: float(solver.net.blobs[name].data) for name in solver.net.outputs}]
+    for _ in range(meta["iterations"] - 1):
+        solver.step(1)
+        outputs.append({name: float(solver.net.blobs[name].data) for name in solver.net.outputs})
+    found = {key: np.array([out[key[4:]] for out in outputs]) for key in golden.files if key.startswith("out/")}
+    found |= {key: sampled(solver, key, "data") for key in golden.files if key.startswith("final/")}
+    assert_training(found, golden, same_blas, 0.05)
+
+
+def sampled(solver: Solver, key: str, what: str) -> np.ndarray:
+    """Return ``data`` or ``diff`` of the parameter KIND/LAYER/INDEX, sampled as the examples' files are."""
+    _, layer, index = key.split("/")
+    values = getattr(solver.net.params[layer][int(index)], what)
+    return values if values.size < SAMPLED else values.reshape(-1)[::EVERY]

@@ -1,0 +1,400 @@
+"""Nets that an engine runs have torch's numbers; what it cannot do, torch does, and a line says so."""
+
+import logging
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import netspec
+from netspec.cli import main
+from netspec.errors import SpecError
+from netspec.export.engines import choice, runners
+from netspec.inspect.features.describer import Describer
+from netspec.inspect.features.records import extract_records
+
+ENGINES = ["onnxruntime", "openvino"]
+NET = """
+name: "small"
+layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 dim: 12 dim: 12 } } }
+layer { name: "conv" type: "Convolution" bottom: "data" top: "conv"
+  convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "gaussian" std: 0.3 } } }
+layer { name: "relu" type: "ReLU" bottom: "conv" top: "conv" }
+layer { name: "pool" type: "Pooling" bottom: "conv" top: "pool" pooling_param { kernel_size: 3 stride: 2 } }
+layer { name: "feat" type: "InnerProduct" bottom: "pool" top: "feat"
+  inner_product_param { num_output: 5 weight_filler { type: "gaussian" std: 0.3 } } }
+"""
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> str:
+    pytest.importorskip("onnx")
+    pytest.importorskip(request.param)
+    return request.param
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small net and its weights, in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    Path("net.prototxt").write_text(NET)
+    netspec.save_weights(netspec.load_net("net.prototxt", seed=1), "net.caffemodel")
+    return tmp_path
+
+
+@pytest.fixture
+def data() -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((2, 3, 12, 12), np.float32)
+
+
+def load(engine: str, **others: Any) -> Any:
+    return netspec.load_net("net.prototxt", weights="net.caffemodel", engine=engine, **others)
+
+
+def entries(folder: Path) -> list[Path]:
+    return sorted((folder / "cache" / "netspec").iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+def test_the_numbers_are_those_of_torch(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
+    net, expected = load(engine), load("torch")
+    assert type(net) is netspec.Net
+    net.load_state_dict(expected.state_dict())
+    with caplog.at_level(logging.WARNING):
+        for batch in (data, data[:1], torch.from_numpy(data)):
+            found = net(data=batch)
+            assert list(found) == ["feat"]
+            torch.testing.assert_close(found["feat"], expected(data=batch)["feat"].detach(), rtol=1e-5, atol=1e-5)
+    assert not caplog.messages
+    assert net.inputs == expected.inputs
+    assert net.shapes == expected.shapes
+    assert list(net.params) == ["conv", "feat"]
+    assert list(net.blobs) == ["feat"]
+
+
+@pytest.mark.slow
+def test_blobs_that_are_asked_for_are_kept(engine: str, files: Path, data: np.ndarray) -> None:
+    net, expected = load(engine), load("torch")
+    net.keep = expected.keep = ["conv"]
+    net(data=data)
+    expected(data=data)
+    assert list(net.blobs) == list(expected.blobs) == ["conv", "feat"]
+    torch.testing.assert_close(net.blobs["conv"], expected.blobs["conv"].detach(), rtol=1e-5, atol=1e-5)
+    assert len(entries(files)) == 1
+    net.keep = "all"
+    net(data=data)
+    assert set(net.blobs) == {"data", "conv", "pool", "feat"}
+    assert len(entries(files)) == 2
+
+
+@pytest.mark.slow
+def test_the_model_is_kept_by_content(engine: str, files: Path, data: np.ndarray) -> None:
+    first = load(engine)(data=data)["feat"]
+    (entry,) = entries(files)
+    made = entry.stat().st_mtime_ns
+    shutil.copy("net.prototxt", "same.prototxt")
+    again = netspec.load_net("same.prototxt", weights="net.caffemodel", engine=engine)(data=data)["feat"]
+    assert torch.equal(first, again)
+    assert entries(files) == [entry]
+    assert entry.stat().st_mtime_ns == made
+    for path in entry.iterdir():
+        if path.name != "about.json":
+            path.write_bytes(b"damaged")
+    assert torch.equal(load(engine)(data=data)["feat"], first)
+    assert torch.equal(load(engine, cache="elsewhere")(data=data)["feat"], first)
+    assert len(list(Path("elsewhere").iterdir())) == 1
+    before = entries(files)
+    assert torch.equal(load(engine, cache=False)(data=data)["feat"], first)
+    assert entries(files) == before
+
+
+@pytest.mark.slow
+def test_changed_parameters_take_effect_and_are_not_kept(engine: str, files: Path, data: np.ndarray) -> None:
+    net, expected = load(engine), load("torch")
+    net(data=data)
+    for each in (net, expected):
+        with torch.no_grad():
+            each.params["feat"][1].fill_(3)
+    torch.testing.assert_close(net(data=data)["feat"], expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
+    net.params["feat"][1].data[...] = 4
+    expected.params["feat"][1].data[...] = 4
+    torch.testing.assert_close(net(data=data)["feat"], expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
+    netspec.save_weights(expected, "other.caffemodel")
+    other = load(engine)
+    other(data=data)
+    netspec.load_weights(other, "other.caffemodel")
+    torch.testing.assert_close(other(data=data)["feat"], expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
+    assert len(entries(files)) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+def test_parameters_that_may_change_unseen_are_read_at_every_pass(
+    engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    net = load(engine)
+    net(data=data)
+    held = net.params["feat"][1].data.numpy()
+    with caplog.at_level(logging.WARNING), torch.no_grad():  # an autograd graph would hold them too
+        for value in (1, 2):
+            held[:] = value
+            found = net(data=data)["feat"]
+            expected = load("torch")
+            expected.params["feat"][1].data.fill_(value)
+            torch.testing.assert_close(found, expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
+    (line,) = caplog.messages
+    assert "parameters may change unseen while their memory is held" in line
+    del held
+    torch.testing.assert_close(net(data=data)["feat"], found, rtol=1e-5, atol=1e-5)
+    assert not net(data=data)["feat"].requires_grad
+
+
+@pytest.mark.slow
+def test_random_weights_are_not_kept(engine: str, files: Path, data: np.ndarray) -> None:
+    found = netspec.load_net("net.prototxt", seed=3, engine=engine)(data=data)["feat"]
+    expected = netspec.load_net("net.prototxt", seed=3)(data=data)["feat"].detach()
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    assert not (files / "cache").exists()
+
+
+@pytest.mark.usefixtures("files")
+def test_a_pass_that_needs_gradients_is_torchs(engine: str, data: np.ndarray) -> None:
+    given = torch.from_numpy(data).requires_grad_()
+    load(engine)(data=given)["feat"].sum().backward()
+    assert given.grad is not None
+    with pytest.raises(SpecError, match="no value for input 'data'"):
+        load(engine)()
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize(
+    ("layer", "phase", "reason"),
+    [
+        (
+            'name: "noise" type: "Pooling" bottom: "data" top: "noise" pooling_param { kernel_size: 1 stride: 2 }',
+            "TEST",
+            'layer "noise"',
+        ),
+        ("", "TRAIN", "it runs nets in phase TEST, this one is in TRAIN"),
+    ],
+)
+def test_what_it_cannot_do_is_torchs(
+    layer: str, phase: str, reason: str, engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    Path("net.prototxt").write_text(NET + (f"layer {{ {layer} }}" if layer else ""))
+    with caplog.at_level(logging.WARNING):
+        net = netspec.load_net("net.prototxt", phase, "net.caffemodel", engine=engine)
+        found = [net(data=data), net(data=data)]
+    expected = netspec.load_net("net.prototxt", phase, "net.caffemodel")(data=data)
+    assert all(torch.equal(each[name], value) for each in found for name, value in expected.items())
+    (line,) = caplog.messages
+    assert line.startswith(f"engine {engine}: ")
+    assert reason in line
+    assert line.endswith("; torch runs the net")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+def test_a_library_that_fails_is_replaced(
+    engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net = load(engine)
+    expected = net(data=data)["feat"]
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("out\nof order")
+
+    monkeypatch.setattr(runners.RUNNERS[engine], "run", fail)
+    with caplog.at_level(logging.WARNING):
+        torch.testing.assert_close(net(data=data)["feat"].detach(), expected, rtol=1e-5, atol=1e-5)
+    assert caplog.messages == [f"engine {engine}: out of order; torch runs the net"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+def test_a_cache_that_cannot_be_written_is_told(
+    engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    Path("file").write_text("")
+    with caplog.at_level(logging.WARNING):
+        load(engine, cache="file/cache")(data=data)
+    assert caplog.messages == ["file/cache: cannot be written: Not a directory; the exported model is not kept"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+def test_bf16_says_how_far_it_is_from_fp32(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
+    expected = load(engine)(data=data)["feat"]
+    with caplog.at_level(logging.WARNING):
+        found = [load(engine, precision="bf16")(data=data)["feat"] for _ in range(2)]
+    lines = caplog.messages
+    if "no bf16" in lines[0]:  # the CPU or the library has none
+        assert lines[0].endswith(f"; {engine} runs it in fp32")
+        assert torch.equal(found[0], expected)
+        return
+    worst = float((found[0] - expected).abs().max() / expected.abs().max())
+    assert 0 < worst < 0.03
+    assert lines == [f"precision bf16: feat differs from fp32 by {worst:.1e} of its largest value"] * 2
+
+
+@pytest.mark.usefixtures("files")
+def test_torch_runs_in_fp32(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        load("torch", precision="bf16")
+    assert caplog.messages == ["precision bf16: torch runs the net in fp32"]
+
+
+def test_an_engine_that_is_not_installed_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "find_spec", lambda name: None if name == "openvino" else True)
+    with pytest.raises(SpecError) as found:
+        netspec.load_net("net.prototxt", engine="openvino")
+    assert str(found.value) == "engine openvino needs the openvino library: pip install 'netspec-caffe[openvino]'"
+
+
+def test_as_many_threads_as_torch_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert runners.threads() == torch.get_num_threads()
+    monkeypatch.setattr(sys, "modules", {})
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    assert runners.threads() == 7
+    monkeypatch.setenv("OMP_NUM_THREADS", "")
+    assert runners.threads() >= 1
+
+
+# Records, commands, images
+
+
+@pytest.mark.slow
+def test_a_net_that_reads_records_scores_and_extracts_the_same(
+    engine: str, work_in: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    work_in("snapshot", "sgd_step")
+    words = ["--model", "sgd_step/train_val.prototxt", "--weights", "sgd_step/init.caffemodel"]
+    told = []
+    for options in ([], ["--engine", engine, "--cache", str(tmp_path / "kept")]):
+        assert main(["test", *words, "--iterations", "3", *options]) == 0
+        told.append([line.split("] ")[1] for line in capsys.readouterr().err.splitlines() if "loss = " in line])
+    assert len(told[0]) > 3
+    numbers = [[float(line.split("loss = ")[1].split()[0]) for line in lines] for lines in told]
+    np.testing.assert_allclose(numbers[1], numbers[0], rtol=1e-4)
+    plain = extract_records(netspec.load_net(words[1], weights=words[3]), ["feat"])
+    assert main(["extract", *words, "--blob", "feat", "--out", "f.npz", "--engine", engine, "--cache", "none"]) == 0
+    with np.load("f.npz") as found:
+        np.testing.assert_allclose(found["feat"], plain["feat"], rtol=1e-4, atol=1e-5)
+        assert list(found["keys"]) == list(plain["keys"])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+def test_time_is_of_the_whole_forward_pass(engine: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["time", "--model", "net.prototxt", "--phase", "TEST", "--iterations", "2", "--engine", engine]
+    assert main(words) == 0
+    told = capsys.readouterr().err
+    assert "Average Forward pass: " in told
+    assert "backward" not in told.partition("Benchmark begins")[2]
+    words[4] = "TRAIN"
+    assert main(words) == 0
+    told = capsys.readouterr().err
+    assert f"engine {engine}: it runs nets in phase TEST, this one is in TRAIN; torch runs the net" in told
+    assert "Average Backward pass: " in told
+
+
+def test_a_describer_takes_an_engine(engine: str, files: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (40, 30, 3), np.uint8)
+    expected = Describer("net.prototxt", "net.caffemodel", zooms="1,0.5")(image)
+    found = Describer("net.prototxt", "net.caffemodel", zooms="1,0.5", engine=engine)(image)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+    assert len(entries(files)) == 1
+
+
+@pytest.mark.slow
+def test_a_kept_net_describes_images_without_torch(engine: str, files: Path) -> None:
+    (files / "images").mkdir()
+    for k in range(17):  # more than a batch
+        cv2.imwrite(f"images/{k}.png", np.random.default_rng(k).integers(0, 256, (20, 20, 3), np.uint8))
+    words = [
+        "extract",
+        "--model",
+        "net.prototxt",
+        "--weights",
+        "net.caffemodel",
+        "--blob",
+        "feat",
+        "--images",
+        "images",
+    ]
+    assert main([*words, "--out", "expected.npz"]) == 0
+    assert main([*words, "--out", "first.npz", "--engine", engine]) == 0
+    code = "import sys; from netspec.cli import main; sys.exit(main(sys.argv[1:]) or 10 * ('torch' in sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words, "--out", "second.npz", "--engine", engine], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    with np.load("expected.npz") as expected, np.load("first.npz") as first, np.load("second.npz") as second:
+        np.testing.assert_allclose(first["features"], expected["features"], rtol=1e-4, atol=1e-4)
+        np.testing.assert_array_equal(first["features"], second["features"])
+
+
+def test_warnings_of_the_files_are_given_at_every_start(
+    engine: str, files: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    Path("net.prototxt").write_text(NET.replace('name: "conv"', 'name: "conv_renamed"'))
+    for _ in range(2):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            Describer("net.prototxt", "net.caffemodel", engine=engine)
+        (line,) = caplog.messages
+        assert "lacks weights for 1 of the net's 2 layers that have any: conv_renamed" in line
+    assert len(entries(files)) == 1
+
+
+FIRST_GOES_FIRST = """
+import gc, signal, sys
+import netspec, numpy as np
+
+def load():
+    net = netspec.load_net("net.prototxt", weights="net.caffemodel", engine="openvino", precision=sys.argv[1])
+    net(data=np.zeros((2, 3, 12, 12), np.float32))
+    return net
+
+heard = []
+first, second = load(), load()
+del first
+gc.collect()
+del second
+gc.collect()
+signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
+signal.raise_signal(signal.SIGTERM)
+assert heard == [signal.SIGTERM]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize("precision", choice.PRECISIONS)
+def test_signals_are_handled_after_nets_of_openvino_are_gone(precision: str) -> None:
+    """Each net's OpenVINO has a signal stack of its own; the first one's would stay where the second one goes last."""
+    pytest.importorskip("onnx")
+    pytest.importorskip("openvino")
+    done = subprocess.run([sys.executable, "-c", FIRST_GOES_FIRST, precision], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+def test_a_size_that_the_net_does_not_take_is_refused_by_all(engine: str) -> None:
+    odd = np.zeros((2, 3, 19, 12), np.float32)
+    faults = []
+    for net in (load("torch"), load(engine)):
+        with pytest.raises(SpecError, match=r'layer "feat" .*: bottom of shape') as found:
+            net(data=odd)
+        faults.append(str(found.value))
+    assert faults[0] == faults[1]

@@ -1,0 +1,158 @@
+"""Whatever ``train`` refuses before its first iteration, ``check`` reports, all at once, in the same words."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import lmdb
+import numpy as np
+import pytest
+
+import netspec
+from case_files import read_cases
+from netspec.data.blobs import from_array
+from netspec.data.database import Writer
+from netspec.data.datum import array_to_datum
+from netspec.data.mean import write_mean
+
+Run = Callable[..., Any]  # the fixture of conftest.py
+
+SOLVER = """net: "net.prototxt"
+base_lr: 0.1
+lr_policy: "fixed"
+max_iter: 1
+snapshot_after_train: false
+solver_mode: CPU
+"""
+NET = """layer { name: "data" type: "DummyData" top: "data" top: "label"
+  dummy_data_param { shape { dim: 4 dim: 3 } shape { dim: 4 dim: 2 } } }
+layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" param { lr_mult: 1 }
+  inner_product_param { num_output: 2
+    weight_filler { type: "xavier" }
+    bias_filler { type: "constant" } } }
+layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "label" top: "loss" }
+"""
+#: A net that reads from the database ``%s``.
+READS = """layer { name: "d" type: "Data" top: "data" top: "label"
+  data_param { source: "%s" backend: LMDB batch_size: 2 } }
+layer { name: "hush" type: "Silence" bottom: "data" bottom: "label" }
+"""
+# The files of each, where they are not the two above, and how each line begins that says what is wrong with them.
+CASES = read_cases("netspec/inspect/check/cases/faults.txt")
+FOUND_IN_DATA = read_cases("netspec/inspect/check/cases/faults_in_data.txt")
+
+
+@pytest.fixture
+def files(run: Run) -> None:
+    """Small data, sound and unsound, in the working directory."""
+    lmdb.open("empty_lmdb").close()
+    with Writer("db") as writer:
+        for i in range(3):
+            writer.put(b"%d" % i, array_to_datum(np.zeros((3, 6, 8), np.uint8)).SerializeToString())
+    write_mean("mean.binaryproto", np.zeros((3, 9, 9), np.float32))
+    cv2.imwrite("0.png", np.zeros((6, 8, 3), np.uint8))
+    Path("empty.txt").write_text("# nothing\n")
+    Path("names.txt").write_text("0.png\n")
+    Path("nix.txt").write_text("nix.png 0\n0.png 0\n")
+    Path("rows.txt").write_text("rows.h5\n")
+    with h5py.File("rows.h5", "w") as file:
+        file["data"] = np.zeros((3, 2))
+    other = netspec.proto.schema.NetParameter()
+    layer = other.layer.add(name="ip")
+    layer.blobs.extend([from_array(np.zeros((3, 5), np.float32)), from_array(np.zeros(3, np.float32))])
+    Path("other.caffemodel").write_bytes(other.SerializeToString())
+    with h5py.File("other.caffemodel.h5", "w") as file:
+        file["data/ip/0"], file["data/ip/1"] = np.zeros((3, 5)), np.zeros(3)
+    Path("cut.caffemodel.h5").write_bytes(Path("other.caffemodel.h5").read_bytes()[:1000])
+
+
+def write(**files: str) -> None:
+    for name, text in {"s.prototxt": SOLVER, "net.prototxt": NET, **files}.items():
+        Path(name).write_text(text)
+
+
+def write_case(case: dict[str, str]) -> list[str]:
+    """Write the files of a case; return how the lines begin that it gets."""
+    write(**{name: text for name, text in case.items() if name != "faults"})
+    return case["faults"].splitlines()
+
+
+def without_warnings(text: str) -> list[str]:
+    return [line for line in text.splitlines() if not line.startswith("warning: ")]
+
+
+def begin_with(lines: list[str], beginnings: list[str]) -> bool:
+    return len(lines) == len(beginnings) and all(map(str.startswith, lines, beginnings))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize("case", [*CASES.values(), *FOUND_IN_DATA.values()], ids=[*CASES, *FOUND_IN_DATA])
+def test_check_reports_at_once_what_train_refuses(run: Run, case: dict[str, str]) -> None:
+    faults = write_case(case)
+    before = sorted(Path().rglob("*"))
+    found = run("check", "s.prototxt", "--data")
+    lines = without_warnings(found.err)
+    assert (found.status, found.out) == (1, "")
+    assert begin_with(lines, faults), found.err
+    assert sorted(Path().rglob("*")) == before
+    trained = run("train", "s.prototxt")
+    assert trained.fault in lines
+    assert not any(message.startswith("Iteration ") for message in trained.messages)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_check_needs_no_data_for_the_faults_of_prototxts(
+    run: Run, case: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults = write_case(case)
+    for opens in ("layers.data.files.open_reader", "layers.data.files.read_image_list", "data.transformer.read_mean"):
+        monkeypatch.setattr(f"netspec.{opens}", lambda *_: pytest.fail("data was opened"))
+    assert begin_with(without_warnings(run("check", "s.prototxt").err), faults)
+
+
+SHAPES = {
+    "HDF5Data": ["--shape", "data=1,2", "--shape", "label=1"],
+    "Data": ["--shape", "data=1,3,6,8"],
+    "ImageData": ["--shape", "data=1,3,6,8"],
+}
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize("name", FOUND_IN_DATA)
+def test_check_opens_data_only_where_it_is_told_to(run: Run, name: str) -> None:
+    write_case(FOUND_IN_DATA[name])
+    shutil.rmtree("db")
+    words = next((words for kind, words in SHAPES.items() if f'type: "{kind}"' in Path("net.prototxt").read_text()), [])
+    if name != "a shape that does not suit the net":
+        assert run("check", "s.prototxt", *words).status == 0
+
+
+def test_weights_can_be_checked_against_a_net_or_a_solver(run: Run, files: None) -> None:
+    write()
+    for file in ("net.prototxt", "s.prototxt"):
+        assert run("check", file).status == 0
+        lines = run("check", file, "--weights", "other.caffemodel,gone.caffemodel").err.splitlines()
+        lines = [line for line in lines if not line.startswith("warning:")]
+        assert [line.partition(" ")[0] for line in lines] == ["other.caffemodel:"] * 2 + ["gone.caffemodel:"]
+    Path("s.prototxt").write_text(SOLVER + 'weights: "gone.caffemodel"')
+    assert "other" not in run("check", "s.prototxt").err
+    assert "gone" not in run("check", "s.prototxt", "--weights", "other.caffemodel").err  # as train --weights
+
+
+def test_a_shape_stands_for_the_data_of_its_layer(run: Run, files: None) -> None:
+    write(**{"net.prototxt": READS % "gone"})
+    assert run("check", "s.prototxt", "--data").status == 1
+    assert run("check", "s.prototxt", "--data", "--shape", "data=2,3,6,8").status == 0
+
+
+def test_data_says_the_shapes_that_it_has(run: Run, files: None) -> None:
+    write(**{"net.prototxt": READS % "db"})
+    result = run("check", "net.prototxt", "--data")
+    assert result.status == 0
+    assert "2x3x6x8, 2" in result.out

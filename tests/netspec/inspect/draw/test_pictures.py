@@ -1,0 +1,232 @@
+"""Pictures of nets: nothing overlaps, and what the net has is in them."""
+
+import random
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+
+import netspec
+from drawn_coordinates import SCREEN, faults, texts_of
+from each import each, last_parts
+from netspec.cli import main
+from netspec.errors import SpecError, Where
+from netspec.graph.options import BuildOptions
+from netspec.inspect.draw.blocks import find_blocks
+from netspec.inspect.draw.box import COLORS, color_of
+from netspec.inspect.draw.diagram import Box, Diagram, diagram_of, kind_of
+from netspec.inspect.draw.html import html_of
+from netspec.inspect.draw.marks import Rect
+from netspec.inspect.draw.picture import picture_of
+from netspec.inspect.draw.settings import settings_text
+from netspec.inspect.draw.svg import svg_of
+from netspec.layers import layer_types
+from netspec.proto.schema import TEST, TRAIN
+from netspec.proto.text import parse_net, parse_net_text
+from paths import nets_as_found
+
+PHASES = [TRAIN, TEST]
+INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 8 dim: 9 dim: 9 } } }\n'
+
+
+def read(text: str) -> Diagram:
+    return diagram_of(*parse_net_text(text, "net.prototxt"), PHASES)
+
+
+def layer(name: str, kind: str, bottoms: str, top: str, more: str = "") -> str:
+    reads = " ".join(f'bottom: "{bottom}"' for bottom in bottoms.split())
+    return f'layer {{ name: "{name}" type: "{kind}" {reads} top: "{top}" {more} }}\n'
+
+
+def conv(name: str, bottom: str, more: str = "") -> str:
+    settings = "convolution_param { num_output: 8 kernel_size: 3 pad: 1 }"
+    return layer(name, "Convolution", bottom, name, f"{settings} {more}")
+
+
+def residual(blocks: int) -> str:
+    text, last = INPUT, "data"
+    for k in range(blocks):
+        text += conv(f"a{k}", last) + layer(f"r{k}", "ReLU", f"a{k}", f"a{k}") + conv(f"b{k}", f"a{k}")
+        text += layer(f"s{k}", "Eltwise", f"{last} b{k}", f"s{k}")
+        last = f"s{k}"
+    return text + layer("end", "Pooling", last, "end", "pooling_param { global_pooling: true pool: AVE }")
+
+
+def random_diagram(seed: int) -> Diagram:
+    """Return boxes that read any earlier ones, with several tops and long names now and then."""
+    draw = random.Random(seed)
+    boxes, reads, tops = [], [], []
+    for k in range(draw.randint(1, 40)):
+        name = f"layer{k}" + "_long" * draw.choice((0, 0, 1, 8))
+        tops.append(tuple(f"{name}_{j}" for j in range(draw.choice((0, 1, 1, 1, 2, 3)))))
+        outputs = [(i, j) for i in range(k) for j in range(len(tops[i]))]
+        reads.append(tuple(draw.sample(outputs, min(len(outputs), draw.choice((1, 1, 1, 2, 5))))))
+        shapes = tuple("64×512×14×14" for _ in tops[-1])
+        boxes.append(Box(name, "Kind", "vision", "5×5", ("TEST",), Where("f"), "", str(k), 10, "", 5 * k, (), shapes))
+    return Diagram("random", tuple(boxes), tuple(reads), tuple(tops))
+
+
+@pytest.mark.slow
+@each("seed", range(60))
+def test_nothing_overlaps_whatever_the_wiring(seed: int) -> None:
+    assert list(faults(picture_of(random_diagram(seed)))) == []
+
+
+@pytest.mark.slow
+@each("path", nets_as_found(), last_parts)
+def test_nothing_overlaps_in_nets_as_they_are_found(path: Path) -> None:
+    picture = picture_of(
+        diagram_of(
+            *parse_net(path), PHASES, BuildOptions(open_data=False, given_shapes={"pair_data": (8, 6, 224, 224)})
+        )
+    )
+    assert [*faults(picture), *faults(picture, unfolded=True)] == []
+
+
+def test_an_overlap_would_be_found() -> None:
+    picture = picture_of(read(residual(2)))
+    picture.bands[3].drawing.marks.append(Rect(0, 0, picture.width, 70, "#fff", layer=99))
+    assert any("crosses box 99" in fault for fault in faults(picture))
+    assert any("overlap" in fault for fault in faults(picture))
+
+
+@pytest.mark.slow
+def test_blocks_that_repeat_are_drawn_once_and_unfold() -> None:
+    diagram = read(residual(100))
+    assert len(diagram.boxes) == 302
+    (block,) = find_blocks(diagram)
+    assert (block.length, block.copies) == (3, 100)
+    picture = picture_of(diagram)
+    folded, unfolded = picture.marks(), picture.marks(unfolded=True)
+    assert "100 × the same: a0 … a99" in [text.text for text in texts_of(folded)]
+    count = [sum(isinstance(m, Rect) and m.layer >= 0 for m in d.marks) for d in (folded, unfolded)]
+    assert count == [2 + 3, 302]
+    assert picture.width <= SCREEN
+    assert [*faults(picture), *faults(picture, unfolded=True)] == []
+
+
+def test_what_differs_does_not_fold() -> None:
+    text = residual(4).replace('name: "b2" type: "Convolution"', 'name: "b2" type: "Convolution" propagate_down: true')
+    assert [(block.first, block.copies) for block in find_blocks(read(text))] == []
+    seen = residual(6) + layer("peek", "ReLU", "a3", "peek")  # a blob inside the fourth block is used elsewhere
+    assert [(block.first, block.copies) for block in find_blocks(read(seen))] == [(1, 3)]
+
+
+def test_the_towers_of_a_siamese_net_stand_side_by_side() -> None:
+    param = 'param { name: "w" } param { name: "b" }'
+    text = INPUT + layer("cut", "Slice", "data", "p", 'top: "q"')
+    for name in "pq":
+        text += conv(f"c{name}", name, param) + layer(f"r{name}", "ReLU", f"c{name}", f"c{name}")
+    diagram = read(text + layer("loss", "EuclideanLoss", "cp cq", "loss"))
+    assert [box.owner for box in diagram.boxes if box.type == "Convolution"] == ["", "cp"]
+    marks = picture_of(diagram).marks().marks
+    at = {diagram.boxes[m.layer].name: m for m in marks if isinstance(m, Rect) and m.layer >= 0}
+    assert at["cp"].y == at["cq"].y
+    assert at["cp"].x + at["cp"].width < at["cq"].x
+    assert "weights of cp" in " ".join(text.text for text in texts_of(picture_of(diagram).marks()))
+
+
+def test_boxes_say_what_the_net_has() -> None:
+    text = 'name: "small"\n' + INPUT + conv("c", "data") + layer("r", "ReLU", "c", "c")
+    text += layer("hit", "Softmax", "c", "hit", "include { phase: TEST }")
+    box = read(text).boxes[1]
+    assert (box.shapes, box.weights, box.work) == (("1×8×9×9",), 8 * 8 * 9 + 8, 8 * 8 * 9 * 81)
+    assert [attached.name for attached in box.attached] == ["r"]
+    words = [text.text for text in texts_of(picture_of(read(text)).marks())]
+    assert {"small", "Convolution 3×3, 8, pad 1", "ReLU · r", "1×8×9×9", "TEST"} <= set(words)
+    assert "46.7 k mult-adds · 584 weights" in words
+
+
+def test_every_layer_type_has_a_color() -> None:
+    assert [name for name in layer_types() if color_of(kind_of(name)) == COLORS[""]] == []
+
+
+def test_a_layer_in_place_on_what_others_read_too_is_a_box_of_its_own() -> None:
+    text = INPUT + conv("c", "data") + layer("p", "Pooling", "c", "p", "pooling_param { kernel_size: 3 }")
+    diagram = read(text + layer("r", "ReLU", "c", "c") + layer("q", "Sigmoid", "c", "q"))
+    assert [box.name for box in diagram.boxes] == ["data", "c", "p", "r", "q"]
+    assert diagram.reads == ((), ((0, 0),), ((1, 0),), ((1, 0),), ((3, 0),))
+
+
+def test_a_net_that_cannot_be_built_is_drawn_without_its_shapes() -> None:
+    diagram = read(conv("c", "data").replace("c", "c", 1) + conv("d", "c"))
+    assert [box.name for box in diagram.boxes] == ["c", "d"]
+    assert any('unknown bottom blob "data"' in str(fault) for fault in diagram.faults)
+    assert list(faults(picture_of(diagram))) == []
+    assert list(faults(picture_of(read('name: "empty"')))) == []
+    assert [box.name for box in read('layer { name: "s" type: "Silence" bottom: "no" }').boxes] == ["s"]
+
+
+@pytest.mark.parametrize(
+    ("param", "words"),
+    [
+        ("convolution_param { num_output: 4 kernel_h: 3 kernel_w: 1 stride: 1 pad_h: 1 }", "3×1, 4, pad 1×0"),
+        ("pooling_param { pool: AVE global_pooling: true }", "AVE, global pooling"),
+        ("lrn_param { local_size: 3 alpha: 0.1 engine: CAFFE }", "local size 3, alpha 0.1"),
+    ],
+)
+def test_settings_in_a_few_words(param: str, words: str) -> None:
+    net, _ = parse_net_text(layer("x", "X", "a", "b", param), "f")
+    assert settings_text(net.layer[0]) == words
+
+
+@pytest.mark.slow
+def test_files_of_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    net = tmp_path / "net.prototxt"
+    net.write_text('name: "a <b> & \\"c\\""\n' + residual(3).replace('"a0"', '"</script>"'))
+    for suffix in ("svg", "html", "png"):
+        assert main(["draw", str(net), "--out", str(tmp_path / f"net.{suffix}")]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert said.out.splitlines()[-1] == f'{tmp_path / "net.png"}: 14 layers of a <b> & "c"'
+    svg = ElementTree.parse(tmp_path / "net.svg").getroot()
+    picture = cv2.imread(str(tmp_path / "net.png"))
+    assert picture is not None
+    assert picture.shape[1] == pytest.approx(2 * int(svg.attrib["width"]), abs=2)
+    assert np.ptp(picture) > 100
+    page = (tmp_path / "net.html").read_text()
+    assert page.count("</script>") == 1
+    assert not re.search(r"(src|href)=|@import|url\(", page)
+    assert main(["draw", str(net), "--out", str(tmp_path / "net.gif")]) == 2
+    assert main(["draw", str(tmp_path / "none.prototxt"), "--out", str(tmp_path / "net.svg")]) == 1
+
+
+def test_text_can_be_read_on_a_phone() -> None:
+    """The page draws no smaller than 9 / 10.5 of the picture at first: no text is below 9 pixels."""
+    diagram = read(residual(3) + layer("only", "ReLU", "end", "only", "include { phase: TEST }"))
+    page = html_of(diagram, picture_of(diagram))
+    sizes = [float(size) for size in re.findall(r'font-size="([\d.]+)"', page)]
+    assert "TEST" in page
+    assert min(sizes) >= 10.5
+    assert "Math.max(9 / 10.5" in page
+    assert "prefers-color-scheme: dark" in page
+    assert "a click on a box" in page
+
+
+def test_a_solver_is_drawn_by_its_training_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("net.prototxt").write_text('name: "trained"\n' + residual(1))
+    Path("solver.prototxt").write_text('net: "net.prototxt" base_lr: 1 lr_policy: "fixed"')
+    assert main(["draw", "solver.prototxt", "--out", "net.svg"]) == 0
+    assert "trained" in Path("net.svg").read_text()
+
+
+def test_the_net_in_a_file_of_weights_is_drawn(tmp_path: Path) -> None:
+    net = tmp_path / "net.prototxt"
+    net.write_text('name: "kept"\n' + INPUT + conv("conv", "data"))
+    netspec.save_weights(netspec.load_net(net), tmp_path / "net.caffemodel")
+    assert main(["draw", str(tmp_path / "net.caffemodel"), "--out", str(tmp_path / "net.svg")]) == 0
+    picture = (tmp_path / "net.svg").read_text()
+    assert "kept" in picture
+    assert "conv" in picture
+
+
+def test_names_of_strangers_write_no_markup() -> None:
+    diagram = Diagram(
+        "<b>", (Box("<i>\x1b", "T&", "", "", (), Where("f"), "<", ""),), ((),), (("<u>",),), (SpecError("x"),)
+    )
+    for text in (svg_of(picture_of(diagram)), html_of(diagram, picture_of(diagram))):
+        assert not re.search(r"<[biu]>|\x1b", text)

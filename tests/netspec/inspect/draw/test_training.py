@@ -1,0 +1,121 @@
+"""Pictures of trainings: what is in them, and the three forms in which they are written."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from netspec.inspect.draw.training import Look, training_figure
+from netspec.inspect.logs.curve import Curve
+from netspec.inspect.logs.run import Run, read_log
+from paths import GOLDEN
+
+CAFFES = GOLDEN / "log" / "caffe_train.log"
+Run_ = Callable[..., Any]
+
+
+def titles(figure: Any) -> list[str]:
+    return [axis.get_title("left") for axis in figure.axes]
+
+
+def test_each_kind_of_output_has_a_panel_and_each_run_its_curves() -> None:
+    run, other = read_log(CAFFES), read_log(CAFFES)
+    other.tests[0]["accuracy"] = Curve([0, 25], [0.5, 0.75])
+    figure = training_figure([run, other])
+    assert titles(figure) == ["loss", "accuracy", "learning rate"]
+    ids = [line.get_gid() for line in figure.axes[0].lines]
+    assert ids == ["run0-raw", "run0-smooth", "run0-test", "run1-raw", "run1-smooth", "run1-test"]
+    raw, test = figure.axes[0].lines[0], figure.axes[0].lines[2]
+    assert list(raw.get_ydata()) == run.loss.values  # pyright: ignore[reportArgumentType]
+    assert list(test.get_xdata()) == [0, 25, 50]  # pyright: ignore[reportArgumentType]
+    assert [line.get_gid() for line in figure.axes[1].lines] == ["run1-test"]
+
+
+def test_a_blob_of_many_numbers_gets_no_panels() -> None:
+    run = Run("x", Curve([0], [1]))
+    run.tests[0] = {f"p[{k}]": Curve([0], [1]) for k in range(100)}
+    assert titles(training_figure([run])) == ["loss"]
+
+
+def test_losses_that_are_no_numbers_are_marked() -> None:
+    figure = training_figure([Run("x", Curve([0, 1, 2], [1, float("nan"), float("inf")]))], Look(log=True))
+    (marks,) = [line for line in figure.axes[0].lines if line.get_gid() == "run0-nan"]
+    assert list(marks.get_xdata()) == [1, 2]  # pyright: ignore[reportArgumentType]
+
+
+def test_a_few_great_losses_do_not_hide_the_rest() -> None:
+    curve = Curve(list(range(100)), [80.0] + [1 + 0.01 * (k % 10) for k in range(99)])
+    assert training_figure([Run("x", curve)]).axes[0].get_ylim()[1] < 2
+
+
+def test_tests_far_above_the_training_are_in_the_picture() -> None:
+    run = Run("x", Curve(list(range(100)), [1 + 0.01 * (k % 10) for k in range(100)]), losses={"loss"})
+    run.tests[0] = {"loss": Curve([50], [3.0])}
+    assert training_figure([run]).axes[0].get_ylim()[1] > 3
+
+
+@pytest.mark.slow
+def test_the_command_writes_png_svg_and_html(run: Run_) -> None:
+    for ending in ("png", "svg", "html"):
+        result = run("plot", CAFFES, "--names", "<a> & $b_1$", "--out", f"x.{ending}")
+        assert (result.status, result.err) == (0, "")
+        assert "<a> & $b_1$: state done, iterations 60, last loss 0.0543485" in result.out
+    assert cv2.imread("x.png") is not None
+    texts = {text.text for text in ET.parse("x.svg").iter("{http://www.w3.org/2000/svg}text")}
+    assert {"<a> & $b_1$", "loss", "learning rate", "iteration"} <= texts
+    page = Path("x.html").read_text()
+    assert "<a>" not in page
+    assert 'id="run0-smooth"' in page
+    assert re.search(r'role="img" aria-label="[^"]*last loss 0\.0543485', page)
+    assert not re.search(r'(src|href)="http', page)
+    found = re.search(r'<script type="application/json" id="curves">(.*?)</script>', page)
+    assert found is not None
+    curves = json.loads(found[1])
+    assert curves["runs"][0]["name"] == "<a> & $b_1$"
+    assert dict(curves["runs"][0]["curves"])["test loss"] == [[0, 0.147966], [25, 0.0510559], [50, 0.0502543]]
+    assert 0 < curves["left"] < curves["right"] < 1
+
+
+def test_equal_names_are_told_apart_by_their_folders(run: Run_) -> None:
+    for folder in "ab":
+        Path(folder).mkdir()
+        Path(folder, "train.log").write_bytes(CAFFES.read_bytes())
+    assert run("plot", "a/train.log", "b/train.log", "--out", "x.svg").out.startswith("a/train.log: state")
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (("no.log", "--out", "x.png"), 1, "no.log: cannot be read: No such file or directory\n"),
+        ((CAFFES, "--out", "x.jpg"), 1, "x.jpg: expected a name that ends in .png, .svg, .html\n"),
+        ((CAFFES, "--out", "no/x.png"), 1, "no/x.png: cannot be written: No such file or directory\n"),
+        ((CAFFES, "--names", "a,b", "--out", "x.png"), 2, "found 2 --names and 1 logs"),
+    ],
+)
+def test_what_cannot_be_drawn(run: Run_, words: tuple[object, ...], status: int, said: str) -> None:
+    result = run("plot", *words)
+    assert result.status == status
+    assert said in result.err
+    assert not Path("x.png").exists()
+
+
+def test_a_logarithmic_axis_needs_losses_above_zero(run: Run_) -> None:
+    Path("x.log").write_text("Iteration 0, loss = -1\nIteration 10, loss = -2\n")
+    result = run("plot", "x.log", "--out", "x.svg", "--log_scale")
+    assert (result.status, result.err) == (0, "warning: no loss is above 0: its axis is not logarithmic\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["png", "svg", "html"])
+def test_names_that_cannot_be_written_are_escaped(run: Run_, ending: str) -> None:
+    name = "caf\udce9\x1b.log"
+    Path(name).write_bytes(CAFFES.read_bytes())
+    result = run("plot", name, "--out", f"x.{ending}")
+    assert result.out.startswith("caf\\udce9\\x1b.log: state done")
+    if ending == "svg":
+        assert "caf\\udce9\\x1b.log" in "".join(ET.parse("x.svg").getroot().itertext())

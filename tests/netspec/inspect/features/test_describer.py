@@ -1,0 +1,76 @@
+"""A net as the describe callable of a loop-closure detector."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from loopclosure.detector.detector import LoopDetector
+from netspec.data.database import open_reader
+from netspec.data.datum import datum_to_array, parse_datum
+from netspec.errors import SpecError
+from netspec.inspect.features.describer import Describer
+from netspec.inspect.features.records import extract_records
+from netspec.load import load_net
+from paths import GOLDEN
+
+
+@pytest.fixture
+def describe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Describer:
+    (tmp_path / "pairs").symlink_to(GOLDEN / "pairs")
+    (tmp_path / "sgd_step").symlink_to(GOLDEN / "snapshot")
+    monkeypatch.chdir(tmp_path)
+    return Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel")
+
+
+def test_an_image_gets_the_descriptor_that_the_whole_net_gives_it(describe: Describer) -> None:
+    net = load_net("sgd_step/train_val.prototxt", weights="sgd_step/init.caffemodel")
+    expected = extract_records(net, ["feat"], 1)["feat"]
+    net.close()
+    reader = open_reader("pairs/test_lmdb")
+    for k in range(3):
+        image = datum_to_array(parse_datum(reader.record(k)))[0]  # the first of the pair
+        assert np.allclose(describe(image), expected[k], atol=1e-5)
+        assert np.allclose(describe(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)), expected[k], atol=1e-2)
+
+
+def test_weights_come_from_several_files(describe: Describer) -> None:
+    image = np.random.default_rng(2).integers(0, 256, (28, 28), dtype=np.uint8)
+    both = Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel,sgd_step/init.caffemodel")
+    assert np.array_equal(both(image), describe(image))
+    with pytest.raises(SpecError, match=r"^gone\.caffemodel: cannot be read: No such file"):
+        Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel, gone.caffemodel")
+
+
+def test_images_of_any_size_are_resized(describe: Describer) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (60, 90, 3), dtype=np.uint8)
+    small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (28, 28))
+    assert np.array_equal(describe(image), describe(small))
+
+
+def test_zooms_are_views_of_the_middle_and_a_detector_sees_through_them(describe: Describer) -> None:
+    near = Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel", zooms="1,0.5")
+    images = np.random.default_rng(1).integers(0, 256, (8, 56, 56, 3), dtype=np.uint8)
+    descriptor = near(images[0])
+    np.testing.assert_allclose(descriptor, [*describe(images[0]), *describe(images[0][14:42, 14:42])], atol=1e-6)
+    detectors = [LoopDetector(d, views=d.views, exclude_recent=2, threshold=-1e-3) for d in (describe, near)]
+    for detector in detectors:
+        for image in images:
+            detector.add(image)
+    # A step ahead, the camera sees what was in the middle.
+    assert [detector.add(images[3][14:42, 14:42]).accepted for detector in detectors] == [None, 3]
+
+
+@pytest.mark.parametrize(("zooms", "fault"), [("1,x", "expected numbers"), (1.5, "at most 1"), ("0", "more than 0")])
+def test_odd_zooms(describe: Describer, zooms: str | float, fault: str) -> None:
+    with pytest.raises(SpecError, match=fault):
+        Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel", zooms=zooms)
+
+
+def test_a_detector_takes_it(describe: Describer) -> None:
+    images = np.random.default_rng(1).integers(0, 256, (8, 28, 28, 3), dtype=np.uint8)
+    detector = LoopDetector(describe, exclude_recent=2, threshold=-1e-3)
+    for image in images:
+        detector.add(image)
+    assert detector.add(images[3]).accepted == 3

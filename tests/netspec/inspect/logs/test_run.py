@@ -1,0 +1,211 @@
+"""Logs of trainings: Caffe's own of several versions, and netspec's."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from netspec.errors import SpecError
+from netspec.inspect.logs.curve import Curve, shown_range, smoothed, thinned
+from netspec.inspect.logs.run import Follower, LogReader, Run, read_log
+from netspec.inspect.logs.summary import iterations_per_second, summary
+from paths import GOLDEN
+
+CAFFES = GOLDEN / "log" / "caffe_train.log"
+OLD = "I0101 00:00:{:02d}.000000   77 solver.cpp:239] {}"
+
+
+def read(*messages: str) -> Run:
+    reader = LogReader("log")
+    for second, message in enumerate(messages):
+        reader.feed(OLD.format(second, message))
+    return reader.run
+
+
+def test_a_log_of_caffe() -> None:
+    run = read_log(CAFFES)
+    assert run.loss.iterations == [0, 10, 20, 30, 40, 50, 60]
+    assert run.loss.values[1] == 0.0442083
+    assert (run.rate.iterations, run.rate.values[2:4]) == ([0, 10, 20, 30, 40, 50], [0.005, 0.005])
+    assert run.tests == {0: {"loss": Curve([0, 25, 50], [0.147966, 0.0510559, 0.0502543])}}
+    assert run.train["loss"].values == run.loss.values[:-1]
+    assert run.losses == {"loss"}
+    assert run.snapshots[-1] == (60, "sgd_step/ref_iter_60.caffemodel")
+    assert (run.state, run.max_iter, run.process) == ("done", 60, 12526)
+    assert run.speed.values[1] == 117.647
+    assert run.times.values[-1] == pytest.approx(0.639364, abs=1e-6)
+    assert summary(run)["least test loss"] == "0.0502543 at 50"
+
+
+def test_sentences_of_other_versions() -> None:
+    run = read(
+        "Iteration 100, Testing net (#1)",
+        "    Test net output #0: accuracy = 0.5",
+        "Test score #1: 0.25",
+        "Test loss: 0.75",
+        "Iteration 100, loss = 1.5",
+        "Iteration 100, lr = 0.01",
+        "Iteration 200 (12.5 iter/s, 8s/100 iter), 1.2/90ep, loss = 1.25",
+    )
+    assert run.tests == {1: {"accuracy": Curve([100], [0.5]), "score 1": Curve([100], [0.25]),
+                             "test loss": Curve([100], [0.75])}}  # fmt: skip
+    assert run.loss == Curve([100, 200], [1.5, 1.25])
+    assert run.speed == Curve([200], [12.5])
+
+
+def test_a_log_of_2014() -> None:
+    run = read(
+        "Iteration 500, lr = 0.001",
+        "Iteration 500, loss = 1.5",
+        "Iteration 500, Testing net",
+        "Test score #0: 0.5504",
+        "Test score #1: 1.27805",
+        "Snapshotting to lenet_iter_500",
+        "Snapshotting solver state to lenet_iter_500.solverstate",
+    )
+    assert run.tests == {0: {"score 0": Curve([500], [0.5504]), "score 1": Curve([500], [1.27805])}}
+    assert (run.loss, run.rate) == (Curve([500], [1.5]), Curve([500], [0.001]))
+    assert run.snapshots == [(500, "lenet_iter_500")]
+
+
+def test_a_log_without_prefixes_and_one_of_several_nodes() -> None:
+    reader = LogReader("log")
+    for line in ("Iteration 10, loss = 0.5", "    Train net output #0: loss: a = b = 0.25 (* 1 = 0.25 loss)",
+                 "[n0.d0.r0] Iteration 20 (2.5 iter/s, 4s/10 iter), 0.1/90.1ep, loss = 0.75",
+                 "[n0.d0.r0]     Test net output #0: top-1 = 0.5"):  # fmt: skip
+        reader.feed(line)
+    assert reader.run.loss == Curve([10, 20], [0.5, 0.75])
+    assert reader.run.train == {"loss: a = b": Curve([10], [0.25])}
+    assert reader.run.tests == {0: {"top-1": Curve([20], [0.5])}}
+    assert not len(reader.run.times)
+
+
+@pytest.mark.parametrize("text", ["nan", "-nan", "1.#QNAN", "-1.#IND"])
+def test_a_loss_that_is_no_number(text: str) -> None:
+    assert np.isnan(read("Iteration 1, loss = " + text).loss.values).all()
+
+
+def test_elements_of_one_output_have_names_of_their_own() -> None:
+    lines = [f"    Test net output #{k}: {name} = {k}" for k, name in enumerate(["p", "p", "q", "p = r"])]
+    run = read("Iteration 5, Testing net (#0)", *lines, "Iteration 9, Testing net (#0)", *lines)
+    assert {name: curve.values for name, curve in run.tests[0].items()} == {
+        "p": [0, 0], "p[1]": [1, 1], "q": [2, 2], "p = r": [3, 3]}  # fmt: skip
+
+
+def test_a_resumed_training_replaces_what_it_repeats() -> None:
+    test = ["    Test net output #0: loss = {} (* 1 = {} loss)".format(*2 * [value]) for value in "123"]
+    run = read("Iteration 0, loss = 1", "Iteration 10, loss = 2", "Iteration 15, Testing net (#0)", test[0],
+               "Iteration 20, loss = 3", "Initializing solver from parameters: ", "Iteration 10, Testing net (#0)",
+               test[1], "Iteration 10, loss = 4")  # fmt: skip
+    assert run.loss == Curve([0, 10], [1, 4])
+    assert run.tests[0]["loss"] == Curve([10], [2])
+
+
+def test_the_years_end_does_not_turn_time_back() -> None:
+    reader = LogReader("log")
+    reader.feed("I1231 23:59:59.000000 1 solver.cpp:239] Iteration 0, loss = 1")
+    reader.feed("I0101 00:00:01.000000 1 solver.cpp:239] Iteration 10, loss = 1")
+    assert reader.run.times.values[1] == pytest.approx(2, abs=86400.0)
+    assert reader.run.times.values[1] > 0
+    assert iterations_per_second(reader.run)
+
+
+@pytest.mark.parametrize(
+    ("line", "state"),
+    [
+        ("I0101 00:00:00.000000 1 solver.cpp:332] Optimization Done.", "done"),
+        ("I0101 00:00:00.000000 1 solver.cpp:311] Optimization stopped early.", "stopped early"),
+        ("F0101 00:00:00.000000 1 math.cpp:1] Check failed: error == cudaSuccess (2 vs. 0)  out of memory", "failed"),
+        ("*** Aborted at 1 (unix time) try SIGABRT", "failed"),
+        ("a b.prototxt:3:1: Iteration 500: the loss is nan; lower base_lr, or go on with --nan warn", "failed"),
+        ("I0101 00:00:00.000000 1 net.cpp:1] something", "running"),
+    ],
+)
+def test_how_a_training_ended(line: str, state: str) -> None:
+    reader = LogReader("log")
+    reader.feed(line)
+    assert reader.run.state == state
+
+
+def test_a_growing_log_gives_what_the_whole_log_gives(tmp_path: Path) -> None:
+    data, path = CAFFES.read_bytes(), tmp_path / "train.log"
+    path.write_bytes(b"")
+    follower = Follower(path, str(CAFFES))
+    for start in range(0, len(data), 997):
+        with path.open("ab") as file:
+            file.write(data[start : start + 997])
+        assert follower.poll()
+    assert not follower.poll()
+    assert follower.run == read_log(CAFFES)
+    path.write_bytes(b"I0101 00:00:00.000000 1 solver.cpp:239] Iteration 7, loss = 1\n")
+    follower.poll()
+    assert follower.run.loss == Curve([7], [1])
+
+
+@pytest.mark.parametrize(("data", "what"), [(b"\xff\x00 no log", "holds no iteration"), (None, "cannot be read")])
+def test_what_is_no_log_is_refused(tmp_path: Path, data: bytes | None, what: str) -> None:
+    path = tmp_path / "x.log"
+    if data is not None:
+        path.write_bytes(data)
+    with pytest.raises(SpecError, match=what):
+        read_log(path)
+
+
+def test_smoothing_is_the_mean_of_the_finite_neighbors() -> None:
+    values = np.array([1, 2, np.nan, 4, np.inf, 6.0])
+    np.testing.assert_allclose(smoothed(values, 3), [1.5, 1.5, 3, 4, 5, 6])
+    np.testing.assert_array_equal(smoothed(values, 1)[:2], [1, 2])
+    assert np.isnan(smoothed(values, 1)[2])
+
+
+def test_thinning_keeps_extremes_and_ends() -> None:
+    x = np.arange(10000.0)
+    y = np.sin(x)
+    y[1234], y[4321], y[50] = 9, -9, np.nan
+    few, kept = thinned(x, y, 100)
+    assert len(few) <= 102
+    assert {0, 1234, 4321, 9999} <= set(few)
+    np.testing.assert_array_equal(kept, y[few.astype(int)])
+
+
+def test_the_range_that_is_drawn_leaves_out_few_values_and_no_curve() -> None:
+    loss = np.concatenate([[80.0], np.linspace(2, 1, 99)])
+    low, high = shown_range([loss]) or (0, 0)
+    assert (low, high) == (1, pytest.approx(2.6, abs=0.1))
+    assert shown_range([loss, np.array([5.0, 6.0])]) == (1, pytest.approx(9.0))
+    assert shown_range([np.array([80.0, 1, 2])]) == (1, 80)
+    assert shown_range([np.full(3, np.nan)]) is None
+
+
+@pytest.mark.parametrize("digits", [11, 400, 5000])
+def test_numbers_that_no_training_has_are_not_read(digits: int) -> None:
+    """Caffe's counts are ints of 32 bits, its losses floats of 32 bits."""
+    long = "9" * digits
+    run = read(
+        "Iteration 10, loss = 1",
+        f"Iteration {long}, loss = 0.5",
+        f"Iteration {long}, lr = 0.1",
+        f"Iteration {long}, Testing net (#{long})",
+        f"Test net output #{long}: accuracy = 0.5",
+        "Iteration 20, loss = 1e308",
+        f"Snapshotting to x_iter_{long}.caffemodel",
+    )
+    run.settings["max_iter"] = long
+    assert (run.loss.iterations, run.loss.values) == ([10, 20], [1, float("inf")])
+    assert (len(run.rate), run.tests, run.snapshots, run.max_iter) == (0, {}, [], None)
+    run.settings["max_iter"] = "\u00b2"
+    assert run.max_iter is None
+
+
+def test_a_log_may_come_through_a_pipe(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.write(writer, CAFFES.read_bytes())  # less than a pipe holds
+    os.close(writer)
+    run = read_log(f"/dev/fd/{reader}")
+    os.close(reader)
+    assert run.loss.iterations[:2] == [0, 10]
+
+
+def test_a_window_may_be_larger_than_the_curve() -> None:
+    assert smoothed(np.array([1.0, 3.0]), 10**30).tolist() == [2, 2]

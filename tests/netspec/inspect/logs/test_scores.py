@@ -1,0 +1,51 @@
+"""The file that tells programs what a training's tests found and which snapshots it took."""
+
+from pathlib import Path
+
+import pytest
+
+from netspec.errors import SpecError
+from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
+
+SCORES = Scores(
+    [
+        Score(0, 0, {"loss": [0.5], "accuracy": [0.1, 0.2]}),
+        Score(5, 0, {"loss": [0.25]}),
+        Score(5, 1, {"loss": [1.0]}),
+    ],
+    [Snapshot(5, "a/b_iter_5.caffemodel"), Snapshot(8, "a/b_iter_8.caffemodel")],
+)
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    SCORES.write(tmp_path / "scores.json")
+    assert read_scores(tmp_path / "scores.json") == SCORES
+    assert [path.name for path in tmp_path.iterdir()] == ["scores.json"]
+
+
+def test_values_that_are_no_numbers_are_kept(tmp_path: Path) -> None:
+    Scores([Score(3, 0, {"loss": [float("inf"), float("nan")]})]).write(tmp_path / "scores.json")
+    (test,) = read_scores(tmp_path / "scores.json").tests
+    assert [str(value) for value in test.outputs["loss"]] == ["inf", "nan"]
+
+
+def test_a_training_that_goes_on_keeps_what_was_before() -> None:
+    assert SCORES.before(5) == Scores(SCORES.tests[:1], SCORES.snapshots[:1])  # it will test at 5 once more
+    assert SCORES.before(6) == Scores(SCORES.tests, SCORES.snapshots[:1])
+    assert SCORES.before(0) == Scores([], [])
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "1", '{"tests": []}', '{"tests": [1], "snapshots": []}', '{"tests": [{}], "snapshots": []}']
+)
+def test_another_file_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "f.json").write_text(text)
+    with pytest.raises(SpecError) as fault:
+        read_scores(tmp_path / "f.json")
+    assert str(fault.value).startswith(f"{tmp_path}/f.json: this is not a scores file (of netspec train --scores): ")
+    assert "\n" not in str(fault.value)
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match=r"nowhere\.json: cannot be read: No such file"):
+        read_scores(tmp_path / "nowhere.json")

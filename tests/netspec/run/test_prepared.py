@@ -1,0 +1,434 @@
+"""Runs without gradients: prepared, folded and fused, they give what a layer-by-layer run gives, whoever writes."""
+
+import copy
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typing_extensions import override
+
+from exported import trained
+from netspec.exact.blas import one_thread
+from netspec.graph.steps import PASSES
+from netspec.layers.activation import ReLU
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.offers import offered
+from netspec.layers.vision.convolution import Convolution
+from netspec.net.net import Net
+from netspec.net.weights import load_weights, write_binary
+from netspec.proto.schema import TRAIN, LayerParameter
+from netspec.run import prepared as programs
+
+FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
+INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 8 dim: 40 dim: 40 } } }'
+CONV = f'type: "Convolution" convolution_param {{ num_output: 16 kernel_size: 3 pad: 1 {FILLERS} }}'
+PRODUCT = f'type: "InnerProduct" inner_product_param {{ num_output: 6 {FILLERS} }}'
+NORM = """
+layer { name: "bn" type: "BatchNorm" bottom: "conv" top: "bn" }
+layer { name: "scale" type: "Scale" bottom: "bn" top: "scale" scale_param { bias_term: true } }
+layer { name: "relu" type: "ReLU" bottom: "scale" top: "scale" }
+"""
+BLOCK = INPUT + f'layer {{ name: "conv" bottom: "data" top: "conv" {CONV} }}' + NORM
+SHARED = f"""
+layer {{ name: "drop" type: "Dropout" bottom: "scale" top: "scale" }}
+layer {{ name: "left" bottom: "scale" top: "left" {CONV} }}
+layer {{ name: "right" bottom: "scale" top: "right" {CONV} }}
+layer {{ name: "sum" type: "Eltwise" bottom: "left" bottom: "right" top: "sum" }}
+layer {{ name: "end" type: "ReLU" bottom: "sum" top: "sum" }}
+"""
+
+
+def images(*shape: int) -> torch.Tensor:
+    return torch.randn(*(shape or (1, 8, 40, 40)), generator=torch.Generator().manual_seed(3))
+
+
+def slowly(net: Net, **inputs: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return what the net gives layer by layer."""
+    with torch.enable_grad():
+        return {name: blob.detach() for name, blob in net(**inputs).items()}
+
+
+def quickly(net: Net, **inputs: torch.Tensor) -> dict[str, torch.Tensor]:
+    with torch.no_grad():
+        return net(**inputs)
+
+
+def assert_same(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> None:
+    assert list(found) == list(expected)
+    for name, blob in expected.items():
+        assert found[name].shape == blob.shape
+        assert float((found[name] - blob).abs().max()) <= 1e-5 * max(1.0, float(blob.abs().max()))
+
+
+def last_program(net: Net) -> programs.Program:
+    assert net.prepared is not None
+    return next(reversed(net.prepared.made.values()))
+
+
+def test_norms_fold_into_the_convolution_and_the_activation_fuses(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK))
+    assert_same(quickly(net, data=images()), slowly(net, data=images()))
+    program = last_program(net)
+    (step,) = program.schedule.steps
+    assert step.chain is not None
+    assert [net.plan.nodes[i].name for i in (step.node, *step.chain.folded)] == ["conv", "bn", "scale"]
+    assert step.finish is not None
+    assert net.plan.nodes[step.finish].name == "relu"
+    assert program.kinds == ["packed"]
+
+
+def test_what_only_hands_on_is_not_run_and_sums_are_made_in_place(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK + SHARED))
+    assert_same(quickly(net, data=images()), slowly(net, data=images()))
+    steps = last_program(net).schedule.steps
+    assert [net.plan.nodes[step.node].name for step in steps] == ["conv", "left", "right", "sum"]
+    assert steps[-1].reuse
+
+
+@pytest.mark.parametrize("how", ["num_output: 12", "num_output: 8 group: 8", "num_output: 8 group: 8 dilation: 2"])
+def test_deconvolutions_are_laid_out_too(how: str, net_of: Callable[..., Net]) -> None:
+    layer = f'type: "Deconvolution" convolution_param {{ kernel_size: 4 stride: 2 pad: 1 {how} {FILLERS} }}'
+    text = INPUT + f'layer {{ name: "conv" bottom: "data" top: "conv" {layer} }}' + NORM
+    net = trained(net_of(text.replace('type: "ReLU"', 'type: "ReLU" relu_param { negative_slope: 0.1 }')))
+    x = images(1, 8, 80, 80)
+    assert_same(quickly(net, data=x), slowly(net, data=x))
+    assert last_program(net).kinds == ["packed"]
+
+
+@pytest.mark.parametrize("passes", [(), *((name,) for name in PASSES), PASSES], ids="-".join)
+def test_each_pass_can_be_switched(passes: tuple[str, ...], net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK + SHARED, passes=passes))
+    assert_same(quickly(net, data=images()), slowly(net, data=images()))
+    assert (net.prepared is None) == (not passes)
+
+
+@pytest.mark.parametrize("keep", ["all", ["conv"], ["bn", "left"]], ids=str)
+def test_blobs_that_are_asked_for_are_there(keep: str | list[str], net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK + SHARED))
+    net.keep = keep
+    slowly(net, data=images())
+    expected = {name: blob.detach() for name, blob in net.blobs.items()}
+    quickly(net, data=images())
+    assert_same(net.blobs, expected)
+    net.keep = ()
+    quickly(net, data=images())
+    assert list(net.blobs) == ["sum"]
+
+
+def test_small_layers_keep_caffes_order_of_sums(net_of: Callable[..., Net]) -> None:
+    text = BLOCK.replace("dim: 40 dim: 40", "dim: 6 dim: 6")
+    net = trained(net_of(text))
+    x = images(1, 8, 6, 6)
+    np.testing.assert_array_equal(quickly(net, data=x)["scale"], slowly(net, data=x)["scale"])
+    assert last_program(net).kinds == ["exact", "exact", "exact"]
+    loose = trained(net_of(text, exact="none"))
+    assert_same(quickly(loose, data=x), slowly(loose, data=x))
+    assert len(last_program(loose).kinds) == 1
+
+
+def write_in_place(net: Net) -> None:
+    with torch.no_grad():
+        net.params["conv"][0].mul_(2)
+
+
+def write_to_data(net: Net) -> None:
+    net.params["conv"][0].data[...] = 0.25
+
+
+def write_by_numpy(net: Net) -> None:
+    net.params["bn"][0].detach().numpy()[...] = 3
+
+
+def give_other_data(net: Net) -> None:
+    net.params["scale"][1].data = torch.full((16,), -0.5)
+
+
+def replace_the_parameter(net: Net) -> None:
+    net.layers[1].blobs[0] = torch.nn.Parameter(torch.full((16, 8, 3, 3), 0.1))
+
+
+def load_other_weights(net: Net) -> None:
+    path = net.plan.source.file  # of a test: no file has this name
+    other = {name: [blob.detach() + 1 for blob in blobs] for name, blobs in net.params.items()}
+    kept = {name: [blob.detach().clone() for blob in blobs] for name, blobs in net.params.items()}
+    for values in (other, kept):
+        with torch.no_grad():
+            for name, blobs in net.params.items():
+                for blob, value in zip(blobs, values[name], strict=True):
+                    blob.copy_(value)
+        if values is other:
+            write_binary(net, path)
+    load_weights(net, path)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        write_in_place,
+        write_to_data,
+        write_by_numpy,
+        give_other_data,
+        replace_the_parameter,
+        load_other_weights,
+    ],
+)
+def test_what_is_written_to_parameters_counts_in_the_next_run(
+    write: Callable[[Net], None],
+    net_of: Callable[..., Net],
+    tmp_path: object,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(str(tmp_path))
+    net = trained(net_of(BLOCK))
+    before = quickly(net, data=images())["scale"]
+    write(net)
+    after = quickly(net, data=images())
+    assert_same(after, slowly(net, data=images()))
+    assert float((after["scale"] - before).abs().max()) > 1e-3
+    for _ in range(2):
+        assert_same(quickly(net, data=images()), slowly(net, data=images()))
+    if write is not replace_the_parameter:  # a parameter of another class does not say what is written to it
+        assert last_program(net).kinds == ["packed"]
+
+
+def test_memory_that_somebody_holds_may_be_written_to_at_any_time(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK))
+    quickly(net, data=images())
+    held = net.params["conv"][0].detach().numpy()[1:]
+    for value in (0.1, 0.2, 0.3):
+        held[...] = value
+        assert_same(quickly(net, data=images()), slowly(net, data=images()))
+        assert last_program(net).kinds[0] == "as is"
+    del held
+    quickly(net, data=images())
+    assert_same(quickly(net, data=images()), slowly(net, data=images()))
+    assert last_program(net).kinds == ["packed"]
+
+
+def test_shapes_may_change_from_run_to_run(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK + SHARED))
+    for shape in ((1, 8, 40, 40), (3, 8, 20, 31), (1, 8, 5, 5), (1, 8, 40, 40), (3, 8, 20, 31)):
+        assert_same(quickly(net, data=images(*shape)), slowly(net, data=images(*shape)))
+    assert net.prepared is not None
+    assert len(net.prepared.made) == 3
+
+
+@pytest.mark.parametrize("exact", ["none", "small"])
+def test_what_was_prepared_for_a_shape_is_there_when_it_comes_again(exact: str, net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK + SHARED, exact=exact))
+    sizes = (5, 40, 7)
+    for size in sizes:
+        quickly(net, data=images(1, 8, size, size))
+    assert net.prepared is not None
+    before = list(net.prepared.made.values())
+    for size in sizes:
+        quickly(net, data=images(1, 8, size, size))
+    assert all(a is b for a, b in zip(net.prepared.made.values(), before, strict=True))
+    assert "as is" not in {kind for program in before for kind in program.kinds}
+
+
+def test_programs_of_a_net_are_bounded(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(programs, "PROGRAMS", 2)
+    net = trained(net_of(BLOCK))
+    for size in (7, 8, 9, 7):
+        assert_same(quickly(net, data=images(1, 8, size, size)), slowly(net, data=images(1, 8, size, size)))
+    assert net.prepared is not None
+    assert len(net.prepared.made) == 2
+
+
+@pytest.mark.parametrize(("runs", "fewest", "most"), [(programs.RUNS, 2, 16), (0, 1, 1)])
+def test_what_programs_keep_is_bounded_by_what_runs_need(
+    runs: int, fewest: int, most: int, net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs, "RUNS", runs)
+    net = trained(net_of(BLOCK + SHARED))
+    assert net.prepared is not None
+    learned = sum(item.parameter.nbytes for item in net.learnable)
+    for size in range(8, 24):
+        quickly(net, data=images(1, 8, size, 9))
+        made = net.prepared.made.values()
+        limit = runs * (learned + max(program.need for program in made))
+        assert len(made) == 1 or net.prepared.kept_bytes() <= limit
+        assert set().union(*(program.memos for program in made)) == set(net.prepared.memos)
+    assert fewest <= len(net.prepared.made) <= most
+    assert_same(quickly(net, data=images(1, 8, 8, 9)), slowly(net, data=images(1, 8, 8, 9)))
+
+
+def test_exact_programs_share_copies_of_blobs_and_count_what_they_keep(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK, exact="all"))
+    assert net.prepared is not None
+    for size in range(8, 40):
+        quickly(net, data=images(1, 8, size, size))
+    made = net.prepared.made.values()
+    assert net.prepared.memos.keys() == next(iter(made)).memos
+    assert min(program.kept for program in made) > 0
+    learned = sum(item.parameter.nbytes for item in net.learnable)
+    assert net.prepared.kept_bytes() <= programs.RUNS * (learned + max(program.need for program in made))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_runs_of_many_sizes_take_little_more_memory_than_one(tmp_path: Path) -> None:
+    """Six small convolutions, 24 batch sizes: the process grows by a few runs of the largest."""
+    text = 'layer { name: "c0" type: "Input" top: "c0" input_param { shape { dim: 1 dim: 32 dim: 64 dim: 64 } } }'
+    for k in range(6):
+        text += f"""layer {{ name: "c{k + 1}" type: "Convolution" bottom: "c{k}" top: "c{k + 1}"
+            convolution_param {{ num_output: 32 kernel_size: 3 pad: 1 weight_filler {{ type: "xavier" }} }} }}"""
+    path = tmp_path / "net.prototxt"
+    path.write_text(text)
+    program = f"""if True:
+        import os, torch, netspec
+        from pathlib import Path
+        torch.set_num_threads(1)
+        net = netspec.load_net({str(path)!r}, seed=0)
+        grown = []
+        for size in range(1, 71, 3):
+            with torch.no_grad():
+                net(c0=torch.ones(size, 32, 64, 64))
+            grown.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
+        print(max(grown) - grown[0])"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=True)
+    one_run = 3 * 4 * 70 * 32 * 64 * 64  # bytes: the input, a bottom and a top
+    assert int(told.stdout) < 3 * one_run
+
+
+def test_nets_that_train_are_not_prepared(net_of: Callable[..., Net]) -> None:
+    assert net_of(BLOCK, TRAIN).prepared is None
+
+
+def test_inputs_and_earlier_outputs_are_never_overwritten(net_of: Callable[..., Net]) -> None:
+    text = (
+        INPUT
+        + """
+layer { name: "flat" type: "Flatten" bottom: "data" top: "flat" }
+layer { name: "double" type: "Eltwise" bottom: "data" bottom: "data" top: "double" }
+layer { name: "seen" type: "Flatten" bottom: "double" top: "seen" }
+layer { name: "more" type: "Eltwise" bottom: "double" bottom: "data" top: "more" }
+layer { name: "relu" type: "ReLU" bottom: "more" top: "more" }
+layer { name: "same" type: "Power" bottom: "more" top: "same" }
+layer { name: "end" type: "ReLU" bottom: "same" top: "same" }
+layer { name: "join" type: "Concat" bottom: "seen" bottom: "flat" top: "join" }
+"""
+    )
+    net, x = net_of(text), images()
+    expected = slowly(net, data=x)
+    first = quickly(net, data=x)
+    assert torch.equal(x, images())
+    assert_same(first, expected)
+    quickly(net, data=-x)
+    assert_same(first, expected)
+
+
+@pytest.mark.parametrize("keep", [(), "conv", "all"])
+@pytest.mark.parametrize("exact", ["small", "all"])
+def test_products_lend_memory_only_where_nobody_looks_afterwards(
+    exact: str, keep: str | tuple[str, ...], net_of: Callable[..., Net]
+) -> None:
+    text = (
+        INPUT.replace("dim: 40 dim: 40", "dim: 5 dim: 4")
+        + f"""
+layer {{ name: "conv" bottom: "data" top: "conv" {CONV.replace("pad: 1", "group: 2")} }}
+layer {{ name: "flat" type: "Flatten" bottom: "conv" top: "flat" }}
+layer {{ name: "parts" type: "Slice" bottom: "flat" top: "left" top: "right" slice_param {{ axis: 1 }} }}
+layer {{ name: "ip" bottom: "left" top: "ip" {PRODUCT} }}
+layer {{ name: "relu" type: "ReLU" bottom: "ip" top: "ip" }}
+layer {{ name: "shape" type: "Reshape" bottom: "ip" top: "shape" reshape_param {{ shape {{ dim: 0 dim: 2 dim: 3 }} }} }}
+layer {{ name: "inner" bottom: "ip" top: "inner" {PRODUCT} }}
+layer {{ name: "end" bottom: "inner" top: "end" {PRODUCT} }}
+"""
+    )
+    net = net_of(text, exact=exact)
+    net.keep = keep
+    given = [images(n, 8, 5, 4) * k for k, n in enumerate((3, 3, 1, 0, 3))]
+    with one_thread():
+        expected = [(slowly(net, data=x), dict(net.blobs)) for x in given]
+        found = [(quickly(net, data=x), net.blobs) for x in given]
+    for (outputs, kept), (wanted, all_wanted) in zip(found, expected, strict=True):
+        for name, blob in {**wanted, **all_wanted}.items():
+            assert torch.equal({**kept, **outputs}[name], blob), name
+
+
+def test_what_follows_on_a_count_of_items_is_run_by_its_values(net_of: Callable[..., Net]) -> None:
+    text = INPUT.replace("dim: 1 dim: 8", "dim: 4 dim: 8").replace("} }", "} shape { dim: 4 } }")
+    text = text.replace('top: "data"', 'top: "data" top: "which"')
+    text += f"""
+layer {{ name: "some" type: "Filter" bottom: "data" bottom: "which" top: "some" }}
+layer {{ name: "conv" bottom: "some" top: "conv" {CONV} }}
+{NORM}
+"""
+    net, x = trained(net_of(text)), images(4, 8, 40, 40)
+    for which in ([1, 0, 1, 1], [0, 1, 0, 0], [1, 1, 1, 1]):
+        inputs = {"data": x, "which": torch.tensor(which, dtype=torch.float32)}
+        assert_same(quickly(net, **inputs), slowly(net, **inputs))
+
+
+def test_not_a_number_never_wins_a_maximum(net_of: Callable[..., Net]) -> None:
+    pool = (
+        'layer { name: "pool" type: "Pooling" bottom: "data" top: "pool" pooling_param { kernel_size: 2 stride: 2 } }'
+    )
+    net, x = net_of(INPUT + pool), images()
+    x[0, 0, :3, :3] = torch.nan
+    assert torch.equal(quickly(net, data=x)["pool"], slowly(net, data=x)["pool"])
+
+
+def test_copies_other_precisions_and_threads(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK + SHARED))
+    expected = quickly(net, data=images())
+    other = copy.deepcopy(net)
+    with torch.no_grad():
+        other.params["conv"][0].zero_()
+    assert_same(quickly(net, data=images()), expected)
+    assert_same(quickly(other, data=images()), slowly(other, data=images()))
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda each: [quickly(each, data=images()) for _ in range(20)][-1], (net, other)))
+    assert_same(both[0], expected)
+    net.double()
+    assert_same(quickly(net, data=images().double()), slowly(net, data=images().double()))
+
+
+def test_inference_mode_and_no_grad_may_take_turns(net_of: Callable[..., Net]) -> None:
+    lrn = 'layer { name: "lrn" type: "LRN" bottom: "scale" top: "lrn" }'
+    net = trained(net_of(BLOCK + lrn))
+    expected = slowly(net, data=images())
+    for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
+        with mode():
+            assert_same(net(data=images()), expected)
+
+
+def test_layers_that_share_weights_each_lay_them_out_for_themselves(net_of: Callable[..., Net]) -> None:
+    text = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 8 dim: 300 } } }'
+    for name, bottom, transposed in (("in", "data", "false"), ("out", "in", "true"), ("again", "out", "false")):
+        text += f"""
+layer {{ name: "{name}" type: "InnerProduct" bottom: "{bottom}" top: "{name}" param {{ name: "w" }}
+  inner_product_param {{ num_output: 300 transpose: {transposed} bias_term: false
+    weight_filler {{ type: "xavier" }} }} }}
+"""
+    net, x = net_of(text, exact="none"), torch.randn(8, 300)
+    assert_same(quickly(net, data=x), slowly(net, data=x))
+    assert last_program(net).kinds == ["packed"] * 3
+
+
+def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> None:
+    class Halved(Convolution):
+        @override
+        def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return tuple(top / 2 for top in super().forward(*bottoms))
+
+    class Named(Convolution):
+        """The same forward pass."""
+
+    def made(cls: type[Layer]) -> Layer:
+        param = LayerParameter(name="it", type="Convolution", bottom=["x"], top=["y"])
+        param.convolution_param.num_output = 2
+        param.convolution_param.kernel_size.append(3)
+        return cls(param, [(1, 2, 4, 4)])
+
+    names = ("prepare", "absorbs", "absorb", "fresh", "to_onnx")
+    assert [offered(made(Halved), name) for name in names] == [None] * len(names)
+    assert None not in [offered(made(Named), name) for name in names]
+    assert offered(made(ReLU), "fresh")
