@@ -17,7 +17,7 @@ from netspec.terminal.commands import Commands, WrongUsage, run
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
 SMALL, WAYS_OF_SMALL = ("tiny", "lenet", "cifar10_quick", "pnet"), ("netspec", "pycaffe", "pytorch")
-TRAINING = ("netspec", "netspec-bf16", "netspec-compile", "pytorch", "pycaffe")
+TRAINING = ("netspec", "netspec-bf16", "pytorch", "pycaffe")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

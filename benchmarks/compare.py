@@ -93,7 +93,7 @@ def _worker(case: Case, way: str, task: dict[str, Any], suffix: str, yardsticks:
 
 
 def parts(way: str) -> tuple[str, dict[str, str]]:
-    """Return who runs ``netspec-openvino-bf16``, by which engine, in which precision; ``compile`` counts as one."""
+    """Return who runs ``netspec-openvino-bf16``, by which engine, and in which precision."""
     name, *rest = way.split("-")
     precision = rest.pop() if rest[-1:] == ["bf16"] else "fp32"
     return name, {"engine": rest[0] if rest else "torch", "precision": precision}

@@ -147,7 +147,6 @@ def netspec_training(task: Task) -> Run:
         task["caffemodel"],
         device=task["device"],
         precision=task.get("precision", "fp32"),
-        compiled=task.get("engine") == "compile",
     )
 
     def run() -> dict[str, Any]:

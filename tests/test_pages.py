@@ -29,8 +29,8 @@ GIVEN = "import numpy, torch; images, image = torch.rand(2, 3, 32, 32), numpy.ze
 MOST = {"--frames": 60, "--train": 24, "--val": 8, "--test": 4, "--batches": 1, "--start": 10}
 # Where the CPU has none, a training in bf16 takes five times as long as in fp32.
 BF16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()
-# A GPU, minutes to compile, other machines; tests/netspec has test_gpu, net/test_segments, solver/test_processes.
-NEEDS = {"--gpu", "--compile", "--nnodes"}
+# A GPU, other machines; tests/netspec has test_gpu and solver/test_processes.
+NEEDS = {"--gpu", "--nnodes"}
 FOUND: dict[tuple[str, ...], int] = {("netspec", "diff"): 1}  # says by its status that files differ
 
 PAGES = [page for page in DOCUMENTS if any(block.language in ("", "python") for block in blocks(page))]

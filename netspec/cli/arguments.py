@@ -161,7 +161,7 @@ def shape(text: str) -> tuple[str, tuple[int, ...]]:
 
 
 _CHOSEN = {name: name for name in ("level", "exact", "strict", "passes", "limit")}
-_CHOSEN |= {"allow_python_layers": "allow_python", "data": "open_data", "compile": "compiled"}
+_CHOSEN |= {"allow_python_layers": "allow_python", "data": "open_data"}
 
 
 def options(arguments: argparse.Namespace, **chosen: Any) -> BuildOptions:

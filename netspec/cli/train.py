@@ -54,12 +54,6 @@ def add_to(commands: Commands) -> None:
         help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, fp16 on GPUs; both round "
         "more (default: fp32)",
     )
-    p.add_argument(
-        "--compile",
-        action="store_true",
-        help="make functions of the nets' layers with torch.compile; the first pass takes a minute or more, and needs "
-        "a C++ compiler",
-    )
     add_strict(p)
 
 

@@ -22,7 +22,7 @@ class BuildOptions:
     ``exact`` sets which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
     ``accumulate_in_place`` makes layers add the gradients that they sum up to ``grad`` themselves, like Caffe
     (netspec/exact/accumulate.py); hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see
-    these gradients. With ``compiled``, torch.compile makes functions of those layers that it can follow.
+    these gradients.
     ``passes`` are those of netspec/graph/steps.py that a net of phase TEST may use when it runs without gradients.
     Weights must have every layer of the net if ``strict``. The net may need ``limit`` bytes of memory (None: what there
     is on its device). ``dialects`` are those of Caffe's forks that the net uses; what its text says is added.
@@ -42,7 +42,6 @@ class BuildOptions:
     exact: str = SMALL
     accumulate_in_place: bool = False
     passes: Collection[str] = PASSES
-    compiled: bool = False
     strict: bool = False
     limit: int | None = None
     dialects: Collection[str] = ()

@@ -30,7 +30,6 @@ class Activation(Layer):
 
     fresh = True
     any_layout = True
-    traceable = True
 
     onnx_op: ClassVar[str]  # of a layer without settings, and its expression in torch
     torch_call: ClassVar[str]

@@ -32,7 +32,6 @@ class LRN(Layer):
     Caffe: src/caffe/layers/lrn_layer.cpp
     """
 
-    traceable = True
     fresh = True
     any_layout = True
 

@@ -36,7 +36,6 @@ class BatchNorm(Layer):
     """
 
     default_param_lr = 0.0
-    traceable = True
     fresh = True
     any_layout = True
 

@@ -22,7 +22,6 @@ class _Affine(Layer):
     """What Scale and Bias have in common: an operand that is learned or a second bottom, laid over some axes."""
 
     bottoms = (1, 2)
-    traceable = True
 
     def learned_shape(self, param: Any, field: str) -> Shape:
         """Return the shape of a learned operand: ``num_axes`` axes of the bottom from ``axis`` on (-1: all)."""

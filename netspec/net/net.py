@@ -25,7 +25,7 @@ from netspec.layers.contract.base import Layer
 from netspec.layers.contract.reading import Fed, Restarts, TakesArrays
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
-from netspec.proto.schema import PHASE_NAMES, TEST, TRAIN
+from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.eager import Eager
 from netspec.run.prepared import Prepared
 from netspec.run.training import TrainingStep, obstacle
@@ -86,7 +86,7 @@ class Net(torch.nn.Module):
         """Make what runs the net: of ``runners`` the first that can. The last, ``eager``, always can."""
         options = self.options
         made = self.plan, list(self.layers), self.loss_weights, options.exact
-        self.eager = Eager(*made, options.compiled, learns=self.phase == TRAIN)
+        self.eager = Eager(*made)
         self.prepared = Prepared(*made, options.passes) if self.phase == TEST and options.passes else None
         self._training: TrainingStep | str | None = None  # made at the first pass that trains
         self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]
@@ -171,8 +171,6 @@ class Net(torch.nn.Module):
 
     def training_step(self) -> TrainingStep | str:
         """Return what trains the net by kernels prepared once, or in words why there is none."""
-        if self.eager.segments:
-            return "its layers are compiled"
         if why := obstacle(self.plan, list(self.layers), self.eager.chains):
             return why
         weighted = partial(weighted_sum, exact=self.options.exact)

@@ -11,15 +11,13 @@ from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.run.chains import chains, together
 from netspec.run.in_place import Memory, is_overwritten, run_overwritten
-from netspec.run.segments import Segment, rows
 from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
 
 class Eager:
     """Runs the layers of a plan; every net can be run so.
 
-    ``loss_weights[i][j]`` is the loss weight of layer i's top j. ``exact`` is as in netspec/exact. With ``compiled``,
-    torch.compile makes functions of the layers that it can (netspec/run/segments.py); with gradients where ``learns``.
+    ``loss_weights[i][j]`` is the loss weight of layer i's top j. ``exact`` is as in netspec/exact.
     """
 
     def __init__(
@@ -28,52 +26,40 @@ class Eager:
         layers: Sequence[Layer],
         loss_weights: Sequence[Sequence[float]],
         exact: str,
-        compiled: bool = False,
-        learns: bool = False,
     ) -> None:
         self._plan, self._layers, self._exact = plan, list(layers), exact
         self._losses = losses_of(loss_weights)
         self._last_uses = last_uses(plan)
         self.overwritten = [is_overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
-        apart = self._apart()
-        self.chains = chains(plan, self._layers, apart)
+        self.chains = chains(plan, self._layers, self._apart())
         self._lines: dict[frozenset[int], list[Step]] = {}  # by what is kept, of the last run
-        self.segments: dict[int, Segment] = {}  # by their first layer
-        for row in rows(self._layers, apart) if compiled else ():
-            self.segments[row[0]] = Segment(plan, self._layers, row, learns, self._line)
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
         """Run all layers on the values ``given`` by the caller; the values ``kept`` are there afterwards."""
         values: Values = dict(given)
         if kept not in self._lines:
-            self._lines = {kept: self._line(range(len(self._layers)), kept)}
+            self._lines = {kept: self._line(kept)}
         return walk(self._lines[kept], values, self._exact, self._remembering()), values
 
     def one_by_one(self) -> list[Step]:
         """Return a step for each layer but the inputs, all by themselves; no value ends."""
         return [step._replace(ends=()) for i in range(len(self._layers)) for step in self._alone(i)]
 
-    def _line(self, part: Sequence[int], kept: frozenset[int], inner: bool = False) -> list[Step]:
-        """Return the steps of consecutive layers for runs that keep some values; ``inner``: of those of a segment."""
+    def _line(self, kept: frozenset[int]) -> list[Step]:
+        """Return the steps of runs that keep some values."""
         steps: list[Step] = []
         end = -1
-        for i in part:
+        for i, node in enumerate(self._plan.nodes):
             if i <= end:
                 continue
-            segment = None if inner else self.segments.get(i)
-            following = [k for k in self._chains_to(i, kept) if k in part]
-            if segment and not kept & segment.within:
-                end = segment.last
-                step = Step(end, segment.run, segment.bottoms, segment.tops)
-            elif following:
-                end = following[-1]
-                run = together([self._layers[k] for k in (i, *following)])
-                step = Step(end, run, self._plan.nodes[i].bottoms, self._plan.nodes[end].tops)
-            else:
-                end = i
+            following = self._chains_to(i, kept)
+            if not following:
                 steps += self._alone(i, kept)
                 continue
-            steps.append(step._replace(ends=self._ends(i, end, kept)))
+            end = following[-1]
+            run = together([self._layers[k] for k in (i, *following)])
+            tops, ends = self._plan.nodes[end].tops, self._ends(i, end, kept)
+            steps.append(Step(end, run, node.bottoms, tops, ends=ends))
         return steps
 
     def _alone(self, i: int, kept: frozenset[int] = frozenset()) -> list[Step]:

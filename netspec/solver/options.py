@@ -27,8 +27,8 @@ class TrainingOptions:
     ``build.seed`` is used if there is no random_seed; without it one is drawn. Level and stages are the training net's.
     ``nan`` says what a loss of NaN or infinity does: "stop" raises SpecError, "warn" warns once. In another
     ``precision`` than "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order, whatever
-    ``build.exact`` says, nor does a compiled one. Of several ``processes`` each has one training net and calls the same
-    methods; the root tests and writes the snapshots.
+    ``build.exact`` says. Of several ``processes`` each has one training net and calls the same methods; the root tests
+    and writes the snapshots.
     ``action`` is called between iterations, also those of a test: "stop" ends the training, "snapshot" takes one.
     ``clock`` gives the seconds for "iter/s".
     """
@@ -48,7 +48,7 @@ class TrainingOptions:
     @property
     def exact_sums(self) -> str:
         """Which sums the training net computes as Caffe does, to the last bit."""
-        return self.build.exact if self.precision == FP32 and not self.build.compiled else NONE
+        return self.build.exact if self.precision == FP32 else NONE
 
 
 def choose_device(param: Any, node: Place) -> torch.device:

@@ -132,7 +132,6 @@ class Resumable(Training):
         manner: dict[str, Any] = {
             "precision": self.options.precision,
             "exact": self.exact,
-            "compiled": self.options.build.compiled,
             "device": self.device.type,
             "torch": torch.__version__,
         }

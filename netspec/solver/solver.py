@@ -46,7 +46,6 @@ def load_solver(
     strict: bool = False,
     precision: str = FP32,
     nan: str = "stop",
-    compiled: bool = False,
     limit: int | None = None,
 ) -> Solver:
     """Build the solver of a prototxt and its nets, ready to run.
@@ -68,7 +67,6 @@ def load_solver(
         allow_python=allow_python,
         exact=exact,
         strict=strict,
-        compiled=compiled,
         limit=limit,
     )
     given = [] if device is None else [device] if isinstance(device, (str, torch.device)) else device

@@ -25,7 +25,6 @@ from netspec.proto.binary import check_readable, split_paths
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import write_text
-from netspec.run.segments import missing_tool
 from netspec.solver import nets, update
 from netspec.solver.blocks import Blocks
 from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
@@ -89,8 +88,6 @@ class Training:
             check_prefix(param, self.node)
         check_readable(self._weights())
         self.device = options.devices[0] if options.devices else choose_device(param, self.node)
-        if options.build.compiled and (lack := missing_tool(self.device)):
-            raise SpecError(f"--compile: {lack}", self.node.where)
         self.seed = self._chosen_seed()
         rule = update.find_rule(param.type)
         assert rule is not None, "check_settings refuses unknown types"

@@ -81,22 +81,12 @@ import loopclosure, lmdb_build.databases, loopclosure.report.page
 from loopclosure import LoopDetector
 compared("import")
 """
-COMPILED = """
-import numpy as np
-from netspec.load import load_net
-net = load_net("deploy.prototxt", phase="TEST", seed=0, passes=("compile",))
-compared("build")
-with torch.no_grad():
-    for _ in range(2):
-        net(data=np.zeros(net.shapes["data"], np.float32))
-compared("run")
-"""
 SMALL = """layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1 dim: 8 dim: 8 } } }
 layer { name: "c" type: "Convolution" bottom: "data" top: "c" convolution_param { num_output: 2 kernel_size: 3 } }
 layer { name: "s" type: "Sigmoid" bottom: "c" top: "s" }"""
 
 
-@pytest.mark.parametrize("work", [NET + TRAINING, LOOPS, COMPILED], ids=["net", "loops", "compiled"])
+@pytest.mark.parametrize("work", [NET + TRAINING, LOOPS], ids=["net", "loops"])
 def test_a_library_changes_no_setting_of_its_process(work: str, tmp_path: Path) -> None:
     for folder in ("sgd_step", "pairs"):
         found = next(GOLDEN.glob(f"**/{folder}"))

@@ -51,7 +51,6 @@ class Prepares(Protocol):
 
     fresh: bool  # its one top is memory of its own, not a bottom's
     any_layout: bool  # its kernel takes bottoms whose channels lie side by side (channels_last)
-    traceable: bool  # torch.compile can follow its forward pass: see netspec/run/segments.py
 
     def prepare(self, how: Preparation) -> Kernel | None:
         """Return what computes ``forward`` and then ``how.finish``, for bottoms of the present shapes.

@@ -30,8 +30,6 @@ class Eltwise(Layer):
     Caffe: src/caffe/layers/eltwise_layer.cpp
     """
 
-    traceable = True
-
     PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
     bottoms = (2, None)
     fresh = True
@@ -244,7 +242,6 @@ class Softmax(Layer):
 
     gradient_reads = frozenset({"top"})
     fresh = True
-    traceable = True
     any_layout = True
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:

@@ -34,7 +34,6 @@ class Concat(Layer):
     """
 
     bottoms = (1, None)
-    traceable = True
     any_layout = True
 
     def setup(self) -> None:
@@ -82,7 +81,6 @@ class Slice(Layer):
     """
 
     tops = (1, None)
-    traceable = True
     any_layout = True
 
     def setup(self) -> None:

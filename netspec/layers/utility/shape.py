@@ -19,7 +19,6 @@ class _OtherShape(Layer):
     """A layer whose top has its bottom's numbers in another shape."""
 
     shares = frozenset({"data", "diff"})
-    traceable = True
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])
@@ -107,7 +106,6 @@ class Split(Layer):
     """
 
     tops = (1, None)
-    traceable = True
     shares = frozenset({"data"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:

@@ -47,7 +47,6 @@ class Convolution(SlidingFilter):
     bottoms = (1, None)
     tops = (1, None)
     same_tops = True
-    traceable = True
     fresh = True
     any_layout = True
 

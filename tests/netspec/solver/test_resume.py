@@ -19,6 +19,7 @@ from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError
 from netspec.net.stamp import sealed
 from netspec.solver.extra import newest_pair, path_beside, read_extra
+from netspec.solver.settings import changes
 from netspec.solver.snapshot import State, read_state, write_state
 from netspec.solver.solver import Solver, load_solver
 from netspec.solver.update import RULES
@@ -227,6 +228,11 @@ def test_what_changes_the_numbers_is_said(
     (said,) = [line for line in warnings() if line.startswith(state)]
     assert said.startswith(f"{state}.extra: the training goes on with other numbers: ")
     assert told in said
+
+
+def test_a_state_of_when_trainings_could_be_compiled() -> None:
+    assert changes({"solver": {"compiled": False}}, {"solver": {}}) == ""
+    assert changes({"solver": {"compiled": True}}, {"solver": {}}) == "compiled is the default, was True"
 
 
 def test_another_number_of_records_is_said(warnings: Callable[[], list[str]]) -> None:
