@@ -62,9 +62,13 @@ class Hdf5Source:
 
     def batch(self, iteration: int) -> Arrays:
         """Return the tops of an iteration, float32."""
-        rows = self._rows(iteration)
+        return self.together(iteration, 1)
+
+    def together(self, iteration: int, count: int) -> Arrays:
+        """Return what :func:`netspec.data.sources.batches` splits."""
+        rows = self._rows(iteration, count)
         files = np.searchsorted(self._starts, rows, side="right") - 1
-        tops = tuple(np.empty(shape, np.float32) for shape in self.shapes)
+        tops = tuple(np.empty((len(rows), *shape), np.float32) for shape in self._row_shapes)
         for file in np.unique(files):
             here = files == file
             with self._lock:
@@ -79,13 +83,13 @@ class Hdf5Source:
         files = np.searchsorted(self._starts, rows, side="right") - 1
         return [f"{self._files[f]}:{row - self._starts[f]}" for f, row in zip(files, rows, strict=True)]
 
-    def _rows(self, iteration: int) -> np.ndarray:
-        """Return the rows of an iteration, counted through all files."""
-        count = self.cursor.count
-        places = np.array(self.cursor.positions(iteration))
+    def _rows(self, iteration: int, count: int = 1) -> np.ndarray:
+        """Return the rows of iterations, counted through all files."""
+        rows = self.cursor.count
+        places = np.array(self.cursor.positions(iteration, count))
         if not self._shuffle:
-            return places % count
-        return np.array([self._order(epoch)[i] for epoch, i in zip(places // count, places % count, strict=True)])
+            return places % rows
+        return np.array([self._order(epoch)[i] for epoch, i in zip(places // rows, places % rows, strict=True)])
 
     def _order_of(self, epoch: int) -> np.ndarray:
         seed, stream = self._draws.seed, f"{self._draws.stream}/shuffle/{epoch}"

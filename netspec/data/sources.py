@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -53,9 +53,9 @@ class Cursor:
         seed, stream = draws.seed, draws.stream
         self._order = lru_cache(maxsize=2)(lambda epoch: permutation(seed, f"{stream}/shuffle/{epoch}", count))
 
-    def records(self, iteration: int) -> list[int]:
-        """Return the numbers of the records of an iteration."""
-        return [self._record(position) for position in self.positions(iteration)]
+    def records(self, iteration: int, count: int = 1) -> list[int]:
+        """Return the numbers of the records of an iteration, or of ``count`` iterations from this one on."""
+        return [self._record(position) for position in self.positions(iteration, count)]
 
     def first(self) -> int:
         """Return the number of the first record of all."""
@@ -65,9 +65,9 @@ class Cursor:
         epoch, i = divmod(position, self.count)
         return int(self._order(epoch)[i]) if self._shuffle else i
 
-    def positions(self, iteration: int) -> range:
-        """Return the positions of an iteration's records in the endless sequence that all ranks read."""
-        start, end = self._span(iteration)
+    def positions(self, iteration: int, count: int = 1) -> range:
+        """Return the positions of the records in the endless sequence that all ranks read; see :meth:`records`."""
+        start, end = self._span(iteration, count)
         return range(start + self._rank, end, self._ranks)
 
     def wraps(self, iteration: int) -> int:
@@ -75,11 +75,11 @@ class Cursor:
         start, end = self._span(iteration)
         return end // self.count - start // self.count
 
-    def _span(self, iteration: int) -> tuple[int, int]:
-        """Return the first and the end position of the records that all ranks read in an iteration."""
+    def _span(self, iteration: int, count: int = 1) -> tuple[int, int]:
+        """Return the first and the end position of the records that all ranks read in iterations."""
         width = self.batch_size * self._ranks
         start = self.skip + iteration * width
-        return start, start + width
+        return start, start + count * width
 
 
 def draw_skip(rand_skip: int, seed: int, stream: str) -> int:
@@ -103,6 +103,24 @@ class Source(Protocol):
 
     def keys(self, iteration: int) -> list[str]:
         """Return the names of the records of an iteration."""
+        ...
+
+
+def batches(source: Source, iteration: int, count: int) -> list[Arrays]:
+    """Return the tops of ``count`` iterations: made all at once where the source has ``together``, and can."""
+    arrays = source.together(iteration, count) if count > 1 and isinstance(source, Together) else None
+    if arrays is None:
+        return [source.batch(i) for i in range(iteration, iteration + count)]
+    size = source.cursor.batch_size
+    return [tuple(array[k : k + size].copy() for array in arrays) for k in range(0, count * size, size)]
+
+
+@runtime_checkable
+class Together(Protocol):
+    """A source that can make the batches of several iterations at once."""
+
+    def together(self, iteration: int, count: int) -> Arrays | None:
+        """Return the tops of ``count`` iterations one behind the other; None if this cannot be."""
         ...
 
 
@@ -163,14 +181,21 @@ class DatabaseSource(_ImageSource):
         self._small = self._stacked(reader.records((cursor.first(),))) is not None
 
     def batch(self, iteration: int) -> Arrays:
-        """Return images (N, C, H, W) and labels (N,): of small records all at once."""
+        """Return images (N, C, H, W) and labels (N,)."""
+        return self.together(iteration, 1) or super().batch(iteration)
+
+    def together(self, iteration: int, count: int) -> Arrays | None:
+        """Return what :func:`batches` splits, of small records; None if they must be read one by one."""
         try:
-            found = self._stacked(self._reader.records(self.cursor.records(iteration))) if self._small else None
+            found = self._stacked(self._reader.records(self.cursor.records(iteration, count))) if self._small else None
         except SpecError:
-            found = None  # one by one they say which record it is
-        if found is None or (len(found[0]) > 1 and self._transform.output_shape(found[0].shape[1:]) != self._shape):
-            return super().batch(iteration)
-        return self._transform(found[0], self.cursor.positions(iteration)), found[1]
+            return None  # one by one they say which record it is
+        alike = found and (
+            self.cursor.batch_size == 1 or self._transform.output_shape(found[0].shape[1:]) == self._shape
+        )
+        return (
+            (self._transform(found[0], self.cursor.positions(iteration, count)), found[1]) if found and alike else None
+        )
 
     def keys(self, iteration: int) -> list[str]:
         """Return the keys of the records of an iteration."""

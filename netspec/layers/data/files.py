@@ -20,7 +20,7 @@ from netspec import log
 from netspec.data.database import open_reader
 from netspec.data.images import read_image_list
 from netspec.data.prefetch import Feed
-from netspec.data.sources import Cursor, DatabaseSource, Draws, ImageListSource, Source, draw_skip
+from netspec.data.sources import Cursor, DatabaseSource, Draws, ImageListSource, Source, Together, batches, draw_skip
 from netspec.data.transformer import Transformer, contradictions
 from netspec.errors import SpecError, UnknownShape, Where
 from netspec.layers.contract.base import Layer, Shape
@@ -29,6 +29,7 @@ from netspec.proto.schema import PHASE_NAMES, value
 
 BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
 MOVED = ("scale", "mean_file", "crop_size", "mirror")  # to transform_param, so in a current layer they mean nothing
+MOST_AT_ONCE = 1 << 16  # numbers in the batches that a thread makes at once, and at most 32 batches
 Batch = tuple[tuple[torch.Tensor, ...], int]
 T = TypeVar("T")
 
@@ -102,7 +103,9 @@ class ReadingLayer(Layer):
         self.ahead = self._batches_ahead()
         ahead: int = self.param.data_param.prefetch
         workers = 1 if self.in_order else max(1, min(ahead, os.cpu_count() or 1))
-        self._feed = Feed(make, ahead, workers)
+        size = sum(map(math.prod, self._shapes))
+        at_once = MOST_AT_ONCE // max(size, MOST_AT_ONCE // 32) if isinstance(self.source, Together) else 1
+        self._feed = Feed(make, ahead, workers, max(1, at_once))
 
     def _batches_ahead(self) -> int:
         """Return the bytes of the batches read ahead, float32."""
@@ -176,6 +179,8 @@ class ReadingLayer(Layer):
         for _ in range(wraps):
             self.log_restart()
         self.top_shapes = [tuple(top.shape) for top in tops]  # at batch size 1 images may differ in size
+        if self.context.device.type == "cpu":  # where they are: ``to`` lets other threads take Python's lock
+            return tops
         return tuple(top.to(self.context.device, non_blocking=True) for top in tops)
 
     def log_restart(self) -> None:
@@ -214,13 +219,16 @@ class ReadingLayer(Layer):
         log.info(site, "output data size: " + ",".join(map(str, source.shapes[0])))
 
 
-def _make(source: Source, num_tops: int, pinned: bool, iteration: int) -> Batch:
-    """Make a batch, in whatever thread; page-locked where it goes to a GPU, so that the copy need not wait.
+def _make(source: Source, num_tops: int, pinned: bool, iteration: int, count: int) -> list[Batch]:
+    """Make batches, in whatever thread; page-locked where they go to a GPU, so that the copy need not wait.
 
     It has no reference to the layer, so that an unused layer is deleted at once, and its threads are stopped.
     """
-    tops = tuple(torch.from_numpy(array) for array in source.batch(iteration)[:num_tops])
-    return tuple(top.pin_memory() if pinned else top for top in tops), source.cursor.wraps(iteration)
+    made: list[Batch] = []
+    for i, arrays in enumerate(batches(source, iteration, count), iteration):
+        tops = tuple(torch.from_numpy(array) for array in arrays[:num_tops])
+        made.append((tuple(top.pin_memory() if pinned else top for top in tops), source.cursor.wraps(i)))
+    return made
 
 
 @register("Data", "data_param", "transform_param")

@@ -4,6 +4,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -11,14 +13,21 @@ from netspec.data.prefetch import Feed
 from paths import ROOT
 
 
+def each(make: Callable[[int], Any]) -> Callable[[int, int], list[Any]]:
+    return lambda first, count: [make(i) for i in range(first, first + count)]
+
+
+@each
 def slow_square(i: int) -> int:
     time.sleep(0.002 * (i % 3))
     return i * i
 
 
-@pytest.mark.parametrize(("ahead", "workers"), [(0, 1), (1, 1), (4, 3)])
-def test_batches_come_in_order_however_many_threads_make_them(ahead: int, workers: int) -> None:
-    feed = Feed(slow_square, ahead, workers)
+@pytest.mark.parametrize(
+    ("ahead", "workers", "at_once"), [(0, 1, 1), (1, 1, 1), (4, 3, 1), (4, 2, 3), (1, 2, 8), (0, 1, 8)]
+)
+def test_batches_come_in_order_however_many_threads_make_them(ahead: int, workers: int, at_once: int) -> None:
+    feed = Feed(slow_square, ahead, workers, at_once)
     assert [feed.next() for _ in range(20)] == [i * i for i in range(20)]
     assert feed.position == 20
     feed.close()
@@ -26,7 +35,7 @@ def test_batches_come_in_order_however_many_threads_make_them(ahead: int, worker
 
 @pytest.mark.parametrize("ahead", [0, 2])
 def test_a_feed_counts_the_time_for_which_it_was_waited_for(ahead: int) -> None:
-    feed = Feed(lambda i: time.sleep(0.05), ahead, workers=1)
+    feed = Feed(each(lambda i: time.sleep(0.05)), ahead, workers=1)
     feed.next()
     assert feed.waited >= 0.05
     feed.close()
@@ -34,7 +43,7 @@ def test_a_feed_counts_the_time_for_which_it_was_waited_for(ahead: int) -> None:
 
 def test_batches_are_made_ahead_but_not_far() -> None:
     made: list[int] = []
-    feed = Feed(made.append, ahead=3, workers=1)
+    feed = Feed(each(made.append), ahead=3, workers=1)
     feed.next()
     deadline = time.monotonic() + 5
     while len(made) < 4 and time.monotonic() < deadline:
@@ -67,8 +76,9 @@ def test_a_feed_that_nobody_needs_any_more_ends_its_threads() -> None:
         assert not thread.is_alive()
 
 
-def test_restart_goes_anywhere() -> None:
-    feed = Feed(slow_square, 3, 2)
+@pytest.mark.parametrize("at_once", [1, 4])
+def test_restart_goes_anywhere(at_once: int) -> None:
+    feed = Feed(slow_square, 3, 2, at_once)
     feed.next()
     feed.restart()
     assert [feed.next(), feed.next()] == [0, 1]
@@ -77,14 +87,15 @@ def test_restart_goes_anywhere() -> None:
     feed.close()
 
 
-@pytest.mark.parametrize("ahead", [0, 3])
-def test_a_fault_surfaces_in_its_own_turn(ahead: int) -> None:
+@pytest.mark.parametrize(("ahead", "at_once"), [(0, 1), (3, 1), (3, 4)])
+def test_a_fault_surfaces_in_its_own_turn(ahead: int, at_once: int) -> None:
+    @each
     def make(i: int) -> int:
         if i == 2:
             raise ValueError(f"record {i}")
         return i
 
-    feed = Feed(make, ahead, 2)
+    feed = Feed(make, ahead, 2, at_once)
     assert [feed.next(), feed.next()] == [0, 1]
     with pytest.raises(ValueError, match="record 2"):
         feed.next()
@@ -93,7 +104,7 @@ def test_a_fault_surfaces_in_its_own_turn(ahead: int) -> None:
 
 
 def test_the_interpreter_ends_though_nobody_closed_the_feed() -> None:
-    feed = "Feed(lambda i: time.sleep(0.05), 4, 4)"
+    feed = "Feed(lambda i, n: [time.sleep(0.05)], 4, 4)"
     code = f"import time; from netspec.data.prefetch import Feed; {feed}.next(); print('end')"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30, check=False

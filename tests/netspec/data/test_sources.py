@@ -8,7 +8,7 @@ import pytest
 
 from netspec.data.database import Writer, open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
-from netspec.data.sources import Cursor, DatabaseSource, Draws, draw_skip
+from netspec.data.sources import Cursor, DatabaseSource, Draws, batches, draw_skip
 from netspec.data.stacked import Stacker
 from netspec.data.transformer import Transformer
 from netspec.errors import SpecError, Where
@@ -158,6 +158,18 @@ def test_small_records_are_read_at_once_as_one_by_one(
     data, labels = read.batch(0)
     assert (data == transformer(arrays, range(len(arrays)))).all()
     assert labels.tolist() == [np.float32(datum.label) for datum in (*one_by_one, one_by_one[0])]
+
+
+@pytest.mark.parametrize("ranks", [1, 3])
+@pytest.mark.parametrize("shapes", [[(2, 3, 4)] * 7, [(2, 3, 4), (3, 6, 5), (3, 6, 5)]])
+def test_several_iterations_at_once_are_those_one_by_one(
+    tmp_path: Path, ranks: int, shapes: list[tuple[int, int, int]]
+) -> None:
+    alike = len(set(shapes)) == 1
+    found = source(tmp_path / "db", shapes, 4 if alike else 1, crop_size=2, mirror=True)
+    found.cursor = Cursor(len(shapes), 4 if alike else 1, 1, True, Draws(1, "x", ranks - 1, ranks))
+    for one, at_once in zip([found.batch(i) for i in range(3, 8)], batches(found, 3, 5), strict=True):
+        assert all((a == b).all() for a, b in zip(one, at_once, strict=True))
 
 
 def test_records_of_another_form_than_those_before_are_read_too() -> None:
