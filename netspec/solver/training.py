@@ -20,7 +20,6 @@ from netspec.layers.contract.reading import Scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
-from netspec.process import waiting
 from netspec.proto.binary import check_readable, split_paths
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
@@ -187,8 +186,6 @@ class Training:
         for line in fields_without_effect(self.param, self.node, read):
             log.warning("solver.cpp:45", line)
         if said := dependence(self.net, torch.get_num_threads()):
-            log.info("solver.cpp:57", said)
-        if self.device.type == "cpu" and (said := waiting.too_late(torch.get_num_threads())):
             log.info("solver.cpp:57", said)
         if self.options.precision == FP16 and self.device.type == "cpu":
             log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs that have it")

@@ -22,7 +22,6 @@ from netspec.exact.blas import kernels
 from netspec.files.arrays import read_npz
 from netspec.files.limits import amount, memory
 from netspec.inspect.check.check import check_file
-from netspec.process import waiting
 from netspec.proto.binary import is_net_binary
 from netspec.terminal.version import UNKNOWN, version
 
@@ -64,7 +63,6 @@ def _machine() -> Iterator[tuple[str, str]]:
     yield "memory", amount(memory())
     yield "BLAS kernels", ", ".join(sorted(kernels())) or "another BLAS"
     yield "torch", f"CUDA {torch.version.cuda or 'none'}, {torch.get_num_threads()} threads"
-    yield "idle OpenMP threads", printable(waiting.how())
     for k in range(torch.cuda.device_count()):
         yield f"GPU {k}", torch.cuda.get_device_name(k)
     for name in sorted(os.environ):
