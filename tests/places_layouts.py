@@ -1,5 +1,6 @@
 """Small synthetic sequences in the layouts that people have: one path of a camera, written in each of them."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -90,10 +91,7 @@ def write_benchmark(folder: Path, queries: int = 12, references: int = 14) -> Pa
     """A folder as VPR-Bench ships it: query i shows reference i + 1, and its neighbors."""
     write_pictures(folder / "query", [f"{i:07d}.jpg" for i in range(queries)])
     write_pictures(folder / "ref", [f"{i:07d}.jpg" for i in range(references)])
-    rows = np.empty((queries, 2), dtype=object)
-    for i in range(queries):
-        rows[i] = [i, [i, i + 1, i + 2]]
-    np.save(folder / "ground_truth_new.npy", rows)
+    (folder / "ground_truth.json").write_text(json.dumps([[i, [i, i + 1, i + 2]] for i in range(queries)]))
     return folder
 
 

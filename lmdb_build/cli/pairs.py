@@ -56,8 +56,8 @@ Sequences with poses, several of them (KIND is seen from the files, or named):
   and pose-form: {POSE_FORM_HELP}; topic, pose-topic: of a bag that has several
 Or one of these:
   images:     images in natural order, truth=MASK of loops (.mat .npy .txt or image), camera={"|".join(CAMERAS)}
-  traverses:  queries, references=FOLDER, truth=MASK or ground_truth*.npy
-  nordland:   query/, ref/, ground_truth*.npy: VPR benchmarks
+  traverses:  queries, references=FOLDER, truth=MASK or ground_truth*.json
+  nordland:   query/, ref/, ground_truth*.json: VPR benchmarks
   folders:    a folder, references=FOLDER: equal names are the same place
   table:      a CSV of positives, two columns of image names; group=COLUMN names the place; index=CSV of groups
   index:      a CSV of frames; group=COLUMN names the place, track=COLUMN the clip, time=COLUMN the position in it:

@@ -39,7 +39,7 @@ Truth from poses (KIND is seen from the files, or named):
 Truth from elsewhere:
   fabmap:     FAB-MAP's New College or City Centre; truth=, coordinates=, camera={"|".join(CAMERAS)} (default: both)
   traverses:  two drives, PATH and references=PATH; equal numbers are equal places, or truth= says it
-  nordland:   query/, ref/, ground_truth*.npy, as VPR benchmarks ship it
+  nordland:   query/, ref/, ground_truth*.json, as VPR benchmarks ship it
   pairs:      places photographed twice (pairs.csv)
 
 KEYs: start, stop (frame N or share P%), stride, limit: which frames; references=PATH: another sequence to look in;

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import read_pixels
 from loopclosure.places.mat_file import read_mat
 from netspec.errors import SpecError
-from netspec.files.arrays import read_lists, read_npy
+from netspec.files.arrays import read_npy
 from netspec.files.opencv import cv2
 
 # The FAB-MAP sets call it truth; several papers' derived files GT.
@@ -45,12 +47,12 @@ def read_truth_matrix(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 def read_matches(path: str | Path, queries: int, references: int) -> tuple[np.ndarray, np.ndarray]:
     """Read which references (R) show each query (Q): (hard, soft), both (Q, R) bool.
 
-    A mask, as :func:`read_truth_matrix` reads it, or an .npy file as VPR benchmarks ship it: rows of a query's number
-    and the numbers of its references (VPR-Bench, ``ground_truth_new.npy``), or for each query such a list. Numbers
-    count from 0. Raises InputError for other files, and for numbers of images that are not there.
+    A mask, as :func:`read_truth_matrix` reads it, or lists in a .json file: rows of a query's number and the numbers of
+    its references, as VPR-Bench has them in a pickle, or for each query such a list. Numbers count from 0. Raises
+    InputError for other files, and for numbers of images that are not there.
     """
     path = Path(path)
-    lists = read_lists(path) if path.suffix.lower() == ".npy" else None
+    lists = _read_lists(path) if path.suffix.lower() == ".json" else None
     if lists is None:
         hard, soft = read_truth_matrix(path)
         if hard.shape != (queries, references):
@@ -76,6 +78,16 @@ def read_matches(path: str | Path, queries: int, references: int) -> tuple[np.nd
                 )
             hard[query, reference] = True
     return hard, hard
+
+
+def _read_lists(path: Path) -> list[Any]:
+    try:
+        lists = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError("cannot be read; expected lists of the numbers of images, in JSON", path) from error
+    if not (isinstance(lists, list) and all(isinstance(row, list) for row in lists)):
+        raise InputError("expected a list of lists of the numbers of images", path)
+    return lists
 
 
 def read_coordinates(path: str | Path) -> np.ndarray:

@@ -121,7 +121,8 @@ def layout_of(source: Path, otherwise: str = "images") -> str:
 def benchmark_parts(folder: Path) -> tuple[Path, Path, Path]:
     """Return the queries, the references and the truth of a folder as VPR benchmarks ship it.
 
-    VPR-Bench (Zaffar et al., IJCV 2021): ``query/``, ``ref/``, ``ground_truth_new.npy`` or another ground_truth*.npy.
+    VPR-Bench (Zaffar et al., IJCV 2021): ``query/``, ``ref/``, and ground_truth*.json or .npy; of several the one
+    that ends in ``_new``. Lists in a .npy are refused with how to convert them.
     Raises InputError if one of them is missing.
     """
     parts = []
@@ -130,12 +131,13 @@ def benchmark_parts(folder: Path) -> tuple[Path, Path, Path]:
         if not found:
             raise InputError(f"has no folder {' or '.join(names[:3])} with the {what}", folder)
         parts.append(found[0])
-    truths = sorted(folder.glob("ground_truth*.npy"))
+    truths = sorted(folder.glob("ground_truth*.json")) or sorted(folder.glob("ground_truth*.npy"))
     newest = [path for path in truths if path.stem.endswith("_new")] or truths
     if len(newest) != 1:
         names = ", ".join(path.name for path in truths) or "none"
         raise InputError(
-            f"expected one ground_truth*.npy, found {names}; name the parts with --traverses, and the truth", folder
+            f"expected one ground_truth*.json or .npy, found {names}; traverses: names the parts",
+            folder,
         )
     return parts[0], parts[1], newest[0]
 

@@ -1,7 +1,7 @@
 """Arrays of .npz and .npy files, read with care.
 
 numpy makes room for what a header announces before it reads, and a small packed file may unpack to any size: both are
-checked here against what the file holds. Of Python objects only lists of numbers are unpickled, by :func:`read_lists`.
+checked here against what the file holds. Python objects are refused: to unpickle them could run anything.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import pickle
-import re
 import struct
 import sys
 import tokenize
@@ -31,7 +29,7 @@ T = TypeVar("T")
 _FAULTS = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, MemoryError, SyntaxError),
     *(EOFError, NotImplementedError, RuntimeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
-    *(struct.error, pickle.UnpicklingError, SystemError),
+    *(struct.error, SystemError),
 )
 
 
@@ -73,91 +71,6 @@ def map_npy(path: str | Path, expected: str) -> np.ndarray:
         return np.asarray(np.memmap(stream, dtype, "r", stream.tell(), shape, order))
 
 
-def read_lists(path: str | Path) -> list[Any] | None:
-    """Return the lists in an .npy file whose elements are lists or arrays of integers; None for a plain array.
-
-    Such a file is a pickle, which could run anything: here it may hold integers, lists, tuples and arrays of them, and
-    nothing else. Raises InputError for other files.
-    """
-    with _opened(Path(path), "an array of numbers, or of lists of integers") as stream:
-        shape, _, dtype = _described(stream)
-        if not dtype.hasobject:
-            return None
-        found = _Lists(stream).load()
-        if not isinstance(found, _Array) or found.values.shape != shape:
-            raise ValueError("another array than its header says")
-        return _plain(found)
-
-
-class _Lists(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIssue]
-    """Unpickles numpy arrays and lists; whatever else a pickle names is refused.
-
-    What numpy itself would rebuild from a damaged pickle may end the process, and so may the memory that the unpickler
-    in C takes for a large number: this one is in Python, and :class:`_Array` stands for numpy's.
-    """
-
-    def find_class(self, module: str, name: str) -> Any:
-        if module in ("numpy", "numpy.core.multiarray", "numpy._core.multiarray") and name in _KNOWN:
-            return _KNOWN[name]
-        raise pickle.UnpicklingError(f"{module}.{name} is no list of numbers")
-
-
-class _Kind:
-    """A dtype in a pickle, by its code: ``O8``, or one of numbers such as ``i8``."""
-
-    def __init__(self, code: str, *_: Any) -> None:
-        if not re.fullmatch(r"O8?|[biuf][1248]", code):
-            raise ValueError(f"an array of {code!r:.40}")
-        self.code, self.order = code, "="
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self.order = {">": ">"}.get(state[1], "<")
-
-    def numbers(self, data: bytes) -> np.ndarray:
-        """Return what the bytes hold."""
-        if self.code[0] == "O":
-            raise ValueError("a number of Python objects")
-        return np.frombuffer(data, np.dtype(self.order + self.code))
-
-
-class _Array:
-    """An array in a pickle: ``values`` are known when its state is read."""
-
-    def __init__(self, *_: Any) -> None:
-        self.values = np.empty(0, object)
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        _, shape, kind, by_columns, data = state
-        if kind.code[0] == "O":
-            values = np.empty(len(data), object)
-            for i, each in enumerate(data):
-                values[i] = each
-        else:
-            values = kind.numbers(data)
-        self.values = values.reshape(shape, order="F" if by_columns else "C")
-
-
-_KNOWN: dict[str, Any] = {
-    "ndarray": _Array,
-    "dtype": _Kind,
-    "_reconstruct": _Array,
-    "scalar": lambda kind, data: kind.numbers(data)[0],
-}
-
-
-def _plain(value: Any) -> Any:
-    """Return integers and lists of them for what numpy has. Raises ValueError for other values."""
-    if isinstance(value, _Array):
-        value = value.values.tolist()
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (float, np.floating)) and float(value).is_integer():
-        return int(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    raise ValueError(f"a {type(value).__name__}")
-
-
 def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
     """Return the arrays of an open .npz of ``stored`` bytes; raises what zipfile and numpy raise."""
     with zipfile.ZipFile(packed) as archive:
@@ -184,7 +97,7 @@ def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dty
     """Return shape, order by columns, and dtype of an array in the format .npy, of ``size`` bytes in a stream."""
     shape, by_columns, dtype = _described(stream)
     if dtype.hasobject:
-        raise ValueError("an array of Python objects")
+        raise ValueError("an array of Python objects, a pickle, which could run code; lists are read from .json")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > size:
         raise ValueError(f"an array of shape {shape}, {dtype}, in {size} bytes")
     return shape, by_columns, dtype

@@ -342,7 +342,7 @@ FORMATS = {
     "ROS 1 bag": Format(".bag", recordings.bag, recordings.read_bag),
     "ROS 2 metadata.yaml": Format("", recordings.bag, recordings.read_bag, "metadata.yaml"),
     "ROS 2 bag": Format("", recordings.bag, recordings.read_bag, recordings.BAG_FILE),
-    "truth of lists": Format(".npy", recordings.lists, recordings.read_matches_of_four),
+    "truth of lists": Format(".json", recordings.lists, recordings.read_matches_of_four),
     "png": Format(".png", picture, either_picture),
     "jpeg": Format(".jpg", picture, either_picture),
 }

@@ -202,7 +202,7 @@ def test_pairs_of_a_benchmark_are_a_query_and_a_reference(tmp_path: Path) -> Non
     folder = write_benchmark(tmp_path / "b")
     for line in (
         f"nordland:{folder}",
-        f"traverses:{folder}/query,references={folder}/ref,truth={folder}/ground_truth_new.npy --root {folder}",
+        f"traverses:{folder}/query,references={folder}/ref,truth={folder}/ground_truth.json --root {folder}",
     ):
         chosen = lists(tmp_path / "out", line)
         assert {label for _, _, label in chosen} == {0, 1}
