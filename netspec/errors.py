@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True)  # of a large net there are millions
@@ -103,6 +104,20 @@ class ForkFault(SpecError):
 
 class UnknownShape(SpecError):
     """A blob whose shape is known only from data that was not opened."""
+
+
+def check_choice(what: str, found: object, known: Sequence[str]) -> None:
+    """Raise SpecError for what is not one of the known words."""
+    if found not in known:
+        hint = did_you_mean(found, list(known)) if isinstance(found, str) else ""
+        raise SpecError(f"found {what} {found!r}, expected {', '.join(map(repr, known))}{hint}")
+
+
+def several(given: Any) -> tuple[Any, ...]:
+    """Return several things where a caller may give one or none: a text or a path is one, not its letters."""
+    if given is None:
+        return ()
+    return tuple(given) if isinstance(given, Iterable) and not isinstance(given, (str, bytes)) else (given,)
 
 
 def did_you_mean(word: str, known: list[str] | tuple[str, ...]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from netspec.errors import several
 from netspec.exact import SMALL
 from netspec.export.engines.choice import TORCH, Choice
 from netspec.export.engines.net import with_engine
@@ -22,13 +23,13 @@ def load_net(
     phase: str | int = "TEST",
     weights: str | Path | Iterable[str | Path] | None = None,
     level: int = 0,
-    stages: Iterable[str] = (),
+    stages: str | Iterable[str] = (),
     device: str | torch.device = "cpu",
     seed: int | None = None,
     allow_python: bool = False,
     exact: str = SMALL,
     strict: bool = False,
-    passes: Collection[str] = PASSES,
+    passes: str | Collection[str] = PASSES,
     engine: str = TORCH,
     precision: str = "fp32",
     cache: str | Path | bool | None = None,
@@ -54,12 +55,12 @@ def load_net(
         str(device),
         seed,
         level=level,
-        stages=tuple(stages),
+        stages=several(stages),
         allow_python=allow_python,
         exact=exact,
-        passes=passes,
+        passes=several(passes),
         strict=strict,
         limit=limit,
     )
-    files = [] if weights is None else [weights] if isinstance(weights, (str, Path)) else list(weights)
+    files = several(weights)
     return with_engine(build.load_net(path, phase_of(phase), options, files), choice, path, files)

@@ -36,9 +36,3 @@ CHOICES = (NONE, SMALL, ALL)
 # What "small" computes in Caffe's order: beyond, torch's own kernels are faster.
 SMALL_PRODUCT = 500_000  # multiply-adds an image, of a convolution or an inner product
 SMALL_ITEM = 2_000  # values an image, of layers that pass over memory several times: BatchNorm, Scale, SoftmaxWithLoss
-
-
-def check_choice(exact: str) -> None:
-    """Raise ValueError for what is not one of the choices."""
-    if exact not in CHOICES:
-        raise ValueError(f"found exact {exact!r}, expected {', '.join(map(repr, CHOICES))}")

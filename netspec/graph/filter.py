@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from netspec import log
-from netspec.errors import SpecError
+from netspec.errors import SpecError, several
 from netspec.proto.schema import LayerParameter, NetParameter, NetState, NetStateRule, PhaseValue, SolverParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
@@ -25,14 +25,14 @@ def with_state(
     net: NetParameter, phase: PhaseValue, level: int | None = None, stages: Iterable[str] = ()
 ) -> NetParameter:
     """Return a copy of the net whose state has this phase, this level (unless None) and these stages added."""
-    return in_state(net, net.state, NetState(phase=phase, level=level, stage=stages))
+    return in_state(net, net.state, NetState(phase=phase, level=level, stage=several(stages)))
 
 
 def with_train_state(solver: SolverParameter, level: int | None, stages: Iterable[str]) -> SolverParameter:
     """Return a copy of the solver; its training net gets this level (unless None) and these stages in addition."""
     stated = SolverParameter()
     stated.CopyFrom(solver)
-    stated.train_state.MergeFrom(NetState(level=level, stage=stages))
+    stated.train_state.MergeFrom(NetState(level=level, stage=several(stages)))
     return stated
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from netspec.exact import SMALL, check_choice
+from netspec.errors import check_choice, several
+from netspec.exact import CHOICES, SMALL
 from netspec.graph.steps import PASSES
 
 
@@ -25,7 +26,8 @@ class BuildOptions:
     these gradients.
     ``passes`` are those of netspec/graph/steps.py that a net of phase TEST may use when it runs without gradients.
     Weights must have every layer of the net if ``strict``. The net may need ``limit`` bytes of memory (None: what there
-    is on its device). ``dialects`` are those of Caffe's forks that the net uses; what its text says is added.
+    is on its device). ``dialects`` are those of Caffe's forks that the net uses; what its text says is added. One text
+    where several are meant is one of them. Raises SpecError for an ``exact`` or a pass that there is not.
     """
 
     device: str = "cpu"
@@ -47,4 +49,8 @@ class BuildOptions:
     dialects: Collection[str] = ()
 
     def __post_init__(self) -> None:
-        check_choice(self.exact)
+        check_choice("exact", self.exact, CHOICES)
+        for name in ("stages", "passes", "dialects"):
+            object.__setattr__(self, name, several(getattr(self, name)))
+        for name in self.passes:
+            check_choice("pass", name, PASSES)

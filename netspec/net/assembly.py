@@ -21,7 +21,7 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Backward, Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
-from netspec.layers.contract.context import Context, Random
+from netspec.layers.contract.context import Context, Random, device_of
 from netspec.layers.contract.registry import dialects_of
 from netspec.net.ignored_fields import unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
@@ -58,7 +58,7 @@ class Assembly:
         self.need = Need(plan, last_uses(plan))
         self.backward: Backward | None = None
         self.random = Random(int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed)
-        self._device = torch.device(options.device)
+        self._device = device_of(options.device)
         self._values: dict[int, Shape] = {}
         self._memory = 0  # as Caffe counts it
         self._surveyed, self._too_much = False, None  # whether the whole net was looked at, and what was found

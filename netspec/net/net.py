@@ -22,6 +22,7 @@ from netspec.graph import check_blobs
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
+from netspec.layers.contract.context import device_of
 from netspec.layers.contract.reading import Fed, Restarts, TakesArrays
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
@@ -61,7 +62,7 @@ class Net(torch.nn.Module):
         self.param = plan.net
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
-        self.device = torch.device(options.device)
+        self.device = device_of(options.device)
         self.keep: str | Iterable[str] = ()
         self._kept_of: dict[str | tuple[str, ...], frozenset[int]] = {}  # by ``keep``, as it was last
         self._passing = _Passing()

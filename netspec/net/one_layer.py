@@ -15,7 +15,7 @@ from netspec.exact import SMALL
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, class_of, unknown_type
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.context import nowhere
+from netspec.layers.contract.context import device_of, nowhere
 from netspec.layers.contract.registry import dialects_of
 from netspec.net.net import Array
 from netspec.proto.reader import read_text
@@ -40,12 +40,12 @@ def layer(
 
     Bottoms and tops need no names; ``tops`` is the number of tops, by default the smallest. The layer is built when the
     shapes of its bottoms are known: at the first call, or at once if ``shapes`` are given. ``exact`` is as for a net
-    (netspec/exact). Raises SpecError, and ValueError for an unknown ``exact``.
+    (netspec/exact). Raises SpecError.
 
         >>> netspec.layer('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }')(images).shape
         torch.Size([2, 3, 16, 16])
     """
-    options = BuildOptions(str(device), seed, allow_python=allow_python, exact=exact)
+    options = BuildOptions(str(device_of(device)), seed, allow_python=allow_python, exact=exact)
     context = Context(phase_of(phase), options, Random(seed))
     return OneLayer(partial(make_layer, text, context=context, tops=tops), shapes)
 

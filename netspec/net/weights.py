@@ -18,7 +18,7 @@ import torch
 
 from netspec import log
 from netspec.data import blobs
-from netspec.errors import Report, SpecError, Where
+from netspec.errors import Report, SpecError, Where, several
 from netspec.files.hdf5 import layer_groups, new_hdf5, open_hdf5
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Layer, shape_string
@@ -46,7 +46,7 @@ def load_weights(
     SpecError, and with ``some`` it is one where nothing fits. Others are those of a file that cannot be read, or is not
     what its snapshot wrote, and of blobs of other number or shape than the net's; all go to ``net.plan.source.report``.
     """
-    paths = [Path(path)] if isinstance(path, (str, Path)) else [Path(each) for each in path]
+    paths = [Path(each) for each in several(path)]
     loaded: set[int] = set()
     whole = True
     for each in paths:

@@ -112,11 +112,11 @@ PHASE_NAMES = ("TRAIN", "TEST")
 
 def phase_of(phase: str | int) -> PhaseValue:
     """Return a phase by its name, in small letters too, or by its number. Raises SpecError for an unknown name."""
-    if not isinstance(phase, str):
-        return PhaseValue(phase)
-    if phase.upper() not in PHASES:
-        raise SpecError(f"found phase {phase!r}, expected TRAIN or TEST")
-    return PHASES[phase.upper()]
+    if isinstance(phase, str) and phase.upper() in PHASES:
+        return PHASES[phase.upper()]
+    if phase in PHASES.values():
+        return PhaseValue(int(phase))
+    raise SpecError(f"found phase {phase!r}, expected TRAIN or TEST")
 
 
 @dataclass(frozen=True)

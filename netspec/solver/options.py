@@ -10,13 +10,15 @@ from typing import Any
 import torch
 
 from netspec import log
-from netspec.errors import SpecError
+from netspec.errors import SpecError, check_choice
 from netspec.exact import NONE
 from netspec.graph.options import BuildOptions
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
-from netspec.solver.precision import FP32, check_precision
+from netspec.solver.precision import FP32, PRECISIONS
 from netspec.solver.processes import Processes
+
+NAN = ("stop", "warn")
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class TrainingOptions:
     clock: Callable[[], float] = time.perf_counter
 
     def __post_init__(self) -> None:
-        check_precision(self.precision)
+        check_choice("precision", self.precision, PRECISIONS)
+        check_choice("nan", self.nan, NAN)
         assert not (self.devices[1:] and self.processes.count > 1), "each of several processes has one device"
 
     @property

@@ -22,12 +22,6 @@ _ROUNDED = {BF16: torch.bfloat16, FP16: torch.float16}
 FIRST_SCALE, LARGEST_SCALE, PATIENCE = 2.0**16, 2.0**24, 2000
 
 
-def check_precision(precision: str) -> None:
-    """Raise ValueError for what is not one of the choices."""
-    if precision not in PRECISIONS:
-        raise ValueError(f"found precision {precision!r}, expected {', '.join(map(repr, PRECISIONS))}")
-
-
 @contextmanager
 def computing(precision: str, device: torch.device) -> Iterator[None]:
     """Within the block passes on the device compute in a precision."""

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError, Where, several
 from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
 from netspec.graph.options import BuildOptions
+from netspec.layers.contract.context import device_of
 from netspec.layers.contract.reading import Waits, reads_data
 from netspec.proto.text import parse_solver
 from netspec.solver import update
@@ -39,7 +40,7 @@ def load_solver(
     snapshot: str | Path | None = None,
     device: str | torch.device | Sequence[str | torch.device] | None = None,
     level: int | None = None,
-    stages: Iterable[str] = (),
+    stages: str | Iterable[str] = (),
     allow_python: bool = False,
     action: Callable[[], str | None] = lambda: None,
     exact: str = SMALL,
@@ -63,14 +64,13 @@ def load_solver(
     """
     build = BuildOptions(
         level=level,
-        stages=tuple(stages),
+        stages=several(stages),
         allow_python=allow_python,
         exact=exact,
         strict=strict,
         limit=limit,
     )
-    given = [] if device is None else [device] if isinstance(device, (str, torch.device)) else device
-    options = TrainingOptions(build, [torch.device(d) for d in given], nan, precision, action=action)
+    options = TrainingOptions(build, [device_of(each) for each in several(device)], nan, precision, action=action)
     return make_solver(path, options, weights, snapshot)
 
 
@@ -91,7 +91,7 @@ def make_solver(
         param = with_train_state(param, options.build.level, options.build.stages)
     if weights is not None:
         param.ClearField("weights")
-        param.weights.extend([str(weights)] if isinstance(weights, (str, Path)) else map(str, weights))
+        param.weights.extend(map(str, several(weights)))
     devices = options.devices or [choose_device(param, node)]
     if not options.devices and options.processes.count > 1 and devices[0].type == "cuda":
         devices = [own_device()]

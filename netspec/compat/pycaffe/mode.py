@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import torch
 
 from netspec import log
+from netspec.errors import check_choice
 from netspec.exact import CHOICES, SMALL
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.context import Random
@@ -89,8 +90,7 @@ def set_exact(choice: str) -> None:
 
     Not of Caffe; see netspec/exact/__init__.py.
     """
-    if choice not in CHOICES:
-        raise ValueError(f"found exact {choice!r}, expected {', '.join(map(repr, CHOICES))}")
+    check_choice("exact", choice, CHOICES)
     _mode.exact = choice
 
 

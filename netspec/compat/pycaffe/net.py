@@ -19,7 +19,7 @@ from netspec.compat.pycaffe import mode
 from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.named import Named
 from netspec.compat.pycaffe.passes import Passes
-from netspec.errors import did_you_mean
+from netspec.errors import did_you_mean, several
 from netspec.graph.filter import with_state
 from netspec.layers.utility import pycaffe_shim
 from netspec.layers.utility.live_blobs import Blob, BlobVec
@@ -180,7 +180,7 @@ class Net:
         """
         first = 0 if start is None else self._index(start)
         last = len(self.layers) - 1 if end is None else self._index(end)
-        wanted = [*(self.outputs if end is None else self.top_names[end]), *(blobs or ())]
+        wanted = [*(self.outputs if end is None else self.top_names[end]), *several(blobs)]
         with self.passes.used():
             self._fill(inputs, self.inputs, "data", "Input blob arguments do not match net inputs.")
             self._forward(first, last)
@@ -194,7 +194,7 @@ class Net:
         """
         first = len(self.layers) - 1 if start is None else self._index(start)
         last = 0 if end is None else self._index(end)
-        wanted = [*(self.inputs if end is None else self.bottom_names[end]), *(diffs or ())]
+        wanted = [*(self.inputs if end is None else self.bottom_names[end]), *several(diffs)]
         with self.passes.used(forward=False):
             self._fill(tops, self.outputs, "diff", "Top diff arguments do not match net outputs.")
             self._backward(first, last)
@@ -231,7 +231,7 @@ class Net:
 
         Returns the data of the outputs and of ``blobs`` for all items, as new arrays.
         """
-        found: dict[str, list[np.ndarray]] = {name: [] for name in dict.fromkeys([*self.outputs, *(blobs or ())])}
+        found: dict[str, list[np.ndarray]] = {name: [] for name in dict.fromkeys([*self.outputs, *several(blobs)])}
         for batch in self._batch(inputs):
             for name, array in self.forward(blobs, **batch).items():
                 found[name].extend(array.copy())
@@ -245,8 +245,8 @@ class Net:
         ``arrays`` are inputs and diffs of outputs. Returns the data of the outputs and of ``blobs``, and the diffs of
         the inputs and of ``diffs``, for all items, as new arrays.
         """
-        data: dict[str, list[np.ndarray]] = {name: [] for name in dict.fromkeys([*self.outputs, *(blobs or ())])}
-        grads: dict[str, list[np.ndarray]] = {name: [] for name in dict.fromkeys([*self.inputs, *(diffs or ())])}
+        data: dict[str, list[np.ndarray]] = {name: [] for name in dict.fromkeys([*self.outputs, *several(blobs)])}
+        grads: dict[str, list[np.ndarray]] = {name: [] for name in dict.fromkeys([*self.inputs, *several(diffs)])}
         inputs = {name: array for name, array in arrays.items() if name in self.inputs}
         tops = {name: array for name, array in arrays.items() if name not in self.inputs}
         for ahead, back in zip_longest(self._batch(inputs), self._batch(tops), fillvalue={}):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from netspec.errors import SpecError, did_you_mean
+from netspec.errors import SpecError, check_choice
 
 TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")
 FP32, BF16 = PRECISIONS = ("fp32", "bf16")
@@ -29,9 +29,7 @@ class Choice:
         Raises SpecError for an engine or a precision that there is not, and for an engine that is not installed.
         """
         for what, found, known in (("engine", engine, ENGINES), ("precision", precision, PRECISIONS)):
-            if found not in known:
-                close = did_you_mean(found, known) or f"; expected one of: {', '.join(known)}"
-                raise SpecError(f'unknown {what} "{found}"{close}')
+            check_choice(what, found, known)
         for module in _NEEDS.get(engine, ()):
             if find_spec(module) is None:
                 raise SpecError(f"engine {engine} needs the {module} library: pip install 'netspec-caffe[{engine}]'")

@@ -8,9 +8,21 @@ from dataclasses import dataclass, field
 import torch
 
 from netspec.data.random_words import derived
-from netspec.errors import Report, Where, raise_fault
+from netspec.errors import Report, SpecError, Where, raise_fault
 from netspec.graph.options import BuildOptions
 from netspec.proto.schema import TEST
+
+
+def device_of(name: str | torch.device) -> torch.device:
+    """Return torch's device of a name. Raises SpecError for a name that is none, and for a GPU that is not here."""
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise SpecError(f'found device "{name}", expected cpu, cuda or cuda:NUMBER') from None
+    count = torch.cuda.device_count() if device.type == "cuda" else 0
+    if device.type == "cuda" and (device.index or 0) >= count:
+        raise SpecError(f'found device "{name}", but torch finds {count or "no"} GPU(s) on this machine; "cpu" is here')
+    return device
 
 
 def nowhere(*path: str | int) -> Where:

@@ -124,9 +124,13 @@ def test_where_the_cache_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("engine", "precision", "fault"),
     [
-        ("onnxruntme", "fp32", 'unknown engine "onnxruntme"; did you mean "onnxruntime"?'),
-        ("tensorrt", "fp32", 'unknown engine "tensorrt"; expected one of: torch, onnxruntime, openvino'),
-        ("torch", "int8", 'unknown precision "int8"; expected one of: fp32, bf16'),
+        (
+            "onnxruntme",
+            "fp32",
+            "found engine 'onnxruntme', expected 'torch', 'onnxruntime', 'openvino'; did you mean \"onnxruntime\"?",
+        ),
+        ("tensorrt", "fp32", "found engine 'tensorrt', expected 'torch', 'onnxruntime', 'openvino'"),
+        ("torch", "int8", "found precision 'int8', expected 'fp32', 'bf16'"),
     ],
 )
 def test_choices_that_there_are_not(engine: str, precision: str, fault: str) -> None:
