@@ -29,7 +29,7 @@ NEAR, OVERLAP = 1, 4  # frames of one route: the same place, and views that over
 KEYFRAMES = 4
 VIEWPOINT = 0.3  # of lmdb_build.views: how differently a place is seen in another season
 SMALL = (64, 32)
-SEASONS = (2, 3)
+SEASONS, SAME = (2, 3), 0
 WALKS = (41, 42)  # seeds
 GAP = 30  # frames of one drive that are no loop
 
@@ -103,8 +103,11 @@ def _of_route(name: str, route: list[Path], other: list[Path], work: Path) -> It
     where = np.concatenate([every, np.full(len(between), np.nan), every[half]])
     yield Drive(name, "comes back", _one_drive(once, where))
     yield Drive(name, "once", _one_drive(route, every))
-    yield Drive(name, "twice", _one_drive([*route, *second], np.tile(every, 2)))
-    yield Drive(name, "twice, small", _one_drive([*small[0], *small[1]], np.tile(every, 2)))
+    beside = in_season(route, work / name, SAME)
+    passes = [*route, *beside]
+    yield Drive(name, "twice", _one_drive(passes, np.tile(every, 2)))
+    yield Drive(name, "twice, small", _one_drive(_resized(passes, work / f"{name}_passes_small"), np.tile(every, 2)))
+    yield Drive(name, "twice, season 2", _one_drive([*route, *second], np.tile(every, 2)))
     standing = _standing(len(route))
     yield Drive(name, "stands", _traverses([second[i] for i in standing], every[standing], route, every))
     yield Drive(name, "stood", _traverses(second, every, [route[i] for i in standing], every[standing]))
@@ -157,7 +160,7 @@ def _one_drive(images: list[Path], where: np.ndarray) -> DataSet:
 
 
 def in_season(images: list[Path], folder: Path, season: int) -> list[Path]:
-    """Return the same drive in another season, whose number decides all about it; files in ``folder``."""
+    """Return the same drive from beside, in another season unless that is ``SAME``; its files are in ``folder``."""
     folder = folder.with_name(f"{folder.name}_{season}")
     folder.mkdir(parents=True, exist_ok=True)
     made = [folder / f"{image.stem}.jpg" for image in images]
@@ -168,13 +171,14 @@ def in_season(images: list[Path], folder: Path, season: int) -> list[Path]:
             size = (picture.shape[1], picture.shape[0])
             middle = np.array([0.5, 0.5])
             view = cut_view(picture, size, middle, np.random.default_rng([season, number]), VIEWPOINT)
-            write_jpeg(path, change_light(view, lambda: front, np.random.default_rng(season)))
+            lit = view if season == SAME else change_light(view, lambda: front, np.random.default_rng(season))
+            write_jpeg(path, lit)
     return made
 
 
 def _resized(images: list[Path], folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
-    made = [folder / f"{image.stem}.jpg" for image in images]
+    made = [folder / f"{number:06d}.jpg" for number in range(len(images))]
     for image, path in zip(images, made, strict=True):
         if not path.exists():
             write_jpeg(path, cv2.resize(read_bgr(image), SMALL, interpolation=cv2.INTER_AREA))

@@ -83,7 +83,10 @@ def add_to(commands: Commands) -> None:
     of = DetectorSettings()
     p.add_argument("--metric", choices=METRICS, help=f"of the descriptors (default: {of.metric})")
     p.add_argument(
-        "--exclude-recent", type=int, metavar="FRAMES", help=f"not candidates (default: {of.exclude_recent})"
+        "--exclude-recent",
+        type=int,
+        metavar="FRAMES",
+        help=f"not candidates (default: those of one visit to a place; frame by frame {of.exclude_recent})",
     )
     p.add_argument("--exclude-seconds", type=float, metavar="S", help="nor are frames less than S seconds old")
     p.add_argument("--top-k", type=int, metavar="K", help=f"candidates examined (default: {of.top_k})")
@@ -121,7 +124,7 @@ def _detect(a: argparse.Namespace) -> None:
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.precision is None else a.precision
         odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None
-        found = whole_drive(detector, recording, features, precision, bar, odometry)
+        found = whole_drive(detector, recording, features, precision, bar, odometry, a.exclude_recent)
         results = found.results
         said = [*found.reasons, run.verdicts_said(results)]
     else:

@@ -59,6 +59,7 @@ def answer(
     progress: Progress = silent,
     far: np.ndarray | None = None,
     stamps: np.ndarray | None = None,
+    visit: int | None = None,
 ) -> Answer:
     """Decide which best matches of scores (Q, R), higher = more alike, are loops.
 
@@ -68,10 +69,12 @@ def answer(
     check, agree  verification of a query and a reference, by number; None: there are no images
     far        (Q, R) bool: pairs that odometry puts far apart; they are no candidates, and show how others score
     stamps     (Q,) seconds of the queries, NaN or None where not known
+    visit      in one sequence, a reference is a candidate of a query if it is more than so many frames older; None: if
+               in between the camera saw what is as unlike both as different places are
     """
     if not 0 < precision < 1:
         raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
-    given = candidates(scores, allowed, two, far)
+    given = candidates(scores, allowed, two, far, visit)
     lines = best_setting(given, precision)
     matches = Matches.of(given, lines, precision)
     loops, said = matches.accepted, "verification: not tried, there are no images"
@@ -86,8 +89,9 @@ def answer(
     )
     verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
     unknown = int(np.count_nonzero(matches.few & (matches.inliers <= 0)))
-    reasons = [_sequences_said(lines, precision, given.others), said + (f"; {unknown} cannot be" if unknown else "")]
-    reasons.append(_total_said(np.count_nonzero(loops), np.count_nonzero(matches.there)))
+    reasons = [*filter(None, [given.said]), _sequences_said(lines, precision, given.others)]
+    reasons.append(said + (f"; {unknown} cannot be" if unknown else ""))
+    reasons.append(_total_said(int(np.count_nonzero(loops)), int(np.count_nonzero(matches.there))))
     return Answer([_result(matches, query, str(verdicts[query]), stamps) for query in range(len(verdicts))], reasons)
 
 
@@ -127,6 +131,7 @@ class Auto:
     precision       the share of what is accepted that should be right
     odometry        file of poses of the frames of one sequence; empty: none
     exclude_frames  in one sequence, references within this many frames of the query are not candidates
+    visit           how many frames a visit to a place lasts; -1: found out, for each place
     stamps          (Q,) seconds, None if not known
     """
 
@@ -135,6 +140,7 @@ class Auto:
     precision: float = PRECISION
     odometry: str = ""
     exclude_frames: int = 0
+    visit: int = -1
     stamps: np.ndarray | None = None
     pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
 
@@ -160,8 +166,9 @@ class Auto:
         def agree(query: int, reference: int) -> Agreement:
             return self.pairs.agreement(self.check, images.queries[query], references[reference])
 
+        visit = None if self.visit < 0 else self.visit
         with timed(seconds, "choice and verification"):
-            decided = answer(found.scores, allowed, two, self.precision, self.check, agree, progress, far)
+            decided = answer(found.scores, allowed, two, self.precision, self.check, agree, progress, far, visit=visit)
         scores = np.full(found.scores.shape, np.nan)
         loops = np.flatnonzero(decided.accepted)
         scores[loops, decided.match[loops]] = [decided.results[query].score for query in loops]

@@ -11,6 +11,7 @@ from loopclosure.places.same_place import MAX_DISTANCE_M
 
 DRIFT = 0.1  # of the way: more than odometry is usually off
 FAR_M = 2 * MAX_DISTANCE_M  # from there on two frames show different places
+AWAY = 2  # frames in a row
 ENOUGH = 0.5  # of the queries with a candidate must have frames far apart, for these to show how others score
 
 
@@ -22,12 +23,14 @@ class Candidates:
     allowed    which pairs are candidates
     two        two traverses, or one sequence with itself
     different  pairs that are known to show different places; None: not known of enough queries
+    said       how long a visit to a place lasts, in a sentence; empty for two traverses
     """
 
     scores: np.ndarray
     allowed: np.ndarray
     two: bool
     different: np.ndarray | None = None
+    said: str = ""
 
     @property
     def known(self) -> np.ndarray:
@@ -40,33 +43,43 @@ class Candidates:
         return "backwards" if self.different is None else "far apart in odometry"
 
 
-def candidates(scores: np.ndarray, allowed: np.ndarray, two: bool, far: np.ndarray | None) -> Candidates:
+def candidates(
+    scores: np.ndarray, allowed: np.ndarray, two: bool, far: np.ndarray | None, visit: int | None
+) -> Candidates:
     """Return the pairs that can be loops; the arguments are those of :func:`loopclosure.methods.auto.answer`."""
-    allowed, different = allowed & np.isfinite(scores), None
+    allowed, different, said = allowed & np.isfinite(scores), None, ""
     if far is not None:
         different, allowed = allowed & far, allowed & ~far
         if np.count_nonzero(different.any(axis=1)) < ENOUGH * np.count_nonzero(allowed.any(axis=1)):
             different = None
-    if not two:
-        allowed &= earlier(len(scores), _visit(scores, allowed))
-    return Candidates(scores, allowed, two, different)
+    if not two and visit is not None:
+        allowed &= earlier(len(scores), visit)
+        said = f"a visit to a place lasts {visit} frames, as was said"
+    elif not two:
+        back, lasted = _returned(scores, allowed)
+        allowed &= back
+        said = f"a visit to a place lasts {np.median(lasted):.0f} frames in the middle, {lasted.max()} at most"
+    return Candidates(scores, allowed, two, different, said)
 
 
-def _visit(scores: np.ndarray, allowed: np.ndarray) -> int:
-    """Return how many frames a visit to a place takes in one drive: so many are as unlike as different places are.
+def _returned(scores: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which pairs (n, n) of one drive have a leave-taking between them, and how long each visit lasts, (n,).
 
-    A camera that stands, or a straight road, is like itself for long; that is no loop.
+    A visit to a frame's place ends with ``AWAY`` frames in a row that are as unlike it as different places are: the
+    median of all. A camera that stands, or a straight road, is like itself for long; that is no loop.
     """
-    lags = [(k, np.median(known)) for k in range(1, len(scores)) if len(known := _finite(np.diagonal(scores, -k)))]
-    visit, before = 0, -1
-    while visit > before and np.any(apart := allowed & earlier(len(scores), visit)):
-        different = np.median(scores[apart])
-        visit, before = next((k - 1 for k, alike in lags if alike <= different), visit), visit
-    return visit
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return values[np.isfinite(values)]
+    frames = len(scores)
+    numbers = np.arange(frames)
+    if not allowed.any():
+        return allowed, np.full(frames, frames)
+    unlike = scores <= np.median(scores[allowed])
+    away = np.logical_and.reduce([unlike[k : frames - AWAY + 1 + k] for k in range(AWAY)])  # from frame i, of frame j
+    after = away & (numbers[: len(away), None] > numbers)
+    left = np.where(after.any(axis=0), after.argmax(axis=0) + AWAY, frames)  # the first frame that may be back
+    before = away & (numbers[: len(away), None] + AWAY <= numbers)
+    entered = np.where(before.any(axis=0), len(away) - 1 - before[::-1].argmax(axis=0), -1)
+    back = (numbers[:, None] >= left) & (numbers < entered[:, None])
+    return back, left - AWAY - numbers
 
 
 def far_apart(poses: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ odometry tells which frames are far apart, the best of these is the decoy, and s
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,7 @@ LEAST_ACCEPTED = 10
 NEARLY = 0.95
 # Neighbors of a query, so many before and after, may fit its match better.
 REACH = 4
+MIDDLE = 4  # steps of a line
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,9 @@ class Lines:
     match    (Q,) each query's best reference, -1 without one
     targets  (Q,) its score, -inf without one
     decoys   (Q,) the best score of a reverse line, or of frames far apart in odometry, -inf without one
-    near     (Q,) bool: of the queries just before and after, none that is far fits the match better. Where a loop ends,
-             the line through its last place is the best one for a while
+    near     (Q,) bool: of the queries just before and after, none that is far fits the match better, and the middle of
+             the line is nearer to its mean than to chance. Where a loop ends, the line through its last place is the
+             best one for a while
     """
 
     setting: Setting
@@ -81,7 +83,8 @@ class Lines:
     def accepted(self, precision: float) -> np.ndarray:
         """Return which best matches (Q,) are loops; none if they are too few to tell."""
         accepted = (self.targets >= self.threshold(precision)) & self.near
-        return accepted if np.count_nonzero(accepted) >= LEAST_ACCEPTED else np.zeros_like(accepted)
+        least = max(LEAST_ACCEPTED, self.setting.length)
+        return accepted if np.count_nonzero(accepted) >= least else np.zeros_like(accepted)
 
 
 @dataclass
@@ -155,8 +158,8 @@ def search(given: Candidates, setting: Setting) -> Lines:
     """Search for lines through candidates; decoys are the lines backwards, or pairs known to be different."""
     scores, allowed, different = given.scores, given.allowed, given.different
 
-    def along(distances: np.ndarray) -> np.ndarray:
-        return distances if setting.sequence is None else trajectory_costs(distances, setting.sequence)
+    def along(distances: np.ndarray, sequence: SequenceSettings | None = setting.sequence) -> np.ndarray:
+        return distances if sequence is None else trajectory_costs(distances, sequence)
 
     distances = np.where(allowed, -scores, np.nan)
     if setting.standardized:
@@ -172,7 +175,16 @@ def search(given: Candidates, setting: Setting) -> Lines:
     ratio = len(best[0]) / len(best) if given.two else 1.0
     owner = _owner(best, match, setting.length)
     near = np.abs(owner - np.arange(len(best))) <= max(REACH, 1 / ratio)
+    if setting.sequence is not None:
+        middle = np.where(allowed, -along(distances, replace(setting.sequence, length=MIDDLE)), np.nan)
+        near &= _fits(middle, match, targets)
     return Lines(setting, forward, np.where(np.isneginf(targets), -1, match), targets, decoys, near)
+
+
+def _fits(middle: np.ndarray, match: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return the queries (Q,) whose score ``middle`` (Q, R) at their match is nearer to the line's than to chance."""
+    chance = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in middle])
+    return middle[np.arange(len(match)), match] >= (chance + targets) / 2
 
 
 def _owner(best: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
@@ -192,7 +204,7 @@ def best_setting(given: Candidates, precision: float) -> Lines | None:
     """Return the search that finds the most loops at this precision; None if none finds any."""
     chosen, most = None, 0
     alone = [] if given.different is None else [Setting(None)]
-    for setting in (*alone, *settings(*given.scores.shape, given.two)):
+    for setting in (*alone, *settings(given.scores.shape[0], given.scores.shape[1], given.two)):
         found = search(given, setting)
         count = np.count_nonzero(found.accepted(precision))
         if count * NEARLY > most:

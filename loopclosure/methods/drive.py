@@ -23,17 +23,19 @@ def whole_drive(
     precision: float = PRECISION,
     progress: Progress = silent,
     odometry: np.ndarray | None = None,
+    visit: int | None = None,
 ) -> Answer:
     """Add every frame of a recording to a new detector, then decide with all of them in view which close loops.
 
-    ``odometry`` are poses (frames, 7), NaN where not known. The detector gets these loops, and for frames to come the
+    ``odometry`` are poses (frames, 7), NaN where not known; ``visit`` is that of
+    :func:`loopclosure.methods.auto.answer`. The detector gets these loops, and for frames to come the
     least threshold that accepts none of this drive's others.
     """
     run_detector(detector, recording, features, progress)
     settings, rows = detector.settings, detector.descriptors
     scores = similarity_matrix(rows, None, settings.metric, settings.views)
     numbers = np.arange(len(rows))
-    exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
+    exclusion = Exclusion(seconds=settings.exclude_seconds)
     allowed = np.tri(len(rows), k=-1, dtype=bool)
     allowed &= ~exclusion.excludes(numbers, numbers, detector.stamps, detector.stamps)
     check, pairs = GeometricCheck(), Pairs(lambda number: read_gray((recording.images or [])[number]))
@@ -45,7 +47,7 @@ def whole_drive(
         return pairs.agreement(check, query, reference)
 
     far = None if odometry is None else far_apart(odometry)
-    found = answer(scores, allowed, False, precision, check, agree, progress, far, detector.stamps)
+    found = answer(scores, allowed, False, precision, check, agree, progress, far, detector.stamps, visit)
     single = np.where(allowed, scores, -np.inf).max(axis=1)
     others = float(np.max(single[~found.accepted], initial=-np.inf))
     above = single[found.accepted & (single > others)]

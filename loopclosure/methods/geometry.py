@@ -58,14 +58,6 @@ def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agr
     unlike = np.count_nonzero(against >= 1)
     tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(against)} unlike pairs"
     if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
-        following = (
-            []
-            if given.two
-            else [check.evidence(agree(int(query), int(query) - 1)) >= SURE for query in likely if query]
-        )
-        if accepted.any() and following and np.mean(following) >= LEAST_SHARE:
-            said = f"{tried}: consecutive frames are verified, so that these are no loops"
-            return Geometry(check, agree, np.full(SAMPLE, SURE), False, said)
         said = f"{tried}: these images cannot be verified, so that nothing is rejected for it"
         return Geometry(check, agree, None, True, said)
     # Unlike pairs of a small place, a desk, do show the same things, and so does a dashboard in all images.

@@ -158,14 +158,15 @@ def test_detect_chooses_by_itself(tmp_path, capsys):
     for i, image in enumerate(frames):
         cv2.imwrite(str(tmp_path / "drive" / f"{i:03d}.png"), cv2.resize(image, (64, 48)))
     thumbnails = ["--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]
-    line = ["detect", str(tmp_path / "drive"), "--exclude-recent", "20", *thumbnails, "--out", str(tmp_path / "found")]
+    line = ["detect", str(tmp_path / "drive"), *thumbnails, "--out", str(tmp_path / "found")]
     assert main([*line, "--save", str(tmp_path / "d.npz")]) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 5
-    assert (tmp_path / "found" / "chosen.txt").read_text().splitlines() == printed[:4]
-    assert printed[0].startswith("sequences")
-    assert printed[1].startswith("verification: ")
-    assert "best score" in printed[3]
+    assert len(printed) == 6
+    assert (tmp_path / "found" / "chosen.txt").read_text().splitlines() == printed[:5]
+    assert printed[0].startswith("a visit to a place lasts ")
+    assert printed[1].startswith("sequences")
+    assert printed[2].startswith("verification: ")
+    assert "best score" in printed[4]
     with (tmp_path / "found" / "loops.csv").open() as stream:
         loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
     assert len(loops) > 60

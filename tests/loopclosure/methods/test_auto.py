@@ -10,7 +10,7 @@ from loopclosure.detector.verification import Agreement, GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.methods.auto import answer
 from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
-from loopclosure.methods.candidates import far_apart
+from loopclosure.methods.candidates import candidates, far_apart
 from loopclosure.methods.decoys import threshold
 from loopclosure.progress import silent
 
@@ -166,7 +166,7 @@ def test_a_desk_of_which_all_images_show_something():
         GeometricCheck(),
         lambda q, r: Agreement(90, 70 if rows[q] @ rows[r] > 0.7 else 25, 20),
     )
-    assert "something is the same in all images" in found.reasons[1]
+    assert "something is the same in all images" in found.reasons[2]
     alike_ones = rows[np.arange(200)] @ rows.T > 0.7
     assert alike_ones[np.arange(200), found.match][found.accepted].all()
     assert np.count_nonzero(found.accepted) > 150
@@ -183,20 +183,44 @@ def test_a_camera_that_moves_slowly_closes_no_loop():
 
 
 @pytest.mark.slow
-def test_where_consecutive_frames_are_verified_a_loop_must_be_too():
+def test_a_second_pass_from_beside_is_found_though_only_consecutive_frames_are_verified():
     road = drive(400, 3)
     rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
-    allowed = np.tri(len(rows), k=-31, dtype=bool)
-    for following, loops in ((60, False), (25, True)):
-        found = answer(
-            alike(rows, rows),
-            allowed,
-            False,
-            0.99,
-            GeometricCheck(),
-            lambda q, r, points=following: Agreement(80, points if q - r == 1 else 9, 20),
-        )
-        assert (np.count_nonzero(found.accepted) > 60) == loops
+    points = Agreement(80, 60, 20), Agreement(80, 9, 20)
+    found = answer(
+        alike(rows, rows),
+        np.tri(len(rows), k=-31, dtype=bool),
+        False,
+        0.99,
+        GeometricCheck(),
+        lambda q, r: points[q - r != 1],
+    )
+    assert np.count_nonzero(found.accepted) > 60
+    assert "cannot be verified" in found.reasons[2]
+
+
+@pytest.mark.parametrize("length", [4, 12, 40])
+def test_a_visit_to_a_place_has_an_end(length):
+    """A room in which a camera turns: everything is seen again and again, and is alike."""
+    visits = np.arange(480) // length
+    views = again(np.tile(drive(1, 1), (8, 1)), 0.8, 2)[visits % 8]
+    scores, earlier = alike(*[again(views, 0.3, 3)] * 2), np.tri(480, k=-1, dtype=bool)
+    given = candidates(scores, earlier, False, None, None)
+    apart = np.subtract.outer(visits, visits)
+    assert np.mean(given.allowed[(apart > 0) & (apart % 8 == 0)]) > 0.95
+    assert not given.allowed[apart == 0].any()
+    assert int(given.said.split()[6]) <= 3 * length
+    assert np.array_equal(candidates(scores, earlier, False, None, 7).allowed, np.tri(480, k=-8, dtype=bool))
+
+
+def test_a_loop_does_not_go_on_past_a_seam():
+    """The second pass begins where the first one did, and not where it ended."""
+    road = drive(150, 6)
+    rows = np.concatenate([road, again(road, 0.8, 7)])
+    found = answer(alike(rows, rows), np.tri(300, k=-11, dtype=bool), False)
+    assert np.count_nonzero(found.accepted[150:]) > 130
+    assert np.count_nonzero(found.accepted[:150]) <= 1
+    assert np.all(np.abs(found.match - np.arange(300) + 150)[found.accepted] <= 3)
 
 
 def round_and_round(frames, radius=20.0):
@@ -227,7 +251,7 @@ def test_with_odometry_single_images_are_told_from_chance():
     far = far_apart(round_and_round(200))
     found = answer(scores, allowed, False, far=far)
     wrong = np.abs(found.match - np.arange(200) + 100) > 2
-    assert "far apart in odometry" in found.reasons[0]
+    assert "far apart in odometry" in found.reasons[1]
     assert np.count_nonzero(found.accepted) > 50
     assert not (found.accepted & wrong).any()
 
@@ -247,11 +271,11 @@ def test_single_images_are_verified_where_sequences_tell_nothing():
         GeometricCheck(),
         lambda a, b: points[0] if seen[a] == seen[b] and a % 10 else points[1],
     )
-    assert "one by one" in found.reasons[0]
+    assert "one by one" in found.reasons[1]
     right = seen[found.match] == seen
     assert right[found.accepted].all()
     assert np.count_nonzero(found.accepted) > 150
-    assert "cannot be" in found.reasons[1]
+    assert "cannot be" in found.reasons[2]
 
 
 def test_a_threshold_counts_decoys():
