@@ -14,11 +14,13 @@ import numpy as np
 
 from netspec import log
 from netspec.errors import SpecError
-from netspec.export.engines.cache import entry, fill, note
-from netspec.export.engines.choice import BF16, FP32, Choice
+from netspec.export.engines.cache import entry
+from netspec.export.engines.choice import FP32, Choice
 from netspec.export.engines.key import key_of
 from netspec.export.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
+from netspec.files.whole_file import write_whole
 
+WARNINGS, DIFFERENCE = "warnings.txt", "bf16.txt"  # lines to say at each start
 Export = Callable[[Path], None]  # writes the ONNX model to a path, its weights beside it
 
 
@@ -40,7 +42,7 @@ class Model:
     def __init__(self, choice: Choice, origin: Origin | None, export: Export) -> None:
         self.choice = choice
         self._kept: tempfile.TemporaryDirectory[str] | None = None  # where the cache does not
-        self.folder, self._about = self._made(origin, export)
+        self.folder = self._made(origin, export)
         self._runner, precision = self._opened(choice.precision)
         self._told = precision == FP32
 
@@ -55,33 +57,34 @@ class Model:
             self._tell_difference(inputs, found)
         return found
 
-    def _made(self, origin: Origin | None, export: Export) -> tuple[Path, dict[str, Any]]:
+    def _made(self, origin: Origin | None, export: Export) -> Path:
         runner = RUNNERS[self.choice.engine]
         given = {"engine": self.choice.engine, **runner.identity()}
 
-        def make(folder: Path) -> dict[str, Any]:
+        def make(folder: Path) -> None:
             with _warnings() as told:
                 _export(export, folder / MODEL)
             try:
                 runner.prepare(folder)
             except Exception as fault:  # each library has its own
                 raise Unable(reason(fault)) from None
-            return {**given, "warnings": told}
+            (folder / WARNINGS).write_text("\n".join(told), "utf-8", "backslashreplace")
 
         if self.choice.cache is not None and origin is not None:
             key = key_of(origin.files, {**origin.options, **given})
             try:
-                folder, about, made = entry(self.choice.cache, key, make)
+                folder, made = entry(self.choice.cache, key, make)
             except OSError as fault:
                 where = self.choice.cache
                 log.logger.warning(f"{where}: cannot be written: {fault.strerror}; the exported model is not kept")
             else:
-                for line in () if made else about["warnings"]:
-                    log.logger.warning(line)
-                return folder, about
+                if not made:
+                    _warn_again(folder / WARNINGS)
+                return folder
         self._kept = tempfile.TemporaryDirectory(prefix="netspec-", ignore_cleanup_errors=True)
         folder = Path(self._kept.name)
-        return folder, fill(folder, make)
+        make(folder)
+        return folder
 
     def _opened(self, precision: str) -> tuple[Runner, str]:
         try:
@@ -94,13 +97,25 @@ class Model:
 
     def _tell_difference(self, inputs: Arrays, found: Arrays) -> None:
         """Say how far bf16 is from fp32: measured once, on the first inputs, and kept with the model."""
-        if self._about.get(BF16) is None:
-            exact = _run(open_runner(self.choice.engine, self.folder, FP32), inputs)
-            self._about[BF16] = {name: _difference(found[name], value) for name, value in exact.items()}
-            with suppress(OSError):  # it is measured again
-                note(self.folder, self._about)
-        for name, value in self._about[BF16].items():
-            log.logger.warning(f"precision bf16: {name} differs from fp32 by {value:.1e} of its largest value")
+        place = self.folder / DIFFERENCE
+        if place.exists():
+            return _warn_again(place)
+        exact = _run(open_runner(self.choice.engine, self.folder, FP32), inputs)
+        lines = [
+            f"precision bf16: {name} differs from fp32 by {_difference(found[name], value):.1e} of its largest value"
+            for name, value in exact.items()
+        ]
+        for line in lines:
+            log.logger.warning(line)
+        with suppress(OSError):  # it is measured again
+            write_whole(place, "\n".join(lines), "backslashreplace")
+
+
+def _warn_again(path: Path) -> None:
+    """Say the lines of a file; an older netspec kept none."""
+    with suppress(OSError):
+        for line in path.read_text("utf-8").splitlines():
+            log.logger.warning(line)
 
 
 def _run(runner: Runner, inputs: Arrays) -> dict[str, np.ndarray]:

@@ -1,14 +1,12 @@
-"""The folder of exported models: whole entries or none, bounded, by content."""
+"""The folder of exported models: whole entries or none, by content."""
 
-import json
 import os
-import time
 from pathlib import Path
 
 import pytest
 
 from netspec.errors import SpecError
-from netspec.export.engines.cache import ABANDONED, ABOUT, UNFINISHED, entry
+from netspec.export.engines.cache import entry
 from netspec.export.engines.choice import Choice, user_folder
 from netspec.export.engines.key import key_of
 
@@ -19,47 +17,24 @@ class Maker:
     def __init__(self, size: int = 10) -> None:
         self.size, self.calls = size, 0
 
-    def __call__(self, folder: Path) -> dict[str, str]:
+    def __call__(self, folder: Path) -> None:
         self.calls += 1
         (folder / "model").write_bytes(b"m" * self.size)
-        return {"said": "something"}
 
 
 def test_an_entry_is_made_once(tmp_path: Path) -> None:
     make, cache = Maker(), tmp_path / "new" / "cache"
-    folder, about, made = entry(cache, "key", make)
+    folder, made = entry(cache, "key", make)
     assert (folder / "model").read_bytes() == b"m" * 10
-    assert (about["said"], made) == ("something", True)
-    assert entry(cache, "key", make) == (folder, about, False)
+    assert made
+    assert entry(cache, "key", make) == (folder, False)
     assert entry(cache, "other", make)[0] != folder
     assert make.calls == 2
     assert sorted(path.name for path in cache.iterdir()) == ["key", "other"]
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda folder: (folder / "model").write_bytes(b"m" * 9),
-        lambda folder: (folder / "model").write_bytes(b"x" * 10),
-        lambda folder: (folder / "model").unlink(),
-        lambda folder: (folder / ABOUT).write_text('{"files": '),
-        lambda folder: (folder / ABOUT).write_text("[]"),
-        lambda folder: (folder / ABOUT).unlink(),
-    ],
-)
-def test_a_damaged_entry_is_made_again(damage, tmp_path: Path) -> None:
-    make = Maker()
-    folder, about, _ = entry(tmp_path, "key", make)
-    time.sleep(0.01)  # a file system's clock is coarse
-    damage(folder)
-    again = entry(tmp_path, "key", make)
-    assert (again[0], again[1]["said"], again[2]) == (folder, about["said"], True)
-    assert (folder / "model").read_bytes() == b"m" * 10
-    assert entry(tmp_path, "key", make)[2] is False
-
-
 def test_a_maker_that_fails_leaves_nothing(tmp_path: Path) -> None:
-    def make(folder: Path) -> dict[str, str]:
+    def make(folder: Path) -> None:
         (folder / "half").write_text("a")
         raise KeyboardInterrupt
 
@@ -68,35 +43,28 @@ def test_a_maker_that_fails_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_least_recently_used_go_first(tmp_path: Path) -> None:
-    for age, key in enumerate("abc"):
-        folder = entry(tmp_path, key, Maker(1000), 3500)[0]
-        os.utime(folder / ABOUT, (1000 + age, 1000 + age))
-    entry(tmp_path, "a", Maker(1000), 3500)  # used again
-    entry(tmp_path, "d", Maker(1000), 3500)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c", "d"]
-    entry(tmp_path, "large", Maker(5000), 3500)
-    assert [path.name for path in tmp_path.iterdir()] == ["large"]
-
-
-def test_what_a_dead_process_left_goes(tmp_path: Path) -> None:
-    for name, age in (("old", ABANDONED + 60), ("new", 60)):
-        folder = tmp_path / f"{UNFINISHED}{name}"
-        folder.mkdir()
-        os.utime(folder, (time.time() - age, time.time() - age))
+def test_a_folder_with_other_things_keeps_them(tmp_path: Path) -> None:
+    """However large and old they are."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    with (photos / "large.jpg").open("wb") as file:
+        file.truncate(5 * 2**30)  # of holes
+    for folder in (photos, tmp_path / ".unfinished-of-another"):
+        folder.mkdir(exist_ok=True)
+        os.utime(folder, (0, 0))
     entry(tmp_path, "key", Maker())
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{UNFINISHED}new", "key"]
+    assert (photos / "large.jpg").stat().st_size == 5 * 2**30
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".unfinished-of-another", "key", "photos"]
 
 
 def test_an_entry_that_another_process_made_meanwhile_is_used(tmp_path: Path) -> None:
-    def make(folder: Path) -> dict[str, str]:
+    def make(folder: Path) -> None:
         entry(tmp_path, "key", Maker(20))
-        return Maker(20)(folder)
+        Maker(10)(folder)
 
-    folder, _, _ = entry(tmp_path, "key", make)
+    folder, _ = entry(tmp_path, "key", make)
     assert (folder / "model").stat().st_size == 20
     assert [path.name for path in tmp_path.iterdir()] == ["key"]
-    assert set(json.loads((folder / ABOUT).read_text())["files"]) == {"model"}
 
 
 def test_a_key_is_of_contents_and_options(tmp_path: Path) -> None:
