@@ -38,8 +38,9 @@ def set_parameters(net: Net, arrays: Arrays, prefix: str = "") -> None:
     """Give a net the parameters that ``arrays`` has, named ``PREFIXlayer/index``."""
     for key in arrays:
         if key.startswith(prefix):
-            layer, index = key[len(prefix) :].split("/")
-            net.params[layer][int(index)].data.copy_(torch.from_numpy(arrays[key]))
+            layer, index = key[len(prefix) :].rsplit("/", 1)
+            blob = net.params[layer][int(index)].data
+            blob.copy_(torch.from_numpy(arrays[key]).reshape(blob.shape))
 
 
 def parameters(net: Net, arrays: Arrays, prefix: str) -> dict[str, np.ndarray]:
@@ -47,7 +48,7 @@ def parameters(net: Net, arrays: Arrays, prefix: str) -> dict[str, np.ndarray]:
     found = {}
     for key in arrays:
         if key.startswith(prefix):
-            layer, index = key[len(prefix) :].split("/")
+            layer, index = key[len(prefix) :].rsplit("/", 1)
             values = net.params[layer][int(index)].detach().cpu().numpy()
             found[key] = values if values.size < SAMPLED else values.reshape(-1)[::EVERY]
     return found
@@ -86,18 +87,25 @@ def assert_training(found: Arrays, golden: Arrays, bits: bool, drift: float) -> 
 
 
 def assert_same_layers(found: Arrays, expected: Arrays, tolerance: float) -> None:
-    """Compare parameters named ``.../layer/index``: each layer's to a share of its norm.
+    """Compare parameters named ``.../layer/index``: each layer's to a share of its norm."""
+    for layer, distance in layer_distances(found, expected).items():
+        assert distance <= tolerance, f"{layer}: off by {distance:.1e} of its norm"
+
+
+def layer_distances(found: Arrays, expected: Arrays) -> dict[str, float]:
+    """Return how far the parameters named ``.../layer/index`` are off, each layer's as a share of its norm.
 
     A blob that Caffe left at zero is not compared: what cancels to zero there leaves rounding on other CPUs, and the
     solvers that divide a gradient by its size make a step of it.
     """
+    distances = {}
     for layer in {key.rpartition("/")[0] for key in found}:
         names = [key for key in found if key.rpartition("/")[0] == layer and expected[key].any()]
         if names:
             theirs = np.concatenate([expected[key].reshape(-1) for key in names])
             ours = np.concatenate([found[key].reshape(-1) for key in names])
-            distance = np.linalg.norm(ours - theirs) / np.linalg.norm(theirs)
-            assert distance <= tolerance, f"{layer}: off by {distance:.1e} of its norm"
+            distances[layer] = float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs))
+    return distances
 
 
 class LayerCase:
@@ -154,8 +162,9 @@ class LayerCase:
         ]
         torch.autograd.backward(list(reached.values()), diffs)
         found = {f"indiff/{name}": _gradient(blob) for name, blob in inputs.items()}
-        ran_backward = [node.name for node, ran in zip(net.plan.nodes, net.backward_plan.layers, strict=True) if ran]
-        for layer in set(net.params) & set(ran_backward):
+        passes = zip(net.plan.nodes, net.backward_plan.layers, strict=True)
+        went_back = [node.name for node, ran in passes if ran or "fork" in self.meta]  # those of forks went in any case
+        for layer in set(net.params) & set(went_back):
             found.update({f"paramdiff/{layer}/{i}": _gradient(blob) for i, blob in enumerate(net.params[layer])})
         return {key: value for key, value in found.items() if key in self.golden}
 
