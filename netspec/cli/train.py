@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from netspec import log
 from netspec.cli.arguments import add_device, add_exact, add_python, add_state, add_strict, devices, options
 from netspec.cli.run import BUILT, Commands, signals
+from netspec.errors import SpecError
 from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
 from netspec.terminal.commands import DONE, FAULT, WrongUsage
 
@@ -133,11 +134,17 @@ def _as_caffe() -> bool:
 def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | None], processes: Processes) -> Solver:
     """Return the solver, resumed where that is asked for."""
     from netspec.process.heap import keep_freed_memory
+    from netspec.proto.text import parse_solver
     from netspec.solver.options import TrainingOptions
     from netspec.solver.solver import make_solver
 
     keep_freed_memory()
-    if arguments.resume and (found := _newest(path)):
+    param, node = parse_solver(path)
+    if not param.HasField("max_iter"):
+        raise SpecError(
+            "has no max_iter, so there is nothing to train; add max_iter: N, the number of iterations", node.where
+        )
+    if arguments.resume and (found := _newest(param.snapshot_prefix)):
         arguments.snapshot, arguments.weights = str(found), None
     build = options(arguments, stages=arguments.stage.split(","))  # without --stage an empty one, as in Caffe
     gpus = devices(arguments.gpu) if arguments.gpu else ()
@@ -148,12 +155,10 @@ def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | N
     return solver
 
 
-def _newest(solver: str) -> Path | None:
-    """Return the newest whole snapshot of a solver; None, with a line in the log, where there is none."""
-    from netspec.proto.text import read_solver
+def _newest(prefix: str) -> Path | None:
+    """Return the newest whole snapshot of a prefix; None, with a line in the log, where there is none."""
     from netspec.solver.extra import newest_pair
 
-    prefix = read_solver(solver).snapshot_prefix
     found = newest_pair(prefix)
     if found is None:
         log.logger.info(f'no snapshot to resume from with the prefix "{prefix}": the training starts')

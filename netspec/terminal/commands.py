@@ -75,7 +75,7 @@ class Commands:
     def _list(self, name: str, summary: str) -> None:
         self._groups.setdefault(self.heading, []).append(f"  {name:25} {summary}")
         groups = ("\n".join((f"{heading}:", *lines)) for heading, lines in self._groups.items())
-        self._parser.epilog = "\n\n".join([*groups, "Every command takes -q, for errors only (glog's -minloglevel 2)."])
+        self._parser.epilog = "\n\n".join([*groups, "Every command takes -q, for warnings and errors only."])
 
     def add(
         self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str
@@ -92,7 +92,7 @@ class Commands:
         added.set_defaults(prog=added.prog, run=function, log_level=level, log_form=form, fault_status=FAULT)
         added.set_defaults(begin=lambda arguments: None)
         added.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
-        added.add_argument("-q", dest="minloglevel", action="store_const", const=2, help=argparse.SUPPRESS)
+        added.add_argument("-q", dest="minloglevel", action="store_const", const=1, help=argparse.SUPPRESS)
         for name in ("--logtostderr", "--alsologtostderr"):  # it always does
             added.add_argument(name, action="store_true", help=argparse.SUPPRESS)
         return added

@@ -94,6 +94,23 @@ def test_missing_weights_are_told_before_a_net_is_built(run: Run, words: list[st
 
 
 @pytest.mark.slow
+def test_a_solver_without_max_iter_is_not_trained(run: Run, edited: Edit) -> None:
+    """Caffe trains nothing and ends well; load_solver and step(n) need none."""
+    solver = edited(SOLVER, "max_iter: 60", "")
+    told = "has no max_iter, so there is nothing to train; add max_iter: N, the number of iterations"
+    assert run("train", solver).fault == f"{solver}: {told}"
+
+
+def test_quiet_is_no_log_and_every_warning(run: Run, edited: Edit) -> None:
+    """Weights that fit no layer, and another batch size at a resume."""
+    Path("other.prototxt").write_text(Path(NET).read_text().replace('name: "', 'name: "other_'))
+    solver = edited(SOLVER, NET, "other.prototxt", "max_iter: 60", "max_iter: 1")
+    result = run("train", solver, "--weights", INIT, "-q")
+    assert result.status == 0
+    assert "holds weights for none of the net's" in result.err
+    assert {line[0] for line in result.err.splitlines()} == {"W"}
+
+
 def test_the_door_tools_train(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 2")
     door = [sys.executable, str(ROOT / "tools" / "train.py"), solver]

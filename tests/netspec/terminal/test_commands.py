@@ -144,7 +144,7 @@ def test_an_option_that_was_typed_can_be_refused(capsys: pytest.CaptureFixture[s
         ([], None, "IWE"),
         (["-logtostderr", "--alsologtostderr=1"], None, "IWE"),
         (["-minloglevel=1"], None, "WE"),
-        (["-q"], None, "E"),
+        (["-q"], None, "WE"),
         ([], "2", "E"),
         (["--minloglevel", "0"], "2", "IWE"),
         ([], "9", ""),
