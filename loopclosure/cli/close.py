@@ -34,6 +34,7 @@ OF_FRAMES = (
     "camera",
     "rerun",
 )
+ALL = "all"  # --loops of a graph in which none is false
 
 
 def add_to(commands: Commands) -> None:
@@ -47,7 +48,9 @@ def add_to(commands: Commands) -> None:
         f"{', '.join((*POSES, *TOPICS))} behind it, as in drive.mp4,poses=slam.txt",
     )
     p.add_argument("--graph", type=Path, metavar="IN.g2o", help="a pose graph to solve as it is, instead of frames")
-    p.add_argument("--loops", type=Path, metavar="CSV", help="the loops.csv that detect wrote")
+    p.add_argument(
+        "--loops", metavar="CSV", help="the loops.csv that detect wrote; with --graph: all, if no loop of it is false"
+    )
     path = p.add_mutually_exclusive_group()
     path.add_argument("--odometry", type=Path, metavar="FILE", help="the path to correct: poses of TUM, KITTI or EuRoC")
     path.add_argument(
@@ -82,7 +85,7 @@ def _close(a: argparse.Namespace) -> None:
         raise InputError(f"does not say what its camera is; give --camera {intrinsics.FORM}", frames.source)
     odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
     frames = frames.taken(source.selection())
-    loops = measure(frames, read_loops(a.loops, frames.names), camera, bar)
+    loops = measure(frames, read_loops(Path(a.loops), frames.names), camera, bar)
     closed = close(odometry, loops, frames.poses)
     write_closed(out, closed, frames.stamps, frames.names)
     # Drawing takes seconds to import, which the other commands need not wait for.
@@ -99,11 +102,12 @@ def _close(a: argparse.Namespace) -> None:
 
 def _close_graph(a: argparse.Namespace, out: Path) -> None:
     for option in ("source", *OF_FRAMES):
-        if getattr(a, option) is not None:
+        if getattr(a, option) not in (None, ALL if option == "loops" else None):
             name = "the frames" if option == "source" else f"--{option.replace('_', '-')}"
-            raise WrongUsage(f"{name} and --graph do not go together: a graph has its poses and loops")
+            hint = f"; --loops {ALL} says that all are true" if option == "loops" else ""
+            raise WrongUsage(f"{name} and --graph do not go together: a graph has its poses and loops{hint}")
     graph = read_pose_graph(a.graph)
-    solution = solve_pose_graph(graph)
+    solution = solve_pose_graph(graph, a.loops == ALL)
     write_solution(out, graph, solution)
     from loopclosure.report.paths import draw_paths
 

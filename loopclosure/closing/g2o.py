@@ -2,7 +2,7 @@
 
 Lines: ``VERTEX_SE3:QUAT id x y z qx qy qz qw``, ``EDGE_SE3:QUAT i j`` with the pose of j in the frame of i and the 21
 upper entries of its information matrix; ``VERTEX_SE2 id x y theta``, ``EDGE_SE2 i j x y theta`` with 6 entries;
-``FIX id``. Ids may have gaps and any order; ``#`` begins a comment.
+``FIX id``. Ids may have gaps and any order; ``#`` begins a comment. A file of edges alone gets its vertices from them.
 
 A graph of two dimensions is one of three whose poses lie in a plane: errors and solution are the same.
 """
@@ -14,6 +14,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.graph import Edge, Solution, solve, squares_of
 from loopclosure.detector.export import EDGE, EDGE_2D, PLANE, VERTEX, VERTEX_2D, write_pose_graph
@@ -71,9 +74,10 @@ def read_pose_graph(path: Path) -> PoseGraph:
         raise InputError(f"cannot be read ({error.strerror}); expected a pose graph (g2o)", path) from error
     if len(tags) > 1:
         raise InputError("has vertices or edges of two and of three dimensions; expected one kind", path)
-    if not vertices or not edges:
+    if not edges:
         raise InputError(f"has {len(vertices)} vertices and {len(edges)} edges; expected a pose graph (g2o)", path)
-    rows = {number: row for row, number in enumerate(sorted(vertices))}
+    ids = sorted(vertices or {end for edge in edges for end in edge[1:3]})
+    rows = {number: row for row, number in enumerate(ids)}
     steps, loops = [], []
     for line, *ends, pose, information in edges:
         missing = [end for end in ends if end not in rows]
@@ -85,13 +89,40 @@ def read_pose_graph(path: Path) -> PoseGraph:
     for line, number in fixed:
         if number not in rows:
             raise InputError(f"fixes vertex {number}, which the file does not have", path, line, 1)
-    poses = np.array([vertices[number] for number in rows])
+    poses = np.array([vertices[number] for number in ids]) if vertices else _chained(len(ids), [*steps, *loops])
     return PoseGraph(np.array(list(rows)), poses, steps, loops, [rows[number] for _, number in fixed], True in tags)
 
 
-def solve_pose_graph(graph: PoseGraph) -> Solution:
-    """Find the poses that agree best with all edges; loops that contradict the rest do no harm."""
-    return solve(graph.poses, graph.steps, graph.loops, graph.held)
+def _chained(nodes: int, edges: list[Edge]) -> Array:
+    """Return the poses (N, 7) that edges give when they are chained from the first node of each part on.
+
+    Odometry comes first: an edge is taken the sooner, the nearer its ends follow each other.
+    """
+    joined: dict[tuple[int, int], Edge] = {}
+    for edge in edges:
+        joined.setdefault((min(edge.first, edge.second), max(edge.first, edge.second)), edge)
+    ends = np.array(list(joined))
+    gaps = sparse.csr_matrix((ends[:, 1] - ends[:, 0], tuple(ends.T)), (nodes, nodes))
+    tree = csgraph.minimum_spanning_tree(gaps)
+    poses, known = np.tile([0, 0, 0, 0, 0, 0, 1.0], (nodes, 1)), np.zeros(nodes, bool)
+    for start in range(nodes):
+        if known[start]:
+            continue
+        order, before = csgraph.breadth_first_order(tree, start, directed=False)
+        known[order] = True
+        for node, last in zip(order[1:].tolist(), before[order[1:]].tolist(), strict=True):
+            edge, turn = joined[min(node, last), max(node, last)], Rotation.from_quat(poses[last, 3:])
+            step, turned = edge.pose[:3], Rotation.from_quat(edge.pose[3:])
+            if edge.second == last:
+                turned = turned.inv()
+                step = -turned.apply(step)
+            poses[node] = np.concatenate([poses[last, :3] + turn.apply(step), (turn * turned).as_quat()])
+    return poses
+
+
+def solve_pose_graph(graph: PoseGraph, all_true: bool = False) -> Solution:
+    """Find the poses that agree best with all edges; loops that contradict the rest do no harm, if not ``all_true``."""
+    return solve(graph.poses, graph.steps, graph.loops, graph.held, graph.flat, all_true)
 
 
 def write_solution(out: Path, graph: PoseGraph, solution: Solution) -> None:

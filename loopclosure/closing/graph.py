@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from loopclosure.closing.normal import least_squares_step, order
 
 Array = NDArray[np.float64]
 
-# A true edge of six numbers is below this in 99 of 100 cases (chi-squared).
-ACCEPTED_SQUARE = 16.8
+TRUE_BELOW = 0.99  # the squared error of a true loop is below its limit in so many cases (chi-squared)
 WIDEST, NARROWER = 1000.0, 10.0  # the loss at first, in units of that square; and from one stage to the next
 EARLY_STEPS, LAST_STEPS = 2, 50
 EARLY_GAIN, LAST_GAIN = 1e-2, 1e-7  # a stage ends when a step makes the loss smaller by less than this share
@@ -48,38 +48,57 @@ class Edge:
 
 @dataclass(frozen=True)
 class Solution:
-    """Poses (N, 7) of all nodes, and the squared error of each edge there: (S,) odometry, (L,) loops."""
+    """Poses (N, 7) of all nodes, and the squared error of each edge there: (S,) odometry, (L,) loops.
+
+    limits  (L,) up to which the error of a loop agrees with the rest of the graph
+    """
 
     poses: Array
     odometry_squares: Array
     squares: Array
+    limits: Array
 
     @property
     def accepted(self) -> NDArray[np.bool_]:
         """Which loop edges (L,) agree with the rest of the graph."""
-        return self.squares <= ACCEPTED_SQUARE
+        return self.squares <= self.limits
 
 
-def solve(poses: Array, odometry: Sequence[Edge], loops: Sequence[Edge], held: Collection[int] = ()) -> Solution:
+def solve(
+    poses: Array,
+    odometry: Sequence[Edge],
+    loops: Sequence[Edge],
+    held: Collection[int] = (),
+    flat: bool = False,
+    all_true: bool = False,
+) -> Solution:
     """Find the poses (N, 7) that agree best with all edges.
 
-    ``poses`` are those to start from. Some of the loops may be false. The ``held`` nodes stay where they are, and the
-    first node of each part of the graph that has none of them.
+    ``poses`` are those to start from. Some of the loops may be false, unless they are ``all_true``. The ``held`` nodes
+    stay where they are, and the first node of each part of the graph that has none of them. In a ``flat`` graph an edge
+    measures three numbers, not six.
     """
     graph = _Graph(len(poses), [*odometry, *loops], held)
     state = State(poses[:, :3], Rotation.from_quat(poses[:, 3:]))
+    limits = np.full(len(loops), np.inf) if all_true else _limits(loops, flat)
 
     def worst() -> float:
-        return float(graph.squares(state)[len(odometry) :].max(initial=0)) / ACCEPTED_SQUARE
+        return float((graph.squares(state)[len(odometry) :] / limits).max(initial=0))
 
-    factor = max(WIDEST, worst()) if loops else 1.0
+    factor = max(WIDEST, worst()) if loops and not all_true else 1.0
     while factor > 1:
-        state = _descend(graph, state, _Loss(len(odometry), factor * ACCEPTED_SQUARE), EARLY_STEPS, EARLY_GAIN)
+        state = _descend(graph, state, _Loss(len(odometry), factor * limits), EARLY_STEPS, EARLY_GAIN)
         factor = min(factor / NARROWER, worst())  # at once to the last where no loop is false
-    state = _descend(graph, state, _Loss(len(odometry), ACCEPTED_SQUARE), LAST_STEPS, LAST_GAIN)
+    state = _descend(graph, state, _Loss(len(odometry), limits), LAST_STEPS, LAST_GAIN)
     squares = graph.squares(state)
     solved = np.hstack([state.positions, state.turns.as_quat(canonical=True)])
-    return Solution(solved, squares[: len(odometry)], squares[len(odometry) :])
+    return Solution(solved, squares[: len(odometry)], squares[len(odometry) :], limits)
+
+
+def _limits(loops: Sequence[Edge], flat: bool) -> Array:
+    """Return the greatest error (L,) of a true loop: it grows with how many numbers the loop measures."""
+    measured = np.linalg.matrix_rank(np.array([edge.information for edge in loops]).reshape(-1, 6, 6), hermitian=True)
+    return np.asarray(chi2.ppf(TRUE_BELOW, np.maximum(1, measured - (3 if flat else 0))))
 
 
 def squares_of(poses: Array, edges: Sequence[Edge]) -> Array:
@@ -96,10 +115,10 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class _Loss:
-    """The squares of the first edges, and Geman and McClure's loss, of at ``most`` that much, of the others."""
+    """The squares of the first edges, and Geman and McClure's loss, of at ``most`` (L,) that much, of the others."""
 
     odometry: int
-    most: float
+    most: Array
 
     def __call__(self, squares: Array) -> float:
         loops = squares[self.odometry :]

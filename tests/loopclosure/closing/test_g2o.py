@@ -16,7 +16,7 @@ from loopclosure.closing import graph, normal
 from loopclosure.closing.drift import ate_rmse_m, path_of, steps_between
 from loopclosure.closing.g2o import read_pose_graph, solve_pose_graph
 from loopclosure.closing.graph import Edge, solve
-from loopclosure.detector.export import relative_pose
+from loopclosure.detector.export import relative_pose, write_pose_graph
 from loopclosure.errors import InputError
 from paths import shared
 
@@ -208,6 +208,37 @@ def test_no_other_option_belongs_to_a_graph(tmp_path: Path, capsys: pytest.Captu
     assert "expected the frames and --loops, or --graph" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("flat", [False, True])
+def test_edges_alone_are_chained(tmp_path: Path, flat: bool) -> None:
+    """As SE-Sync's data sets are shipped: odometry in both directions, and a vertex that only a loop reaches."""
+    truth = street(120)
+    truth[:, 2] = 0
+    truth[:, 3:] = Rotation.from_rotvec(0.1 * np.arange(120)[:, None] * [0, 0, 1]).as_quat()
+    ends = [(i, i + 1) if i % 3 else (i + 1, i) for i in range(119) if i != 60] + [(0, 80), (20, 100)]
+    edges = [(3 * i, 3 * j, relative_pose(truth[i], truth[j]), np.eye(6)) for i, j in ends]
+    write_pose_graph(tmp_path / "edges.g2o", {}, edges, flat=flat)
+    read = read_pose_graph(tmp_path / "edges.g2o")
+    np.testing.assert_array_equal(read.ids, np.arange(0, 360, 3))
+    np.testing.assert_allclose(read.poses[:, :3], truth[:, :3] - truth[0, :3], atol=1e-5)
+    assert solve_pose_graph(read).accepted.all()
+
+
+@pytest.mark.parametrize(("flat", "error", "used"), [(True, 3.3, "yes"), (True, 3.5, "no"), (False, 3.5, "yes")])
+def test_a_true_loop_is_within_the_limit_of_its_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flat: bool, error: float, used: str
+) -> None:
+    """99 of 100 squares are below 11.34 of three numbers, 16.81 of six; --loops all rejects none."""
+    step = np.array([1, 0, 0, 0, 0, 0, 1.0])
+    edges = [(i, i + 1, step, 1e8 * np.eye(6)) for i in range(4)]
+    edges.append((0, 4, step * (4 + error) - np.array([0, 0, 0, 0, 0, 0, 3 + error]), np.eye(6)))
+    write_pose_graph(tmp_path / "in.g2o", {}, edges, flat=flat)
+    for words, expected in (([], used), (["--loops", "all"], "yes")):
+        line = ["close", "--graph", str(tmp_path / "in.g2o"), "--out", str(tmp_path / "out"), *words]
+        assert main(line) == 0, capsys.readouterr().err
+        with (tmp_path / "out" / "loops.csv").open() as stream:
+            assert [row["used"] for row in csv.DictReader(stream)] == [expected]
+
+
 @pytest.mark.slow
 def test_the_parking_garage(tmp_path: Path) -> None:
     """Carlone et al., ICRA 2015: 1,661 poses, 6,275 edges; the least chi-squared is 1.268. No loop is false."""
@@ -220,3 +251,6 @@ def test_the_parking_garage(tmp_path: Path) -> None:
     assert time.process_time() - begun < 30  # 1 to 2 where nothing else runs
     assert found.accepted.all()
     assert found.odometry_squares.sum() + found.squares.sum() == pytest.approx(1.26838, abs=1e-4)
+    path.write_text("\n".join(line for line in path.read_text().splitlines() if line.startswith("EDGE")))
+    alone = solve_pose_graph(read_pose_graph(path), all_true=True)
+    assert alone.odometry_squares.sum() + alone.squares.sum() == pytest.approx(1.26838, abs=1e-4)
