@@ -6,16 +6,18 @@ Caffe: src/caffe/blob.cpp (FromProto, ToProto, ShapeEquals)
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from netspec.proto.schema import BlobProto, BlobShape
+from netspec.proto.wire import PLACE, fields
 
 Shape = tuple[int, ...]
 LEGACY_AXES = ("num", "channels", "height", "width")
+_AT_ONCE = 1 << 20  # numbers that are read at once: the next copy finds them in the processor's cache
 _DATA, _DIFF = ("data", "double_data"), ("diff", "double_diff")
 
 # NVIDIA Caffe's BlobProto, which DIGITS 6 and OpenCV's half-precision tools write too: `raw_data_type`, an enum, and
@@ -83,17 +85,54 @@ def in_half_precision(values: np.ndarray) -> Any:
 def _values(proto: Any, names: tuple[str, str]) -> np.ndarray:
     single, double = names
     name, dtype = (double, "<f8") if len(getattr(proto, double)) else (single, "<f4")
-    numbers, shape = getattr(proto, name), shape_of(proto)
-    count, runs = math.prod(shape), None
-    if not numbers or not hasattr(numbers, "__array__"):  # only newer protobuf's numbers have it
-        runs = _Runs.FromString(proto.SerializeToString())
-    if len(numbers) != count and not numbers and names == _DATA and runs and runs.raw_data:
+    found, shape = len(getattr(proto, name)), shape_of(proto)
+    count, stored = math.prod(shape), proto.SerializeToString()
+    if not found and count and names == _DATA and (runs := _Runs.FromString(stored)).raw_data:
         return _raw_values(runs, count).reshape(shape)
-    if len(numbers) != count:
-        raise ValueError(f"found {len(numbers)} numbers in {name}, expected {count} for shape {shape}")
-    values = np.frombuffer(getattr(runs, name), dtype) if runs else np.asarray(numbers, dtype)
-    values.flags.writeable = False
-    return values.reshape(shape)
+    _check_count(found, name, shape)
+    number = BlobProto.DESCRIPTOR.fields_by_name[name].number
+    start = next((field.start for field in fields(stored, 0, len(stored)) if field.number == number), 0)
+    return np.frombuffer(stored, dtype, count, start).reshape(shape)
+
+
+def _check_count(found: int, name: str, shape: Shape) -> None:
+    if found != math.prod(shape):
+        raise ValueError(f"found {found} numbers in {name}, expected {math.prod(shape)} for shape {shape}")
+
+
+class Elsewhere(NamedTuple):
+    """Numbers that were left in the file, little-endian float32: where, and their shape."""
+
+    file: BinaryIO
+    start: int
+    shape: Shape
+
+    def parts(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield all numbers in order, part by part, each with the count of those before it.
+
+        A part is good until the next. Raises OSError where they cannot be read, ValueError where the file was cut.
+        """
+        count = math.prod(self.shape)
+        part = np.empty(min(_AT_ONCE, count), "<f4")
+        self.file.seek(self.start)
+        for done in range(0, count, len(part)):
+            here = part[: count - done]
+            if self.file.readinto(memoryview(here).cast("B")) < here.nbytes:  # type: ignore[attr-defined]
+                raise ValueError("was cut by another program while it was read")
+            yield done, here
+
+
+def elsewhere(proto: Any, file: BinaryIO | None) -> Elsewhere | None:
+    """Return where a blob's numbers lie that were left in the file; None if it has them itself.
+
+    Raises ValueError as :func:`to_array`.
+    """
+    place = _Runs.FromString(proto.SerializeToString()).place if file and not proto.data else ()
+    if not file or not place:
+        return None
+    start, size = place
+    _check_count(size // 4, "data", shape_of(proto))
+    return Elsewhere(file, start, shape_of(proto))
 
 
 def _raw_values(runs: Any, count: int) -> np.ndarray:
@@ -114,8 +153,8 @@ def _raw_values(runs: Any, count: int) -> np.ndarray:
 def _runs_message() -> Any:
     """Return a message of BlobProto's wire format whose packed numbers are ``bytes``.
 
-    protobuf reads and writes repeated floats one Python object at a time (10 s for the 70 million of a net of the
-    paper); as bytes, numpy reads and writes them in place.
+    protobuf writes repeated floats one Python object at a time (10 s for the 70 million of a net of the paper); as
+    bytes, numpy writes them in place.
     """
     file = descriptor_pb2.FileDescriptorProto(name="netspec/blob_runs.proto", package="netspec")
     message = file.message_type.add(name="BlobRuns")
@@ -126,6 +165,7 @@ def _runs_message() -> Any:
     kinds = ((*_RAW_TYPE, field.TYPE_INT32), (*_RAW_DATA, field.TYPE_BYTES))
     for name, number, kind in kinds:
         message.field.add(name=name, number=number, type=kind, label=field.LABEL_OPTIONAL)
+    message.field.add(name="place", number=PLACE, type=field.TYPE_UINT64, label=field.LABEL_REPEATED)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("netspec.BlobRuns"))

@@ -6,7 +6,7 @@ but for their numbers and labels, so what was parsed of one holds for all that h
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +14,11 @@ import numpy as np
 from netspec.data.blobs import Shape
 from netspec.data.datum import parse_datum
 from netspec.proto.schema import Datum
+from netspec.proto.wire import BYTES, FOUR, fields
 
 MOST_BYTES = 1 << 16  # of a record: to copy a larger one together with others takes longer than to parse it
 _MOST_FORMS = 64
 _DATA, _LABEL, _FLOATS = (Datum.DESCRIPTOR.fields_by_name[name].number for name in ("data", "label", "float_data"))
-_VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
 
 
 class _Form(NamedTuple):
@@ -91,7 +91,7 @@ def _unpacked(rows: np.ndarray, form: _Form) -> tuple[np.ndarray, np.ndarray] | 
         return None
     if form.step == 5:
         tagged = values.reshape(len(rows), -1, 5)
-        if (tagged[:, :, 0] != _FLOATS << 3 | _FOUR).any():
+        if (tagged[:, :, 0] != _FLOATS << 3 | FOUR).any():
             return None
         values = tagged[:, :, 1:]
     if form.step > 1:
@@ -104,58 +104,27 @@ def _unpacked(rows: np.ndarray, form: _Form) -> tuple[np.ndarray, np.ndarray] | 
 def _form_of(record: bytes) -> _Form | None:
     """Return the form of a record; None if it is encoded, contradicts itself, or has a field several times."""
     try:
-        fields = list(_fields(record))
+        found = list(fields(record, 0, len(record)))
         datum = parse_datum(record)
-    except (ValueError, IndexError):
+    except ValueError:
         return None
-    floats = [field for field in fields if field[0] == _FLOATS]
-    others = [field[0] for field in fields if field[0] != _FLOATS]
+    floats = [field for field in found if field.number == _FLOATS]
+    others = [field.number for field in found if field.number != _FLOATS]
     shape = (datum.channels, datum.height, datum.width)
     count = shape[0] * shape[1] * shape[2]
     if datum.encoded or len(set(others)) < len(others) or min(shape) <= 0:
         return None
-    places = {number: slice(start, end) for number, _, _, start, end in fields}
+    places = {field.number: slice(field.start, field.end) for field in found}
     label = places.get(_LABEL, slice(0, 0))
     if datum.data:
-        values, step, found = places[_DATA], 1, len(datum.data)
-        if floats:
+        values, step = places[_DATA], 1
+        if floats or len(datum.data) != count:
             return None
     else:
-        found = len(datum.float_data)
-        if found != count:
+        if len(datum.float_data) != count:
             return None
-        step = 4 if len(floats) == 1 and floats[0][1] == _BYTES else 5
-        values = slice(floats[0][3 if step == 4 else 2], floats[-1][4])
-        if step == 5 and values.stop - values.start != 5 * count:
+        packed = floats[0].kind == BYTES
+        step, values = (4, places[_FLOATS]) if packed else (5, slice(floats[0].tag, floats[-1].end))
+        if values.stop - values.start != step * count:
             return None
-    if found != count:
-        return None
     return _Form(np.frombuffer(record, np.uint8), shape, values, label, step)
-
-
-def _fields(record: bytes) -> Iterator[tuple[int, int, int, int, int]]:
-    """Yield number, wire type and place of each field: where its tag starts, and where its contents start and end."""
-    place = 0
-    while place < len(record):
-        first = place
-        tag, place = _varint(record, place)
-        kind, start = tag & 7, place
-        if kind == _VARINT:
-            _, place = _varint(record, place)
-        elif kind == _BYTES:
-            size, start = _varint(record, place)
-            place = start + size
-        elif kind in (_EIGHT, _FOUR):
-            place += 8 if kind == _EIGHT else 4
-        else:
-            raise ValueError(f"has a field of wire type {kind}")
-        yield tag >> 3, kind, first, start, place
-
-
-def _varint(record: bytes, place: int) -> tuple[int, int]:
-    """Return a number of one or more bytes, and where it ends."""
-    found = shift = 0
-    while record[place] >= 128:
-        found |= (record[place] & 127) << shift
-        place, shift = place + 1, shift + 7
-    return found | record[place] << shift, place + 1

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -24,12 +24,13 @@ from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.net.stamp import check_weights
-from netspec.proto.binary import read_net_binary
+from netspec.process.heap import give_back_freed_memory
+from netspec.proto.binary import net_beside_numbers
 from netspec.proto.schema import NetParameter
 
 MOST_NAMES = 20  # layers that a warning names
 MOST_BYTES = 2**31 - 1  # of a protobuf message
-Copies = list[tuple[Layer, int, np.ndarray]]  # the layer, the blob's number in it, the values
+Copies = list[tuple[Layer, int, np.ndarray | blobs.Elsewhere]]  # the layer, the blob's number in it, the values
 
 
 def load_weights(
@@ -56,12 +57,14 @@ def load_weights(
             if h5py.is_hdf5(each):
                 loaded |= _copy(partial(_from_hdf5, net, each), faults.append)
             else:
-                loaded |= _copy(partial(_from_message, net, read_net_binary(each), each), faults.append)
+                with net_beside_numbers(each) as (message, file):
+                    loaded |= _copy(partial(_from_message, net, message, each, file), faults.append)
         except SpecError as fault:
             faults.append(fault)
         for fault in faults:
             net.plan.source.report(fault)
         whole = whole and not faults
+    give_back_freed_memory()
     if whole:
         _tell_missing(net, loaded, paths, strict, some)
 
@@ -71,7 +74,7 @@ def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
 
     Layers that only one side has are left alone. For SpecErrors see :func:`load_weights`.
     """
-    _copy(partial(_from_message, net, message, Path(path)), net.plan.source.report)
+    _copy(partial(_from_message, net, message, Path(path), None), net.plan.source.report)
 
 
 def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
@@ -86,11 +89,28 @@ def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
     with torch.no_grad():
         for layer, j, values in copies if not faults else ():
             blob = layer.blob(j)
-            if not blob.is_meta:
+            if isinstance(values, blobs.Elsewhere) and not blob.is_meta:
+                _read_into(blob, values)
+            elif not blob.is_meta:
                 with warnings.catch_warnings():  # values may lie in read-only memory: they are only read
                     warnings.simplefilter("ignore", UserWarning)
                     blob.copy_(torch.from_numpy(np.ascontiguousarray(values)).view(blob.shape))
     return {id(layer.blobs[j]) for layer, j, _ in copies}
+
+
+def _read_into(blob: torch.Tensor, values: blobs.Elsewhere) -> None:
+    """Copy numbers from their file into a blob. Raises SpecError where the file cannot be read."""
+    target = blob if blob.is_contiguous() else torch.empty_like(blob, memory_format=torch.contiguous_format)
+    flat = target.view(-1)
+    try:
+        for start, part in values.parts():
+            flat[start : start + len(part)].copy_(torch.from_numpy(part))
+    except (OSError, ValueError) as fault:
+        raise SpecError(
+            f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(values.file.name)
+        ) from None
+    if target is not blob:
+        blob.copy_(target)
 
 
 def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, some: bool) -> None:
@@ -181,7 +201,7 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
 # Binary
 
 
-def _from_message(net: Net, message: Any, path: Path, report: Report) -> Copies:
+def _from_message(net: Net, message: Any, path: Path, file: BinaryIO | None, report: Report) -> Copies:
     targets = _layers_by_name(net)
     copies: Copies = []
     for source in message.layer:
@@ -197,7 +217,7 @@ def _from_message(net: Net, message: Any, path: Path, report: Report) -> Copies:
                 report(_wrong_shape(path, source.name, j, blobs.shape_of(blob), target.blob_shapes[j]))
                 continue
             try:
-                copies.append((target, j, blobs.to_array(blob)))
+                copies.append((target, j, blobs.elsewhere(blob, file) or blobs.to_array(blob)))
             except ValueError as fault:
                 report(SpecError(f'layer "{source.name}", blob {j}: {fault}', Where(str(path))))
     return copies

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 from google.protobuf.message import DecodeError, Message
 
@@ -14,6 +16,7 @@ from netspec.files.limits import read_bytes
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.current import upgrade_net
+from netspec.proto.wire import without_numbers
 
 M = TypeVar("M", bound=Message)
 
@@ -73,9 +76,47 @@ def read_net_binary(path: str | Path) -> NetParameter:
     return parse_net_binary(path)[0]
 
 
+@contextmanager
+def net_beside_numbers(path: str | Path) -> Iterator[tuple[NetParameter, BinaryIO | None]]:
+    """Yield the net of a .caffemodel without the numbers of its large blobs, and the open file where they lie.
+
+    See :func:`netspec.proto.wire.without_numbers`. A file that cannot be read that way is yielded whole, and None.
+    Raises SpecError as :func:`read_net_binary`.
+    """
+    with ExitStack() as stack:
+        try:
+            if not os.path.isfile(path):
+                raise ValueError("a pipe, or nothing")
+            file = stack.enter_context(open(path, "rb", buffering=0))
+            message = without_numbers(_Slices(file), 0, os.fstat(file.fileno()).st_size, "NetParameter")
+            found = _upgraded(parse_binary(message, str(path), NetParameter), path)[0], file
+        except (OSError, ValueError):  # SpecError too: the whole file may say more
+            stack.close()
+            found = read_net_binary(path), None
+        yield found
+
+
+class _Slices:
+    """A file that is read where it is sliced."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def __getitem__(self, part: slice) -> bytes:
+        self._file.seek(part.start)
+        data = self._file.read(part.stop - part.start)
+        if len(data) < part.stop - part.start:
+            raise ValueError("is cut")
+        return data
+
+
 def parse_net_binary(path: str | Path, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
     """Return the net of a .caffemodel, and a map that has only the file name. Raises SpecError."""
     net = read_binary(path, NetParameter)
+    return _upgraded(net, path, upgrade)
+
+
+def _upgraded(net: NetParameter, path: str | Path, upgrade: bool = True) -> tuple[NetParameter, SourceMap]:
     source = SourceMap.unknown(str(path), len(net.layer) + len(net.layers))
     return upgrade_net(net, source) if upgrade else (net, source)
 

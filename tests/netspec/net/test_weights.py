@@ -8,12 +8,14 @@ import pytest
 import torch
 
 import netspec
+from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, net_to_proto, save_weights
-from netspec.proto.schema import TRAIN, BlobProto, NetParameter, V1LayerParameter
+from netspec.proto.binary import net_beside_numbers
+from netspec.proto.schema import TRAIN, BlobProto, NetParameter, V0LayerParameter, V1LayerParameter
 from netspec.proto.text import parse_net_text
 from paths import GOLDEN
 
@@ -210,6 +212,98 @@ def test_weights_of_v1_nets_are_upgraded(tmp_path: Path):
     net = net_of(TOWERS)
     load_weights(net, written(tmp_path, proto))
     assert blobs_of(net)["ip"][0][3].tolist() == [9, 10, 11]
+
+
+WIDE = """
+name: "wide" state { phase: TRAIN }
+layer { name: "in" type: "Input" top: "a" input_param { shape { dim: 2 dim: 30 } } }
+layer { name: "ip" type: "InnerProduct" bottom: "a" top: "x" inner_product_param { num_output: 40 } }
+"""
+
+
+def wide(kind: str) -> bytes:
+    """A file of weights 0 to 1199 and biases 0 to 39, as long as those whose numbers are read where they lie."""
+    weights, biases = np.arange(1200, dtype="<f4"), np.arange(40, dtype="<f4")
+    new = [BlobProto(shape={"dim": [40, 30]}, data=weights), BlobProto(shape={"dim": [40]}, data=biases)]
+    old = [
+        BlobProto(num=1, channels=1, height=40, width=30, data=weights),
+        BlobProto(width=40, num=1, channels=1, height=1, data=biases),
+    ]
+    net = NetParameter(name="old")
+    if kind == "V1":
+        net.layers.add(name="ip", type=V1LayerParameter.INNER_PRODUCT, blobs=old)
+    elif kind == "V0":
+        net.layers.add().layer.CopyFrom(V0LayerParameter(name="ip", type="innerproduct", num_output=40, blobs=old))
+    else:
+        net.layer.add(name="ip", type="InnerProduct", blobs=new)
+    stored = net.SerializeToString()
+    layer = b"\x0a\x02ip\x12\x0cInnerProduct"
+    shapes = [blob.shape.SerializeToString() for blob in new]
+    for blob, shape in zip((weights, biases), shapes, strict=True):
+        floats = {
+            "floats with tags": b"".join(b"\x2d" + value.tobytes() for value in blob),
+            "two runs": b"".join(field(5, part.tobytes()) for part in (blob[:20], blob[20:])),
+            "numbers before the shape": field(5, blob.tobytes()),
+            "the field of a place": field(5, blob.tobytes()) + b"\xf8\xff\xff\xff\x0f\x05",
+        }.get(kind)
+        if floats is not None:
+            layer += field(7, floats + field(7, shape))
+            stored = field(100, layer)
+    return stored
+
+
+def field(number: int, contents: bytes) -> bytes:
+    """A field of bytes on the wire."""
+    size, key = len(contents), number << 3 | 2
+    return (
+        b"".join(
+            bytes([n])
+            if n < 128
+            else bytes([n & 127 | 128, n >> 7])
+            if n < 1 << 14
+            else bytes([n & 127 | 128, n >> 7 & 127 | 128, n >> 14])
+            for n in (key, size)
+        )
+        + contents
+    )
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["current", "V1", "V0", "floats with tags", "two runs", "numbers before the shape", "the field of a place"],
+)
+@pytest.mark.parametrize("turned", [False, True])
+def test_numbers_are_read_where_they_lie_in_a_file(kind: str, turned: bool, tmp_path: Path) -> None:
+    (tmp_path / "w.caffemodel").write_bytes(wide(kind))
+    with net_beside_numbers(tmp_path / "w.caffemodel") as (message, file):
+        left = file is not None and not message.layer[0].blobs[0].data
+        assert left == (kind in ("current", "V1", "V0", "numbers before the shape"))
+    net = net_of(WIDE)
+    blob = net.layers[1].blob(0)
+    if turned:  # its memory is not in the order of the numbers
+        blob.data = blob.data.t().contiguous().t()
+    version = blob._version
+    load_weights(net, tmp_path / "w.caffemodel")
+    assert blob._version > version
+    assert (blobs_of(net)["ip"][0].ravel() == np.arange(1200)).all()
+    assert (blobs_of(net)["ip"][1] == np.arange(40)).all()
+    [stored] = stored_layers(tmp_path / "w.caffemodel")
+    assert [blob.ravel().tolist() for blob in stored.blobs] == [list(range(1200)), list(range(40))]
+
+
+def test_what_is_cut_or_has_too_few_numbers_is_refused(tmp_path: Path) -> None:
+    whole = wide("current")
+    net = net_of(WIDE)
+    before = blobs_of(net)["ip"][0]
+    for size in (len(whole) - 1, len(whole) // 2, 30):
+        (tmp_path / "cut.caffemodel").write_bytes(whole[:size])
+        with pytest.raises(SpecError, match=r"cut\.caffemodel: expected a binary NetParameter, found another kind"):
+            load_weights(net, tmp_path / "cut.caffemodel")
+    short = NetParameter.FromString(whole)
+    del short.layer[0].blobs[0].data[-1]
+    with pytest.raises(SpecError, match="blob 0: found 1199 numbers in data, expected 1200 for shape"):
+        load_weights(net, written(tmp_path, short))
+    assert (blobs_of(net)["ip"][0] == before).all()
 
 
 def test_another_shape_is_refused_and_nothing_changes(tmp_path: Path):
