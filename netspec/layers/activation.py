@@ -365,7 +365,7 @@ class Swish(Rounded):
     Caffe: src/caffe/layers/swish_layer.cpp
     """
 
-    gradient_reads = frozenset({"top"})
+    gradient_reads = frozenset({"top", "kept"})  # Caffe keeps the gate of the forward pass
 
     def setup(self) -> None:
         self.beta: float = self.param.swish_param.beta

@@ -28,11 +28,20 @@ class AbsVal(Activation):
         return x.abs()
 
 
+def over_its_diff(bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor, slope: torch.Tensor) -> torch.Tensor:
+    """Return the gradient diff * slope as Caffe's Power and Log compute it: the slope is written to the bottom's diff.
+
+    In place that is the top's diff too: what came from the loss is lost, and the result is the slope's square.
+    """
+    return (slope if bottom is top else diff) * slope
+
+
 @register("Power", "power_param")
 class Power(Rounded):
     """(shift + scale x) ^ power; the constant shift ^ power where scale or power is 0, whatever x is.
 
-    Where shift is 0, Caffe's gradient divides by x and is NaN at x = 0; this one is the derivative there too.
+    Where shift is 0, Caffe's gradient divides by x and is NaN at x = 0; this one is the derivative there too. In place,
+    the gradient is Caffe's too, the square of the slope: see :func:`over_its_diff`.
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -66,16 +75,18 @@ class Power(Rounded):
         return x + self.shift if self.shift != 0 else x
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        return over_its_diff(bottom, top, diff, self._slope(bottom, top))
+
+    def _slope(self, bottom: torch.Tensor, top: torch.Tensor) -> torch.Tensor:
         slope = self.power * self.scale
         if slope == 0 or self.power == 1:
-            return diff * slope
+            return torch.full_like(bottom, slope)
         if self.power == 2:
             derivative = slope * self.scale * bottom
-            return diff * (derivative + slope * self.shift if self.shift != 0 else derivative)
+            return derivative + slope * self.shift if self.shift != 0 else derivative
         if self.shift != 0:
-            return diff * (top / self._inner(bottom) * slope)
-        at_zero = slope * bottom.pow(self.power - 1)
-        return diff * torch.where(bottom == 0, at_zero, top / bottom * self.power)
+            return top / self._inner(bottom) * slope
+        return torch.where(bottom == 0, slope * bottom.pow(self.power - 1), top / bottom * self.power)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.power * self.scale == 0:
@@ -144,6 +155,7 @@ class Log(Rounded):
 
     bottom[0]  any shape
     top[0]     the same shape
+    In place, the gradient is Caffe's too, the square of the slope: see :func:`over_its_diff`.
     Caffe: src/caffe/layers/log_layer.cpp
     """
 
@@ -167,7 +179,7 @@ class Log(Rounded):
         return functions.log(x * self.scale + self.shift) * self.base_scale
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        return diff * (libm.power(bottom * self.scale + self.shift, -1) * self.slope)
+        return over_its_diff(bottom, top, diff, libm.power(bottom * self.scale + self.shift, -1) * self.slope)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         logarithm = graph.node("Log", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))

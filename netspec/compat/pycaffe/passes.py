@@ -28,6 +28,7 @@ from netspec.compat.pycaffe.tapes import (
     parameters,
     places_of,
     storages,
+    undisturbed,
 )
 from netspec.exact.blas import one_thread
 from netspec.layers.contract.base import Layer
@@ -79,6 +80,8 @@ class Passes:
         self._kept = [layer.filled_once() if isinstance(layer, Constant) else () for layer in self._layers]
         self._records = [self._is_recorded(i) for i in range(len(self._layers))]
         self._has_kernels = [self._can_bind(i) for i in range(len(self._layers))]
+        self._keeps = ["kept" in gradient_reads(layer) and self._is_asked(i) for i, layer in enumerate(self._layers)]
+        self._read: list[torch.Tensor | None] = [None] * len(self._layers)  # what those read in their last pass
         for i in range(len(self._layers)):
             self._set_up(i)
         self._prepares = self._can_prepare()
@@ -141,10 +144,14 @@ class Passes:
 
     def _is_recorded(self, i: int) -> bool:
         """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
-        layer, plan = self._layers[i], self.net.backward_plan
+        layer = self._layers[i]
         from_memory = isinstance(layer, Python) or layer.shares or gradient_reads(layer)
-        wanted = any(plan.bottoms[i]) or any(blob.requires_grad for blob in layer.blobs)
-        return plan.layers[i] and wanted and not from_memory
+        return self._is_asked(i) and not from_memory
+
+    def _is_asked(self, i: int) -> bool:
+        """Return whether a gradient of layer ``i`` is asked for, of a bottom or of a learnable blob."""
+        plan = self.net.backward_plan
+        return plan.layers[i] and (any(plan.bottoms[i]) or any(blob.requires_grad for blob in self._layers[i].blobs))
 
     def _can_bind(self, i: int) -> bool:
         """Return whether layer ``i`` has kernels of its own for what autograd would watch."""
@@ -218,6 +225,7 @@ class Passes:
             self.net.prepared is not None
             and self.net.device.type == "cpu"
             and not any(self._records)
+            and not any(self._keeps)
             and not any(self._kept)
             and not any(isinstance(layer, Python) for layer in self._layers)
             and AUTOMATIC not in self.names
@@ -325,6 +333,8 @@ class Passes:
             values, made = tape.leaves, tape.made
         else:
             values = [blob.data_memory.tensor(blob.shape) for blob in bottoms]
+            if self._keeps[i]:
+                self._read[i] = values[0].clone()
             made = layer.run(*values)
         kept = self._kept[i] or [None] * len(made)
         taken = storages(values or list(layer.blobs))
@@ -367,11 +377,13 @@ class Passes:
     def _tape(self, i: int) -> Tape:
         """Return the record of the last forward pass of layer ``i``, its bottoms' values as they are now in memory.
 
-        A layer that has not run, or on other shapes, runs for it.
+        A layer that has not run, or on other shapes, runs for it, and leaves no trace.
         """
         tape, bottoms = self._tapes[i], self.bottoms[i]
         if tape is None or any(leaf.shape != blob.shape for leaf, blob in zip(tape.leaves, bottoms, strict=True)):
-            return self._record(i)
+            self._layers[i].fit([blob.shape for blob in bottoms])
+            with undisturbed(self._layers[i]):
+                return self._record(i)
         for leaf, holder, blob in zip(tape.leaves, tape.holders, bottoms, strict=True):
             kept = self._is_in_place(i, blob) or blob.data_memory.holder(blob.count) is holder
             if not kept:
@@ -396,8 +408,14 @@ class Passes:
         diffs = [top.diff_memory.tensor(top.shape) for top in tops]
         if gradient_reads(layer):
             if wanted[0]:
-                bottom, top = (blob.data_memory.tensor(blob.shape) for blob in (bottoms[0], tops[0]))
+                top = tops[0].data_memory.tensor(tops[0].shape)
+                in_place = bottoms[0] is tops[0]
+                bottom = top if in_place else bottoms[0].data_memory.tensor(bottoms[0].shape)
+                if self._keeps[i] and (read := self._read[i]) is not None and read.shape == bottom.shape:
+                    bottom = read
                 bottoms[0].diff_memory.put(gradient_from_memory(layer, bottom, top, diffs[0]))
+            return
+        if not self._is_asked(i):
             return
         tape = self._tape(i)
         found = tape.backward(*diffs)

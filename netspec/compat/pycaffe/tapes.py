@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +48,20 @@ def by_autograd(
     for leaf in leaves:
         leaf.grad = None
     return found
+
+
+@contextmanager
+def undisturbed(layer: Layer) -> Iterator[None]:
+    """Let a layer run within the block and leave no trace: not in its blobs, in what it remembers, nor in draws."""
+    blobs, remembered = [blob.detach().clone() for blob in layer.blobs], dict(vars(layer))
+    with layer.context.random.undisturbed():
+        try:
+            yield
+        finally:
+            vars(layer).update(remembered)
+            with torch.no_grad():
+                for blob, before in zip(layer.blobs, blobs, strict=True):
+                    blob.copy_(before)
 
 
 def places_of(layer: Layer) -> list[Any]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import torch
@@ -57,6 +58,17 @@ class Random:
             self._generators[key].manual_seed(self.seed if self._part is None else derived(self.seed, self._part))
             self._begun.add(key)
         return self._generators[key]
+
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Let draws within the block be drawn again after it."""
+        states, begun = {key: each.get_state() for key, each in self._generators.items()}, set(self._begun)
+        try:
+            yield
+        finally:
+            self._begun = begun
+            for key, state in states.items():
+                self._generators[key].set_state(state)
 
 
 @dataclass(frozen=True, slots=True)

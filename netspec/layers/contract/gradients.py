@@ -15,10 +15,13 @@ NOTHING: frozenset[str] = frozenset()
 class OwnGradient(Protocol):
     """A layer of one bottom and top whose gradient reads memory: see netspec/run/in_place.py."""
 
-    gradient_reads: frozenset[str]  # of "bottom", "sign" (of it), "top"
+    gradient_reads: frozenset[str]  # of "bottom", "sign" (of it), "top", "kept" (the bottom of the forward pass)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """Return the bottom's gradient as Caffe computes it, step by step, from the data in memory at backward."""
+        """Return the bottom's gradient as Caffe computes it, step by step, from the data in memory at backward.
+
+        A layer that works in place gets one tensor as its bottom and its top.
+        """
         ...
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -145,6 +146,95 @@ def test_in_place_layers_keep_what_their_gradient_needs(net_of: Callable[..., ca
         np.testing.assert_allclose(net.params["scale"][0].diff, 2 * data.sum((0, 2, 3)), rtol=1e-4)
         assert (net.blobs["data"].diff == 6).all()
     del views
+
+
+def _in_place(settings: str, phase: int, net_of: Callable[..., caffe.Net]) -> tuple[np.ndarray, ...]:
+    """Return what a layer reads, what it makes of it in place, the diff given to it, and the one it gives."""
+    text = 'force_backward: true layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 4 dim: 3 } } }'
+    text += 'layer { name: "twice" type: "Scale" bottom: "x" top: "y" scale_param { filler { value: 2 } } }'
+    text += f'layer {{ name: "it" bottom: "y" top: "y" {settings} }}'
+    net = net_of(text, phase)
+    view = net.blobs["y"].data if phase == caffe.TRAIN else None
+    for seed in range(2):
+        x, diff = np.random.default_rng(seed).standard_normal((2, 4, 3)).astype(np.float32)
+        y = net.forward(x=x)["y"].copy()
+        net.blobs["y"].diff[...] = diff
+        net.backward()
+    del view
+    return 2 * x, y, diff, net.blobs["x"].diff / 2
+
+
+def _gate(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+IN_PLACE = {
+    'type: "ReLU" relu_param { negative_slope: 0.1 }': lambda x, y, d: d * np.where(x > 0, 1, 0.1),
+    'type: "PReLU"': lambda x, y, d: d * np.where(x > 0, 1, 0.25),
+    'type: "ELU"': lambda x, y, d: d * np.where(x > 0, 1, 1 + y),
+    'type: "Sigmoid"': lambda x, y, d: d * y * (1 - y),
+    'type: "TanH"': lambda x, y, d: d * (1 - y * y),
+    'type: "Exp"': lambda x, y, d: d * y,
+    'type: "Swish" swish_param { beta: 2 }': lambda x, y, d: d * (2 * y + _gate(2 * x) * (1 - 2 * y)),
+    'type: "Bias" bias_param { filler { value: 3 } }': lambda x, y, d: d,
+    'type: "Scale" scale_param { bias_term: true filler { value: 3 } }': lambda x, y, d: 3 * d,
+    'type: "Dropout"': lambda x, y, d: d * np.divide(y, x, out=np.ones_like(x), where=x != 0),
+    'type: "Softmax"': lambda x, y, d: y * (d - (d * y).sum(1, keepdims=True)),
+    'type: "BatchNorm" batch_norm_param { use_global_stats: true }': lambda x, y, d: d / np.float32(1e-5) ** 0.5,
+    # What these read is overwritten; Power and Log lose the diff as well, since they write their slope over it.
+    'type: "BNLL"': lambda x, y, d: d * _gate(y),
+    'type: "Clip" clip_param { min: -1 max: 1 }': lambda x, y, d: d,
+    'type: "Power" power_param { scale: 3 }': lambda x, y, d: np.full_like(x, 9),
+    'type: "Power" power_param { power: 2 scale: 3 shift: 1 }': lambda x, y, d: (6 * (1 + 3 * y)) ** 2,
+    'type: "Power" power_param { power: 3 shift: 9 }': lambda x, y, d: (3 * y / (y + 9)) ** 2,
+    'type: "Log" log_param { shift: 9 }': lambda x, y, d: (y + 9) ** -2.0,
+}
+
+
+@pytest.mark.parametrize("phase", [caffe.TRAIN, caffe.TEST])
+@pytest.mark.parametrize("settings", IN_PLACE)
+def test_in_place_layers_have_caffes_gradients(net_of: Callable[..., caffe.Net], settings: str, phase: int) -> None:
+    x, y, diff, found = _in_place(settings, phase, net_of)
+    np.testing.assert_allclose(found, IN_PLACE[settings](x, y, diff), rtol=1e-4, atol=1e-5)
+
+
+DRAWN = 'dummy_data_param { shape { dim: 1 dim: 2 } data_filler { type: "gaussian" } } }'
+DRAWS = f'layer {{ name: "d" type: "DummyData" top: "x" {DRAWN}'
+FC = 'layer {{ name: "ip" type: "InnerProduct" bottom: "x" top: "y" inner_product_param {{ num_output: {} }} }}'.format
+READS = 'layer { name: "d" type: "HDF5Data" top: "x" hdf5_data_param { source: "list" batch_size: 1 } }'
+
+
+@pytest.mark.parametrize(
+    "net",
+    [
+        "force_backward: true " + READS + FC(1),
+        DRAWS + FC(2) + 'layer { name: "bn" type: "BatchNorm" bottom: "y" top: "y" propagate_down: false }',
+        "force_backward: true " + DRAWS + 'layer { name: "drop" type: "Dropout" bottom: "x" top: "y" }',
+    ],
+)
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_backward_pass_reads_draws_and_keeps_nothing(net_of: Callable[..., caffe.Net], net: str, alone: bool) -> None:
+    """Also where it comes before a forward pass, when autograd has not watched any."""
+    with h5py.File("x.h5", "w") as file:
+        file["x"] = np.arange(1, 9, dtype=np.float32).reshape(8, 1)
+    Path("list").write_text("x.h5")
+    text = net + 'layer { name: "r" type: "Reduction" bottom: "y" top: "r" loss_weight: 1 }'
+    nets = []
+    for _ in range(2):
+        caffe.set_random_seed(5)
+        nets.append(net_of(text, caffe.TRAIN))
+    one, other = nets
+    if alone:
+        other.backward()
+    for _ in range(3):
+        one.forward()
+        other.forward()
+        other.backward()
+        for name in ("x", "y"):
+            np.testing.assert_array_equal(one.blobs[name].data, other.blobs[name].data)
+    for mine, others in zip(one.params.values(), other.params.values(), strict=True):
+        for a, b in zip(mine, others, strict=True):
+            np.testing.assert_array_equal(a.data, b.data)
 
 
 def test_split_copies_and_reshaped_blobs_lie_in_one_memory(net_of: Callable[..., caffe.Net]) -> None:
