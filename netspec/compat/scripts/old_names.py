@@ -21,6 +21,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 from typing import Any
 
+from netspec.compat.scripts.as_python2 import py2_bytes
 from netspec.terminal.commands import VARIABLE
 
 
@@ -111,6 +112,8 @@ def _numpy(np: Any) -> None:
     _give(np, "asfarray", lambda a, dtype=np.float64: np.asarray(a, dtype))
     _give(np, "typeDict", getattr(np, "sctypeDict", {}))
     _give(np, "msort", lambda a: np.sort(a, axis=0))
+    if np.__version__ >= "2":
+        np.set_printoptions(legacy="1.25")  # a number is shown as 0.5, not as np.float64(0.5)
     np.fromstring = _fromstring(np)
     _let_threshold_be_nan(np)
 
@@ -164,8 +167,7 @@ def _fromstring(np: Any) -> Callable[..., Any]:
     def fromstring(string: Any, dtype: Any = float, count: int = -1, *, sep: str = "", **named: Any) -> Any:
         if sep:
             return text(string, dtype, count, sep=sep, **named)
-        data = string.encode("latin-1") if isinstance(string, str) else string
-        return np.frombuffer(data, dtype, count).copy()
+        return np.frombuffer(py2_bytes(string), dtype, count).copy()
 
     return fromstring
 
@@ -282,11 +284,20 @@ def _skimage_color(color: Any) -> None:
 
 
 def _lmdb(lmdb: Any) -> None:
-    """Let keys be text, as they were in Python 2; only bytes are taken today."""
+    """Let keys be text, and an environment be opened twice in a process, as both were in Python 2."""
     whole, transaction = lmdb.open, lmdb.Transaction
+    opened: dict[str, Any] = {}
 
-    def open(*arguments: Any, **named: Any) -> _Environment:
-        return _Environment(whole(*arguments, **named))
+    def open(path: Any, *arguments: Any, **named: Any) -> _Environment:
+        place = os.path.realpath(path)
+        try:
+            real = whole(path, *arguments, **named)
+        except lmdb.Error as fault:
+            if "already open" not in str(fault) or place not in opened:
+                raise
+            return opened[place].again()
+        opened[place] = _Environment(real)
+        return opened[place]
 
     def begin(env: Any, *arguments: Any, **named: Any) -> _Transaction:
         return _Transaction(transaction(getattr(env, "real", env), *arguments, **named))
@@ -312,6 +323,26 @@ class _Proxy:
 
 
 class _Environment(_Proxy):
+    def __init__(self, real: Any, users: list[int] | None = None) -> None:
+        super().__init__(real)
+        self.users = users or [0]  # how many have it open, shared by them
+        self.users[0] += 1
+        self.is_open = True
+
+    def again(self) -> _Environment:
+        return _Environment(self.real, self.users)
+
+    def close(self) -> None:
+        self.users[0] -= self.is_open
+        self.is_open = False
+        if not self.users[0]:
+            self.real.close()
+
+    __del__ = close
+
+    def __exit__(self, *fault: Any) -> None:
+        self.close()
+
     def begin(self, *arguments: Any, **named: Any) -> _Transaction:
         return _Transaction(self.real.begin(*arguments, **named))
 
@@ -334,6 +365,29 @@ def _bytes(text: Any) -> Any:
 # ---- Python ----
 
 
+def _string(string: Any) -> None:
+    """Give the functions that became methods, and letters by their old names."""
+    methods = "capitalize center count expandtabs find index ljust lower lstrip replace rfind rindex rjust rsplit"
+    for name in (*methods.split(), *("rstrip", "split", "strip", "swapcase", "title", "translate", "upper", "zfill")):
+        _give(string, name, getattr(str, name))
+    _give(string, "join", lambda words, between=" ": between.join(words))
+    _give(string, "joinfields", string.join)
+    _give(string, "splitfields", string.split)
+    _give(string, "maketrans", str.maketrans)
+    for name in ("letters", "lowercase", "uppercase"):
+        _give(string, name, getattr(string, f"ascii_{name}"))
+    for name, kind in (("atof", float), ("atoi", int), ("atol", int)):
+        _give(string, name, kind)
+
+
+def _pickle(pickle: Any) -> None:
+    """Let texts of Python 2, with any bytes in them, be read, and files of text be read and written."""
+    load, loads, dump = pickle.load, pickle.loads, pickle.dump
+    pickle.load = lambda file, **named: load(getattr(file, "buffer", file), **{"encoding": "latin1", **named})
+    pickle.loads = lambda data, **named: loads(py2_bytes(data), **{"encoding": "latin1", **named})
+    pickle.dump = lambda obj, file, *form, **named: dump(obj, getattr(file, "buffer", file), *form, **named)
+
+
 def _unittest_case(case: Any) -> None:
     renamed = {
         **{"assertEquals": "assertEqual", "assertNotEquals": "assertNotEqual", "assert_": "assertTrue"},
@@ -353,4 +407,7 @@ _PATCHES: dict[str, Callable[[Any], None]] = {
     "skimage.color": _skimage_color,
     "lmdb": _lmdb,
     "unittest.case": _unittest_case,
+    "string": _string,
+    "pickle": _pickle,
 }
+PACKAGES = frozenset(name.partition(".")[0] for name in _PATCHES)

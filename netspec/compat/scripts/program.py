@@ -85,6 +85,7 @@ def _execute(data: bytes, main: ModuleType, path: str, reader: sources.Reader) -
         _show(fault, None)
         raise SystemExit(1) from None
     try:
+        main.__dict__["__builtins__"] = sources.builtins_for(path)
         exec(code, main.__dict__)
     except SystemExit:
         raise

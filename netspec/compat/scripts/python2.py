@@ -1,8 +1,9 @@
 """Python 2: how to recognize it, and how to make it Python 3 that computes the same.
 
 The translation is 2to3's (lib2to3 where Python still has it, else fissix, its fork), and adds what that leaves out:
-the quotient of whole numbers is rounded down, ``round`` gives a float and rounds halves away from zero, ``file`` opens
-(netspec/compat/scripts/as_python2.py).
+the quotient of whole numbers is rounded down, ``round`` gives a float and rounds halves away from zero, files and
+``StringIO`` take and give text and bytes (netspec/compat/scripts/as_python2.py). Imports of a package's own modules by
+bare name are left to the run, since only that knows what is imported as a package.
 """
 
 from __future__ import annotations
@@ -66,6 +67,16 @@ def is_python3(data: bytes, path: str) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return _has_python3(ast.parse(data, path))
+
+
+def imported_names(data: bytes, path: str) -> set[str]:
+    """Return the first names of the modules that a file of Python 3 imports, but for relative imports."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        nodes = list(ast.walk(ast.parse(data, path)))
+    whole = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    parts = [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom) and not node.level]
+    return {name.partition(".")[0] for name in (*whole, *parts)}
 
 
 def _has_python3(tree: ast.AST) -> bool:
@@ -149,6 +160,10 @@ def _name(node: ast.AST) -> str:
 # ---- Translating ----
 
 _HELPERS = ("cmp", "file", "open", "round")  # builtins that are others in Python 2
+_HOME = "netspec.compat.scripts.as_python2"
+_ALONE = "as_python2"  # by this name a translation that needs no netspec imports from itself
+_FILES = ("file", "open", _ALONE)  # what needs the functions and classes of files
+_BYTES_IN_TEXT = re.compile(r"(?<!\\)((?:\\\\)*)\\x([89a-fA-F][0-9a-fA-F])")
 
 
 @functools.cache
@@ -166,10 +181,12 @@ def translated(data: bytes, path: str, alone: bool = False) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # lib2to3 says that it will go
-            tree = _tool(package).refactor_string(text, path)
+            tree = _tool(package, _ALONE if alone else _HOME).refactor_string(text, path)
     except Exception as fault:  # each part of 2to3 has errors of its own
         raise SyntaxError(f"this is neither Python 3 nor Python 2: {fault}") from None
     helpers = [] if "division" in tree.future_features else _floor_quotients(tree, package)
+    if "unicode_literals" not in tree.future_features:
+        _mark_bytes(tree, package)
     helpers += _used_builtins(tree)
     return _with_helpers(str(tree), helpers, alone)
 
@@ -181,9 +198,15 @@ def _translator() -> str:
 
 
 @functools.cache
-def _tool(package: str) -> Any:
+def _tool(package: str, home: str) -> Any:
+    """Return 2to3, which takes files in memory from the module ``home``."""
     refactor = importlib.import_module(f"{package}.refactor")
-    return refactor.RefactoringTool(refactor.get_fixers_from_package(f"{package}.fixes"))
+    fixers = refactor.get_fixers_from_package(f"{package}.fixes")
+    tool = refactor.RefactoringTool([name for name in fixers if not name.endswith(".fix_import")])
+    for fixer in (*tool.pre_order, *tool.post_order):
+        if type(fixer).__name__ == "FixImports":
+            fixer.mapping = {**fixer.mapping, "StringIO": home, "cStringIO": home}
+    return tool
 
 
 def _encoding(data: bytes) -> str:
@@ -252,6 +275,14 @@ def _floor_quotients(tree: Any, package: str) -> list[str]:
     return sorted(used)
 
 
+def _mark_bytes(tree: Any, package: str) -> None:
+    """Write bytes above 127 in strings as those of a file are read: they are bytes again where those are due."""
+    kind = importlib.import_module(f"{package}.pgen2.token").STRING
+    for leaf in tree.leaves():
+        if leaf.type == kind and leaf.value[0] in "\"'" and "\\x" in leaf.value:
+            leaf.value = _BYTES_IN_TEXT.sub(r"\1\\udc\2", leaf.value)
+
+
 def _is_float(node: Any) -> bool:
     """Say whether an operand is a float for certain: 2.0, or float(x)."""
     text = str(node).strip()
@@ -262,22 +293,26 @@ def _is_float(node: Any) -> bool:
 
 def _used_builtins(tree: Any) -> list[str]:
     """Return which of the builtins that are others in Python 2 are used; x.open and file=f are no use of them."""
-    named = (leaf for leaf in tree.leaves() if leaf.value in _HELPERS)
-    return sorted({leaf.value for leaf in named if str(leaf.prev_sibling) != "." and str(leaf.next_sibling) != "="})
+    named = (leaf for leaf in tree.leaves() if leaf.value in (*_HELPERS, _ALONE))
+    used = {leaf.value for leaf in named if str(leaf.prev_sibling) != "." and str(leaf.next_sibling) != "="}
+    return sorted(used)
 
 
 def _with_helpers(text: str, helpers: list[str], alone: bool) -> str:
     """Return a text with helpers, behind the docstring and the imports from __future__."""
     if not helpers:
         return text
-    line = f"from netspec.compat.scripts.as_python2 import {', '.join(helpers)}  # as Python 2 has it\n"
+    line = f"from {_HOME} import {', '.join(helpers)}  # as Python 2 has it\n"
     if alone:
-        functions = {getattr(as_python2, name) for name in helpers}
+        named = {name for name in helpers if name not in _FILES}
         if any(name.startswith("py2_") for name in helpers):
-            functions.add(as_python2.py2_is_whole)
-        parts = [inspect.getsource(function) for function in sorted(functions, key=lambda function: function.__name__)]
-        line = "\n\n".join(["import builtins\nimport math\nimport numbers\n", *parts])
-        line += "\n\nfile = open\n" if "file" in helpers else "\n\n"
+            named.add("py2_is_whole")
+        if named != set(helpers) - {"py2_is_whole"}:
+            named |= {"py2_bytes", "py2_text", "Py2Bytes", "file", "StringIO", "open"}
+        functions = [value for name, value in vars(as_python2).items() if name in named]  # in the order of the file
+        parts = [inspect.getsource(function) for function in functions]
+        line = "\n\n".join(["import builtins\nimport io\nimport math\nimport numbers\nimport sys\n", *parts])
+        line += f"\n\nsys.modules[{_ALONE!r}] = sys.modules[__name__]\n\n" if _ALONE in helpers else "\n\n"
     last = 0
     for node in ast.parse(text).body:
         docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and last == 0

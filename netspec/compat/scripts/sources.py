@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import ast
 import builtins
+import functools
 import importlib.abc
 import linecache
 import os
+import re
 import sys
 import sysconfig
 import warnings
@@ -20,13 +22,14 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
-from netspec.compat.scripts import python2
+from netspec.compat.scripts import mended, old_names, python2
+from netspec.compat.scripts.mended import MENDED
 from netspec.errors import SpecError, Where
 from netspec.files.whole_file import write_whole
 
 MAIN = "__netspec_main__"  # by this name a worker imports the program
 RENAMED_METHODS = {"tostring": "tobytes"}  # of arrays, called without arguments
-_FORMAT, _CALL = "__netspec_format__", "__netspec_call__"  # builtins of programs
+_LOOK_AT_THEIR_CALLER = ("namedtuple", "Enum", "_getframe", "warn")  # a call in between would be it
 
 
 def write_translation(path: str, out: Path, always: bool) -> None:
@@ -69,8 +72,8 @@ class Reader(importlib.abc.MetaPathFinder):
         ours = Path(__file__).parents[3]
         others = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
         self._others = (*others, *(str(ours / name) for name in ("netspec", "loopclosure", "lmdb_build")))
-        setattr(builtins, _FORMAT, _format)
-        setattr(builtins, _CALL, _call)
+        for name, function in mended.BUILTINS.items():
+            setattr(builtins, MENDED.format(name), function)
         sys.meta_path.insert(0, self)
 
     def main_code(self, data: bytes, path: str) -> CodeType:
@@ -83,10 +86,11 @@ class Reader(importlib.abc.MetaPathFinder):
         kept = "--write-py3 FILE writes the translation"
         return self._code(data, path, self.python2, f"is Python 2, and runs translated to Python 3; {kept}")
 
-    def module_code(self, data: bytes, path: str) -> CodeType:
-        """Return the code of a module of the program. Raises as :meth:`main_code`."""
+    def module_code(self, data: bytes, path: str, package: str) -> CodeType:
+        """Return the code of a module of the program, in a package unless that is "". Raises as :meth:`main_code`."""
         is_python2 = python2.is_python2(data, path) or (
-            self.python2 and self._is_neighbor(path) and not python2.is_python3(data, path)
+            ((self.python2 and self._is_neighbor(path)) or _imports_beside(data, path, package))
+            and not python2.is_python3(data, path)
         )
         return self._code(data, path, is_python2, "is Python 2 too")
 
@@ -95,7 +99,8 @@ class Reader(importlib.abc.MetaPathFinder):
             return _compiled(data, path)
         if not self.quiet:
             print(f"netspec run: {path} {said}", file=sys.stderr)
-        return _compiled(python2.translated(data, path), path)
+        mended.TRANSLATED.add(path)
+        return _compiled(python2.translated(data, path), path, is_python2=True)
 
     def _is_neighbor(self, path: str) -> bool:
         folders = {self.folder, *({os.path.realpath(entry) for entry in sys.path} - self.given)}
@@ -109,12 +114,52 @@ class Reader(importlib.abc.MetaPathFinder):
         spec = PathFinder.find_spec(fullname, path)
         if spec is None or type(spec.loader) is not SourceFileLoader or not self._is_programs(spec):
             return None
-        spec.loader = _Loader(fullname, str(spec.origin), self.module_code)
+        package = fullname if spec.submodule_search_locations else fullname.rpartition(".")[0]
+        read = functools.partial(self.module_code, package=package)
+        spec.loader = _Loader(fullname, str(spec.origin), read)
         return spec
 
     def _is_programs(self, spec: ModuleSpec) -> bool:
-        origin = str(spec.origin)
-        return not origin.startswith(self._others) and not {"site-packages", "dist-packages"} & set(Path(origin).parts)
+        origin, top = Path(str(spec.origin)), spec.name.partition(".")[0]
+        folder = next((place.parent for place in origin.parents if place.name == top), origin.parent)
+        return not (
+            top in old_names.PACKAGES
+            or str(origin).startswith(self._others)
+            or {"site-packages", "dist-packages"} & set(origin.parts)
+            or {top, f"{top}.py"} & _installed(folder)
+        )
+
+
+@functools.cache
+def _installed(folder: Path) -> frozenset[str]:
+    """Return the names that pip has put into a folder (pip install --target)."""
+    records = (record.read_text("utf-8", "replace") for record in folder.glob("*.dist-info/RECORD"))
+    return frozenset(re.split("[/,]", line, maxsplit=1)[0] for text in records for line in text.splitlines())
+
+
+def _imports_beside(data: bytes, path: str, package: str) -> bool:
+    """Say whether a module of a package imports another by a bare name that nothing else has, as in Python 2."""
+    folder = Path(path).parent
+    beside = {name for name in python2.imported_names(data, path) if package and _is_in(name, folder)}
+    return any(name not in sys.modules and PathFinder.find_spec(name) is None for name in beside)
+
+
+def _is_in(name: str, folder: Path) -> bool:
+    return (folder / f"{name}.py").is_file() or (folder / name / "__init__.py").is_file()
+
+
+def builtins_for(path: str) -> Any:
+    """Return the builtins of a module: in Python 2 an import looks beside the module first, if that is in a package."""
+    return {**vars(builtins), "__import__": _import} if path in mended.TRANSLATED else builtins
+
+
+def _import(name: str, names: Any = None, own: Any = None, wanted: Sequence[str] = (), level: int = 0) -> Any:
+    package = (names or {}).get("__package__")
+    if level == 0 and package and "absolute_import" not in names:
+        top = f"{package}.{name.partition('.')[0]}"
+        places = getattr(sys.modules.get(package), "__path__", None)
+        level = int(top in sys.modules or (places is not None and PathFinder.find_spec(top, places) is not None))
+    return builtins.__import__(name, names, own, wanted, level)
 
 
 class _Loader(SourceFileLoader):
@@ -127,68 +172,70 @@ class _Loader(SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType:
         return self._code(self.get_data(self.path), self.path)
 
+    def exec_module(self, module: ModuleType) -> None:
+        code = self.get_code(module.__name__)
+        vars(module)["__builtins__"] = builtins_for(self.path)
+        exec(code, vars(module))
 
-def _compiled(source: str | bytes, path: str) -> CodeType:
+
+def _compiled(source: str | bytes, path: str, is_python2: bool = False) -> CodeType:
     """Return the code of Python 3; the lines of a text that is not in the file are known to tracebacks."""
     if isinstance(source, str):
         linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of escapes in strings and the like: the script is old
-        tree = ast.fix_missing_locations(_GivingBack().visit(ast.parse(source, path)))
+        tree = ast.fix_missing_locations(_GivingBack(is_python2).visit(ast.parse(source, path)))
         return compile(tree, path, "exec", dont_inherit=True)
 
 
 class _GivingBack(ast.NodeTransformer):
-    """Writes calls for what arrays could do: ``a.tostring()``, ``"%f" % a`` and ``float(a)`` of one element."""
+    """Writes calls for what arrays could do: ``a.tostring()``, ``"%f" % a`` and ``float(a)`` of one element.
+
+    In Python 2 also for what text, bytes and values of unlike types could do: see netspec/compat/scripts/mended.py.
+    """
+
+    def __init__(self, is_python2: bool) -> None:
+        self.is_python2 = is_python2
+        self.functions = {"float", "int"} | ({"bytearray", "sorted", "print"} if is_python2 else set())
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.AST:
+        if self.is_python2 and node.module in ("struct", "hashlib", "base64", "zlib", "binascii"):
+            self.functions.update(alias.asname or alias.name for alias in node.names)
+        return node
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
         function = node.func
-        if isinstance(function, ast.Attribute) and not node.args and not node.keywords:
-            function.attr = RENAMED_METHODS.get(function.attr, function.attr)
-        named = isinstance(function, ast.Name) and function.id in ("float", "int")
-        of_math = isinstance(function, ast.Attribute) and getattr(function.value, "id", "") == "math"
-        takes_one = len(node.args) == 1 and not node.keywords and not isinstance(node.args[0], ast.Starred)
-        if (named or of_math) and takes_one:
-            return ast.copy_location(_calling(_CALL, function, node.args[0]), node)
+        if isinstance(function, ast.Attribute):
+            if not node.args and not node.keywords:
+                function.attr = RENAMED_METHODS.get(function.attr, function.attr)
+            if self.is_python2 and function.attr in ("decode", "encode") and not node.keywords:
+                return ast.copy_location(_calling(MENDED.format(function.attr), function.value, *node.args), node)
+            of_math = getattr(function.value, "id", "") == "math"
+            mended = of_math or (self.is_python2 and function.attr not in _LOOK_AT_THEIR_CALLER)
+        else:
+            mended = isinstance(function, ast.Name) and function.id in self.functions
+        if mended and (node.args or node.keywords):
+            call = ast.Call(ast.Name(MENDED.format("call"), ast.Load()), [function, *node.args], node.keywords)
+            return ast.copy_location(call, node)
         return node
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
         self.generic_visit(node)
         text = isinstance(node.left, ast.Constant) and isinstance(node.left.value, str)
         if text and isinstance(node.op, ast.Mod):
-            return ast.copy_location(_calling(_FORMAT, node.left, node.right), node)
+            return ast.copy_location(_calling(MENDED.format("format"), node.left, node.right), node)
+        return node
+
+    def visit_Compare(self, node: ast.Compare) -> ast.AST:
+        self.generic_visit(node)
+        name = type(node.ops[0]).__name__.lower()
+        if self.is_python2 and len(node.ops) == 1 and name in ("lt", "lte", "gt", "gte"):
+            return ast.copy_location(
+                _calling(MENDED.format(name.replace("te", "e")), node.left, node.comparators[0]), node
+            )
         return node
 
 
 def _calling(name: str, *arguments: ast.expr) -> ast.Call:
     return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
-
-
-def _format(text: str, values: Any) -> str:
-    """Return text % values; arrays of one element are numbers, as they were before NumPy 2.4."""
-    try:
-        return text % values
-    except TypeError:
-        given = values if isinstance(values, tuple) else (values,)
-        numbers = tuple(map(_number, given))
-        if all(number is value for number, value in zip(numbers, given, strict=True)):
-            raise
-        return text % numbers
-
-
-def _call(function: Callable[[Any], Any], value: Any) -> Any:
-    """Return function(value) likewise."""
-    try:
-        return function(value)
-    except TypeError:
-        number = _number(value)
-        if number is value:
-            raise
-        return function(number)
-
-
-def _number(value: Any) -> Any:
-    """Return the element of an array that has one; everything else as it is."""
-    is_array = hasattr(value, "dtype") and getattr(value, "ndim", 0) > 0 and value.size == 1
-    return value.item() if is_array else value

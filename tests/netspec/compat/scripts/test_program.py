@@ -313,3 +313,14 @@ except ImportError:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout == "gone\n", done.stderr
+
+
+def test_a_numpy_that_pip_put_beside_the_program_gets_its_names(run: Run, tmp_path: Path) -> None:
+    files = {
+        "lib/numpy/__init__.py": "__version__, inf, float64 = '1.0', 1e999, 0\ndef fromstring(): pass\n"
+        "set_printoptions = fromstring\n",
+        "lib/other/__init__.py": "def half(n): return n / 2",
+        "lib/other-1.0.dist-info/RECORD": "other/__init__.py,,\n",
+    }
+    script = "import sys; sys.path.insert(0, 'lib')\nimport numpy, other\nprint numpy.float, other.half(3)"
+    assert run("s.py", s=script, files=files).stdout == "<class 'float'> 1.5\n"

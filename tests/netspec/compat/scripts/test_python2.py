@@ -226,3 +226,102 @@ def test_rounding_and_comparing() -> None:
     assert (round(1.25, 1), round(3)) == (1.3, 3.0)
     assert isinstance(round(3), float)
     assert (cmp(1, 2), cmp("b", "a"), cmp(1, 1)) == (-1, 1, 0)
+
+
+AS_PYTHON_2 = {
+    "binary file as text": """
+from caffe.proto import caffe_pb2 as c
+b = c.BlobProto(data=[-1.0, 2e9])
+open('m','w').write(b.SerializeToString())
+b.ParseFromString(open('m').read())
+print len(b.data)
+=2""",
+    "text as bytes": """
+import hashlib, struct, base64
+from struct import unpack
+open('t','wb').write('abcd')
+t = open('t').read()
+print struct.unpack('<I', t)[0] == unpack('<I', t)[0], hashlib.md5(t).hexdigest()[:4],
+print base64.b64encode(t), bytearray(t)[0], t.encode('hex'), t.decode('utf-8')
+=True e2fc YWJjZA== 97 61626364 abcd""",
+    "StringIO is both": """
+import cStringIO, StringIO, csv, zipfile
+f = cStringIO.StringIO('\\xff\\xd8x'); g = StringIO.StringIO()
+print >>g, 'a,b'
+g.seek(0); z = zipfile.ZipFile(cStringIO.StringIO(), 'w'); z.writestr('n', 'x')
+print list(csv.reader(g)), f.getvalue().find('\\xd8'), len(f.read(2)), z.namelist()
+=[['a', 'b']] 1 2 ['n']""",
+    "images": """
+from StringIO import StringIO
+import numpy as np, PIL.Image
+f = StringIO()
+PIL.Image.fromarray(np.zeros((4, 5, 3), np.uint8)).save(f, 'png'); open('i.png', 'w').write(f.getvalue())
+print PIL.Image.open(open('i.png')).size, PIL.Image.open(StringIO(open('i.png').read())).size, 'PNG' in f.getvalue()
+=(5, 4) (5, 4) True""",
+    "pickles": """
+import cPickle as pickle
+pickle.dump({'a': 1}, open('p', 'w')); print pickle.load(open('p')),
+open('q', 'w').write('S"\\xe9"\\n.'); print len(pickle.load(open('q', 'rb')))
+={'a': 1} 1""",
+    "csv in bytes": """
+import csv
+open('c', 'wb').write('1,2'); print list(csv.reader(open('c', 'rb')))
+=[['1', '2']]""",
+    "string": """
+import string
+print string.replace('a b', ' ', '-'), string.join(['a', 'b'], '-'), string.letters[:2]
+=a-b a-b ab""",
+    "order": "print 0.5 > None, None < -1, 'a' > 3, None >= 0\n=True True True False",
+    "sort": """
+a = [3, 1, 2]; a.sort(cmp=lambda x, y: y - x)
+print a, sorted(a, cmp), sorted(a, cmp=cmp)
+=[3, 2, 1] [1, 2, 3] [1, 2, 3]""",
+    "format": "print '{:>8},{:4},'.format((1, 2), None)\n=  (1, 2),None,",
+    "numbers are shown": "import numpy as np\nprint [np.float64(0.5), np.float32(2)]\n=[0.5, 2.0]",
+    "a call in a class": "class A:\n    def f(self): return len('{:6}'.format(None))\nprint A().f()\n=6",
+    "lmdb opened twice": """
+import lmdb
+a = lmdb.open('db'); b = lmdb.open('db', readonly=True)
+with a.begin(write=True) as t: t.put('k', 'v')
+a.close(); print str(b.begin().get('k'), 'ascii')
+=v""",
+}
+
+
+@pytest.mark.parametrize("name", AS_PYTHON_2)
+def test_text_bytes_and_order_are_those_of_python_2(name: str, tmp_path: Path) -> None:
+    source, expected = AS_PYTHON_2[name].split("\n=")
+    (tmp_path / "s.py").write_text(source, "latin-1")
+    command = [sys.executable, "-m", "netspec", "run", "--python2", "s.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout == f"{expected}\n", done.stderr
+
+
+def test_imports_beside_a_module_are_python_2s_in_packages_only(tmp_path: Path) -> None:
+    files = {
+        "main.py": "import settings\nprint settings.X, settings.which",
+        "__init__.py": "",
+        "settings.py": "import pk.a, pk\nX = pk.a.other.X / 2\nwhich = pk.a.json.mine",
+        "pk/__init__.py": "",
+        "pk/a.py": "import b as other, json",
+        "pk/b.py": "import c.d\nX = c.d.X",
+        "pk/json.py": "mine = 1",
+        "pk/c/__init__.py": "",
+        "pk/c/d.py": "X = 7",
+        "new.py": "import pk.a; print(pk.a.other.X)",
+    }
+    for name, source in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(source)
+    for name, printed in (("main.py", "3 1\n"), ("new.py", "7\n")):
+        command = [sys.executable, "-m", "netspec", "run", name]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.stdout == printed, done.stderr
+
+
+def test_a_translation_keeps_its_files_and_needs_no_netspec(tmp_path: Path) -> None:
+    source = "import cStringIO\nf = cStringIO.StringIO('\\xff\\x00'); open('o', 'w').write(f.getvalue())\n"
+    text = translated(f"{source}print 7 / 2, len(open('o').read())\n".encode(), "s.py", alone=True)
+    (tmp_path / "new.py").write_text(text)
+    done = subprocess.run([sys.executable, "new.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.stdout, "netspec" in text) == ("3 2\n", False), done.stderr
