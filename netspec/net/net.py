@@ -155,7 +155,7 @@ class Net(torch.nn.Module):
         """The blobs kept by the last pass of this thread, or of any where it made none; see ``keep``."""
         return getattr(self._passing.own, "blobs", self._passing.last)
 
-    def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]] | None:
+    def forward_backward(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]] | None:
         """Run forward and backward by kernels prepared once; return the loss and the outputs, as forward_loss does.
 
         Gradients are added to ``grad``. None where autograd must do it: see :meth:`training_step`, or where hooks or

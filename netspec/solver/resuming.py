@@ -21,52 +21,58 @@ from netspec.solver.extra import Extra, check_pair, path_beside, read_extra, res
 from netspec.solver.nan import bad_parameter
 from netspec.solver.settings import Settings, changes, settings_of
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
+from netspec.solver.testing import Tests
 from netspec.solver.threads import divided_sums
 from netspec.solver.training import Training
 
 
-class Resumable(Training):
-    """A training that takes snapshots, and goes on from them."""
+class Snapshots:
+    """Takes snapshots of a training, and lets it go on from one."""
 
-    def snapshot(self) -> tuple[str, str]:
+    def __init__(self, training: Training, tests: Tests) -> None:
+        self._training, self._tests = training, tests
+
+    def take(self) -> tuple[str, str]:
         """Write the weights and the state; return their paths, ``PREFIX_iter_N.caffemodel`` and ``.solverstate``.
 
         With ``snapshot_format: HDF5`` both end in ``.h5``. Of several processes the root writes them.
         Raises SpecError if they cannot be written.
         """
-        if self.options.nan == "stop" and bad_parameter(self.net):
-            self.tell_nan("the weights cannot be saved")
-        hdf5 = self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5")
+        training = self._training
+        if training.options.nan == "stop" and bad_parameter(training.net):
+            training.tell_nan("the weights cannot be saved")
+        hdf5 = training.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5")
         form, ending = ("HDF5", ".h5") if hdf5 else ("binary proto", "")
-        stem = f"{self.param.snapshot_prefix}_iter_{self.iteration}"
+        stem = f"{training.param.snapshot_prefix}_iter_{training.iteration}"
         model, state = f"{stem}.caffemodel{ending}", f"{stem}.solverstate{ending}"
         states = self._running_states()
-        if not self.options.processes.is_root:
-            self.last_snapshot = state
+        if not training.options.processes.is_root:
+            training.last_snapshot = state
             return model, state
         log.info("solver.cpp:474" if hdf5 else "solver.cpp:464", f"Snapshotting to {form} file {model}")
-        save_weights(self.net, model, self.param.snapshot_diff)
+        save_weights(training.net, model, training.param.snapshot_diff)
         site = "sgd_solver.cpp:296" if hdf5 else "sgd_solver.cpp:284"
         log.info(site, f"Snapshotting solver state to {form} file {state}")
-        history = [values.cpu().numpy() for values in self.history]
+        history = [values.cpu().numpy() for values in training.history]
         weights, settings = Stamp.of(model), self._settings()
         write_state(
             state,
-            State(self.iteration, model, self.current_step, history),
+            State(training.iteration, model, training.current_step, history),
             before=lambda unfinished: write_extra(
                 path_beside(state),
-                Extra(self.seed, list(self.losses), states, settings, weights, Stamp.of(unfinished)),
+                Extra(training.seed, list(training.losses), states, settings, weights, Stamp.of(unfinished)),
             ),
         )
-        self.last_snapshot = state
-        self.on_snapshot(model)
+        training.last_snapshot = state
+        training.on_snapshot(model)
         return model, state
 
     def _running_states(self) -> list[dict[str, dict[str, Any]]]:
         """Return what each net remembers. During a test, test nets' are as before: it is run again after a resume."""
-        training = [running_state(net) for net in (self.net, *self.replicas.nets)]
-        testing = list(self.states_before_test) or [running_state(net) for net in self.test_nets]
-        return [state for states in self.options.processes.gather(training) for state in states] + testing
+        training = self._training
+        trained = [running_state(net) for net in (training.net, *training.replicas.nets)]
+        tested = list(self._tests.states_before) or [running_state(net) for net in training.test_nets]
+        return [state for states in training.options.processes.gather(trained) for state in states] + tested
 
     def restore(self, path: str | Path) -> None:
         """Resume from a .solverstate or .solverstate.h5, of Caffe or of netspec, and from its weights.
@@ -75,30 +81,31 @@ class Resumable(Training):
         in Caffe, the data layers start again at their first record. Raises SpecError, and changes nothing, if the state
         does not fit this solver's type and net.
         """
+        training = self._training
         where = Where(str(path))
         extra = read_extra(path)
         state = self._of_today(read_state(path), where)
-        if len(state.history) != len(self.history):
-            found, expected = len(state.history), len(self.history)
+        if len(state.history) != len(training.history):
+            found, expected = len(state.history), len(training.history)
             message = (
                 f"incorrect length of history blobs: found {found}, expected {expected} for this net and solver type"
             )
-            raise SpecError(f"{message} {self.param.type}", where)
-        for i, (mine, theirs) in enumerate(zip(self.history, state.history, strict=True)):
+            raise SpecError(f"{message} {training.param.type}", where)
+        for i, (mine, theirs) in enumerate(zip(training.history, state.history, strict=True)):
             if not _same_shape(tuple(mine.shape), theirs.shape):
                 raise SpecError(f"history blob {i} has shape {theirs.shape}, expected {tuple(mine.shape)}", where)
         learned_net = find_learned_net(state, path)
         if extra is not None:
             check_pair(path, learned_net, extra)
-        load_weights(self.net, learned_net, strict=True)
+        load_weights(training.net, learned_net, strict=True)
         log.info("sgd_solver.cpp:336", "SGDSolver: restoring history")
-        for mine, theirs in zip(self.history, state.history, strict=True):
+        for mine, theirs in zip(training.history, state.history, strict=True):
             mine.copy_(torch.tensor(theirs).view(mine.shape))
-        self.iteration = state.iteration
-        self.current_step = state.current_step
-        for net in (self.net, *self.test_nets):
+        training.iteration = state.iteration
+        training.current_step = state.current_step
+        for net in (training.net, *training.test_nets):
             net.restart_data()
-        self.replicas.restart_data()
+        training.replicas.restart_data()
         if extra is None:
             log.logger.info(f"{path} is Caffe's: the data starts again at its first record, with other random numbers")
         else:
@@ -106,21 +113,22 @@ class Resumable(Training):
 
     def _go_on(self, extra: Extra, where: Where) -> None:
         """Go on in the data where a training stopped, with the losses of its average."""
-        training, rank = (self.net, *self.replicas.nets), self.options.processes.rank
-        ranks = len(training) * self.options.processes.count
-        if len(extra.nets) != ranks + self.count_of_tests:
-            expected = f"{ranks} of training and {self.count_of_tests} of testing"
+        training = self._training
+        trained, rank = (training.net, *training.replicas.nets), training.options.processes.rank
+        ranks = len(trained) * training.options.processes.count
+        if len(extra.nets) != ranks + training.count_of_tests:
+            expected = f"{ranks} of training and {training.count_of_tests} of testing"
             log.logger.warning(f"{where}: is of {len(extra.nets)} nets, not {expected}: the data starts again")
             return
-        all_nets = (*training, *self.test_nets)
-        remembered = extra.nets[rank : rank + len(training)] + extra.nets[ranks:][: len(self.test_nets)]
+        all_nets = (*trained, *training.test_nets)
+        remembered = extra.nets[rank : rank + len(trained)] + extra.nets[ranks:][: len(training.test_nets)]
         try:
             for net, states in zip(all_nets, remembered, strict=True):
                 resume(net, states)
         except SpecError as fault:
             raise SpecError(fault.message, where) from None
-        self.losses_before = tuple(extra.losses)
-        if extra.seed != self.seed:
+        training.losses_before = tuple(extra.losses)
+        if extra.seed != training.seed:
             log.logger.warning(f"{where}: random_seed was {extra.seed}: the random numbers are others from here on")
         elif told := changes(extra.settings, self._settings()):
             log.logger.warning(f"{where}: the training goes on with other numbers: {told}")
@@ -129,25 +137,27 @@ class Resumable(Training):
 
     def _settings(self) -> Settings:
         """Return what the numbers of this training follow from."""
+        training = self._training
         manner: dict[str, Any] = {
-            "precision": self.options.precision,
-            "exact": self.exact,
-            "device": self.device.type,
+            "precision": training.options.precision,
+            "exact": training.exact,
+            "device": training.device.type,
             "torch": torch.__version__,
         }
-        if divided_sums(self.net):
+        if divided_sums(training.net):
             manner["threads"] = torch.get_num_threads()
-        tests = {f"test net #{i}": net for i, net in enumerate(self.test_nets)}
-        return settings_of(self.param, {nets.TRAIN_NET: self.net, **tests}, manner)
+        tests = {f"test net #{i}": net for i, net in enumerate(training.test_nets)}
+        return settings_of(training.param, {nets.TRAIN_NET: training.net, **tests}, manner)
 
     def _of_today(self, state: State, where: Where) -> State:
         """Return a state in today's form, where it has a history for each layer that shares a parameter."""
-        number = {id(learnable.parameter): i for i, learnable in enumerate(self.net.learnable)}
-        owners = [number[id(blob)] for layer in self.net.layers for blob in layer.blobs]
-        shapes = [shape for layer in self.net.layers for shape in layer.blob_shapes]
-        if len(state.history) == len(self.history) or len(state.history) != self.rule.sets * len(owners):
+        training = self._training
+        number = {id(learnable.parameter): i for i, learnable in enumerate(training.net.learnable)}
+        owners = [number[id(blob)] for layer in training.net.layers for blob in layer.blobs]
+        shapes = [shape for layer in training.net.layers for shape in layer.blob_shapes]
+        if len(state.history) == len(training.history) or len(state.history) != training.rule.sets * len(owners):
             return state
-        if len(state.history) == 2 * len(self.history) and has_squares(state.history, self.param.type):
+        if len(state.history) == 2 * len(training.history) and has_squares(state.history, training.param.type):
             return state  # not of this type: the second half is another type's second set
         for i, theirs in enumerate(state.history):
             mine = shapes[i % len(shapes)]

@@ -21,17 +21,18 @@ from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.context import device_of
-from netspec.layers.contract.reading import Waits, reads_data
 from netspec.proto.text import parse_solver
-from netspec.solver import update
 from netspec.solver.checks import check_prefix
+from netspec.solver.display import Display
 from netspec.solver.extra import read_extra
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions, choose_device
-from netspec.solver.precision import FP16, FP32, LossScale, computing
+from netspec.solver.precision import FP32
 from netspec.solver.processes import own_device
-from netspec.solver.tally import as_scores
-from netspec.solver.testing import Tested, log_scores
+from netspec.solver.resuming import Snapshots
+from netspec.solver.testing import Tests
+from netspec.solver.training import Blobs, Training
+from netspec.solver.updating import Updates
 
 
 def load_solver(
@@ -108,17 +109,14 @@ def make_solver(
     return solver
 
 
-class Solver(Tested):
-    """A training: the training net, the test nets, and its state (see Training for what it has)."""
-
-    _displayed = (0.0, 0)
-    _waited = 0.0
-    _overflowed = False
+class Solver(Training):
+    """A training: the loop, and its parts: tests, snapshots, updates, display (see Training for what they share)."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
-        self._scale = LossScale(self.options.precision)
-        self._waiting = [layer for layer in self.net.layers if isinstance(layer, Waits)]
+        self._tests, self._updates, self._display = Tests(self), Updates(self), Display(self)
+        self._snapshots = Snapshots(self, self._tests)
+        log.info("solver.cpp:57", "Solver scaffolding done.")
 
     @property
     def learning_rate(self) -> float:
@@ -139,7 +137,7 @@ class Solver(Tested):
             return
         if self.is_due(self.param.display):
             with torch.no_grad():
-                self.losses.append(self.test_pass(self.net)[0].item())
+                self.losses.append(self.forward(self.net)[0].item())
             log.info("solver.cpp:327", f"Iteration {self.iteration}, loss = {log.number(self.loss)}")
         if self.is_due(self.param.test_interval):
             self.test_all()
@@ -156,8 +154,7 @@ class Solver(Tested):
         self.losses.clear()
         self.losses.extend(self.losses_before)
         self.losses_before = ()
-        self._displayed = (self.options.clock(), self.iteration)
-        self._waited = self._seconds_waited()
+        self._display.begin()
         for self.to_come in reversed(range(iterations)):
             if self.is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
                 self.test_all()
@@ -166,12 +163,12 @@ class Solver(Tested):
             for net in (self.net, *self.replicas.nets):
                 net.random.begin(f"iteration {self.iteration}")
             self.on_start()
-            loss, outputs = self._forward_backward()
+            loss, outputs = self._accumulate()
             self.losses.append(loss)
             if not math.isfinite(loss):
                 self.tell_nan(f"the loss is {loss}")
             if self.is_due(self.param.display):
-                self._display(outputs)
+                self._display.show(outputs)
             self.on_gradients()
             self.apply_update()
             self.on_iteration()
@@ -182,91 +179,38 @@ class Solver(Tested):
                 self.stopped = True
                 return
 
-    def _forward_backward(self) -> tuple[float, dict[str, torch.Tensor]]:
-        """Sum the gradients of iter_size passes; return the mean of their losses, and the outputs of the last."""
+    def _accumulate(self) -> tuple[float, Blobs]:
+        """Sum the gradients of iter_size runs; return the mean of their losses, and the outputs of the last."""
         self.clear_gradients()
         self.replicas.clear()
         total = np.float32(0)
-        outputs: dict[str, torch.Tensor] = {}
+        outputs: Blobs = {}
         for _ in range(self.param.iter_size):
             wanted = self.param.debug_info and self.is_due(self.param.display)
             with self.debugged(self.net) if wanted else nullcontext():
-                loss, outputs = self.train_pass()
-            self.replicas.backward(self.options.precision, self._scale)
+                loss, outputs = self.forward_backward()
+            self.replicas.backward(self.options.precision, self.scale)
             total += np.float32(loss.item())
-        self.replicas.reduce()
-        if self.options.precision == FP16:
-            self._unscale()
+        self._updates.reduce()
         return float(total / np.float32(self.param.iter_size)), outputs
-
-    def _unscale(self) -> None:
-        """Take the loss scale off the gradients; where one has overflowed, this iteration will update nothing."""
-        gradients = [item.parameter.grad for item in self.net.learnable if item.parameter.grad is not None]
-        self._overflowed = not self._scale.remove(gradients)
-        if self._overflowed:
-            factor = log.number(self._scale.factor)
-            log.info("sgd_solver.cpp:99", f"Iteration {self.iteration}: float16 overflowed; loss scale {factor}")
-            if self._scale.factor < 1:
-                self.tell_nan("the gradients overflow float16")
 
     def clear_gradients(self) -> None:
         """Clear the gradients, before an iteration sums them up."""
         self.blocks.clear()
 
-    def train_pass(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Run the training net forward and backward; return its loss and outputs."""
-        if self.options.precision == FP32 and (passed := self.net.train_pass()):
-            return passed
-        with computing(self.options.precision, self.device):
-            loss, outputs = self.net.forward_loss()
-        if loss.requires_grad:
-            self._scale.of(loss).backward()
-        return loss, outputs
-
     @torch.no_grad()
     def apply_update(self) -> None:
-        """Update the weights and count the iteration; the gradients then contain the subtracted values, as in Caffe.
+        """Update the weights and count the iteration; the gradients then contain the subtracted values, as in Caffe."""
+        self._updates.apply()
 
-        In float16 an iteration whose gradients overflowed is counted only.
-        """
-        rate = self._advance_rate()
-        if self.is_due(self.param.display):
-            log.info("sgd_solver.cpp:112", f"Iteration {self.iteration}, lr = {log.number(rate)}")
-        if self._overflowed:
-            self.iteration += 1
-            return
-        clipped = (
-            update.clip(self.blocks.diffs(), self.param.clip_gradients) if self.param.clip_gradients >= 0 else None
-        )
-        if clipped:
-            norm, factor = map(log.number, clipped)
-            limit = log.number(self.param.clip_gradients)
-            message = f"Gradient clipping: scaling down gradients (L2 norm {norm} > {limit}) by scale factor {factor}"
-            log.info("sgd_solver.cpp:99", message)
-        for piece in self.blocks.pieces(rate, self.param.weight_decay):
-            update.move(self.rule, self.param, piece, self.iteration)
-        self.replicas.update()
-        self.iteration += 1
+    def test_all(self) -> None:
+        """Run every test net for its test_iter batches with the current weights."""
+        self._tests.run(self.snapshot)
 
-    def _advance_rate(self) -> float:
-        step = next_step(self.param, self.iteration, self.current_step)
-        if step != self.current_step and self.param.lr_policy == "multistep":
-            log.info("sgd_solver.cpp:50", f"MultiStep Status: Iteration {self.iteration}, step = {step}")
-        self.current_step = step
-        return learning_rate(self.param, self.iteration, step)
+    def snapshot(self) -> tuple[str, str]:
+        """Write the weights and the state; return their paths. Raises SpecError (see Snapshots.take)."""
+        return self._snapshots.take()
 
-    def _display(self, outputs: dict[str, torch.Tensor]) -> None:
-        now, (then, iteration) = self.options.clock(), self._displayed
-        speed = (self.iteration - iteration) / (now - then or 1)
-        pace = f"{log.number(speed)} iter/s, {log.number(now - then)}s/{self.param.display} iters"
-        log.info("solver.cpp:239", f"Iteration {self.iteration} ({pace}), loss = {log.number(self.loss)}")
-        log_scores("solver.cpp:258", "Train", as_scores(outputs), self.net.output_loss_weights)
-        if any(reads_data(layer) for layer in self.net.layers):
-            waited = self._seconds_waited()
-            share = 100 * (waited - self._waited) / (now - then or 1)
-            log.info("blocking_queue.cpp:49", f"Waiting for data: {share:.1f} % of the time")
-            self._waited = waited
-        self._displayed = (now, self.iteration)
-
-    def _seconds_waited(self) -> float:
-        return sum(layer.waited for layer in self._waiting)
+    def restore(self, path: str | Path) -> None:
+        """Resume from a .solverstate or .solverstate.h5. Raises SpecError (see Snapshots.restore)."""
+        self._snapshots.restore(path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
@@ -27,13 +28,15 @@ from netspec.proto.text import write_text
 from netspec.solver import nets, update
 from netspec.solver.blocks import Blocks
 from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
-from netspec.solver.extra import Remembered
+from netspec.solver.debug import debug_info
 from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.options import TrainingOptions, choose_device
-from netspec.solver.precision import BF16, FP16
+from netspec.solver.precision import BF16, FP16, FP32, LossScale, computing
 from netspec.solver.replicas import Replicas
 from netspec.solver.tally import Outputs
 from netspec.solver.threads import dependence
+
+Blobs = dict[str, torch.Tensor]  # the outputs of a run, by name
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
@@ -44,7 +47,7 @@ _CREATING = {
 
 
 class Training:
-    """The nets of a solver, and the state of their training.
+    """The nets of a solver, how they are run, and where their training stands: what all parts of a solver share.
 
     ``iteration`` is the number of updates done; ``net`` is the training net, ``test_nets`` the others; ``scores`` has,
     for each test net, the mean of each output element in its last test. ``on_start()`` is called before the passes of
@@ -74,7 +77,6 @@ class Training:
     last_snapshot = ""
     losses: deque[float]
     losses_before: tuple[float, ...] = ()  # of a training that is resumed
-    states_before_test: tuple[Remembered, ...] = ()
     _told_nan = False
 
     def __init__(self, param: Any, node: Place | None = None, options: TrainingOptions | None = None) -> None:
@@ -97,7 +99,7 @@ class Training:
         self._check_size()
         self._say_doubts()
         self.blocks = Blocks(self.net.learnable, self.rule.sets)
-        log.info("solver.cpp:57", "Solver scaffolding done.")
+        self.scale = LossScale(self.options.precision)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled. Raises TypeError."""
@@ -191,6 +193,24 @@ class Training:
             log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs that have it")
         if self.options.precision == BF16 and self.device.type == "cpu" and has_bfloat16() is False:
             log.logger.warning("precision bf16: this CPU has no instructions for it, so it is slower than fp32")
+
+    def forward(self, net: Net) -> tuple[torch.Tensor, Blobs]:
+        """Run a net forward; return its loss and outputs."""
+        return net.forward_loss()
+
+    def forward_backward(self) -> tuple[torch.Tensor, Blobs]:
+        """Run the training net forward and backward; return its loss and outputs."""
+        if self.options.precision == FP32 and (done := self.net.forward_backward()):
+            return done
+        with computing(self.options.precision, self.device):
+            loss, outputs = self.net.forward_loss()
+        if loss.requires_grad:
+            self.scale.of(loss).backward()
+        return loss, outputs
+
+    def debugged(self, net: Net) -> AbstractContextManager[None]:
+        """Log the runs of a net within the block, as for ``debug_info``."""
+        return debug_info(net)
 
     def check_inputs(self) -> None:
         """Raise SpecError where a net has inputs: nobody would fill them."""

@@ -65,17 +65,17 @@ class _Training(core_solver.Solver):
         super().clear_gradients()
 
     @override
-    def train_pass(self) -> tuple[torch.Tensor, Outputs]:
+    def forward_backward(self) -> tuple[torch.Tensor, Outputs]:
         """Run forward and backward; only the last pass of several, and one that somebody watches, fills the blobs."""
         seen = self.is_watched or self.param.debug_info or not self.to_come
-        if not seen and (passed := self.net.train_pass()):
+        if not seen and (passed := self.net.forward_backward()):
             return passed
-        loss, outputs = self.test_pass(self.net)
+        loss, outputs = self.forward(self.net)
         self.shown[self.net].passes.backward(len(self.net.layers) - 1, 0)
         return loss, outputs
 
     @override
-    def test_pass(self, net: core.Net) -> tuple[torch.Tensor, Outputs]:
+    def forward(self, net: core.Net) -> tuple[torch.Tensor, Outputs]:
         shown = self.shown[net]
         loss = shown.passes.forward(0, len(net.layers) - 1)
         blobs = {name: shown.blobs[name] for name in shown.outputs}

@@ -66,12 +66,12 @@ def test_begins_as_caffe_does_on_every_cpu(run: str, folder: Path, monkeypatch: 
 
 def _watched(solver: Solver, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, float]]:
     """Return a list that gets the outputs of each training pass of a solver."""
-    train_pass, outputs = solver.train_pass, []
+    forward_backward, outputs = solver.forward_backward, []
 
     def keep() -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        loss, blobs = train_pass()
+        loss, blobs = forward_backward()
         outputs.append({name: blob.item() for name, blob in blobs.items()})
         return loss, blobs
 
-    monkeypatch.setattr(solver, "train_pass", keep)
+    monkeypatch.setattr(solver, "forward_backward", keep)
     return outputs

@@ -45,7 +45,7 @@ def test_the_share_of_the_time_spent_waiting_for_data_is_there(
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel")
     times, waited = iter([100.0, 100.5, 102.5]), iter([1.0, 1.25, 1.3])
     solver.options = replace(solver.options, clock=lambda: next(times))
-    monkeypatch.setattr(solver, "_seconds_waited", lambda: next(waited))
+    monkeypatch.setattr(solver._display, "_seconds_waited", lambda: next(waited))
     solver.step(11)
     solver.close()
     assert re.findall(r"Waiting for data: (\S+) % of the time", "\n".join(lines())) == ["50.0", "2.5"]

@@ -107,13 +107,13 @@ def test_an_iteration_that_overflows_is_counted_and_changes_nothing(work_in: Cal
     work_in("train/sgd_step")
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel", precision=FP16)
     before = [item.parameter.detach().clone() for item in solver.net.learnable]
-    solver._scale.factor = 2.0**120
+    solver.scale.factor = 2.0**120
     solver.step(1)
     assert solver.iteration == 1
-    assert solver._scale.factor == 2.0**119
+    assert solver.scale.factor == 2.0**119
     for item, values in zip(solver.net.learnable, before, strict=True):
         assert torch.equal(item.parameter, values)
-    solver._scale.factor = FIRST_SCALE
+    solver.scale.factor = FIRST_SCALE
     solver.step(1)
     assert any(not torch.equal(i.parameter, values) for i, values in zip(solver.net.learnable, before, strict=True))
     solver.close()
@@ -124,9 +124,9 @@ def test_gradients_that_overflow_whatever_the_scale_end_the_training(
 ) -> None:
     work_in("train/sgd_step")
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel", precision=FP16)
-    solver._scale.factor = 1.0
-    remove = solver._scale.remove
-    monkeypatch.setattr(solver._scale, "remove", lambda gradients: remove([torch.tensor([torch.inf])]))
+    solver.scale.factor = 1.0
+    remove = solver.scale.remove
+    monkeypatch.setattr(solver.scale, "remove", lambda gradients: remove([torch.tensor([torch.inf])]))
     with pytest.raises(SpecError, match="the gradients overflow float16"):
         solver.step(1)
     solver.close()
