@@ -19,6 +19,7 @@ from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.sequences import ImageSequence
 from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
+from netspec.files.whole_file import safe_cell
 
 CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS)
 KEPT_VIEWS = 500  # their features, in memory
@@ -39,7 +40,8 @@ def read_loops(path: Path, names: Sequence[str]) -> list[Loop]:
     Frames are found by their names, or by their numbers where the table has no names. Raises InputError (file:line)
     for a frame that is not there.
     """
-    numbers = {name: number for number, name in enumerate(names)}
+    numbers = {str(safe_cell(name)): number for number, name in enumerate(names)}
+    numbers |= {name: number for number, name in enumerate(names)}
     loops = []
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as stream:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from loopclosure.detector.verification import LocalFeatures
 from loopclosure.index.index import Index
-from netspec.files.arrays import check_array
+from netspec.files.arrays import Rows, check_array
 
 FIRST_CAPACITY = 256  # frames; doubled when full
 NO_ROWS = np.zeros((0, 0), np.float32)
@@ -26,8 +28,8 @@ class Points:
 
     sizes: np.ndarray
     ends: np.ndarray
-    points: np.ndarray
-    descriptors: np.ndarray
+    points: np.ndarray | Rows
+    descriptors: np.ndarray | Rows
 
     def of(self, frame: int) -> LocalFeatures:
         """Return those of one frame."""
@@ -132,7 +134,7 @@ class Frames:
             found["descriptors"] = np.concatenate([np.zeros((0, 128), np.uint8), *(f.descriptors for f in local)])
         return found
 
-    def take(self, arrays: dict[str, np.ndarray], points: Points | None) -> None:
+    def take(self, arrays: Mapping[str, Any], points: Points | None) -> None:
         """Add frames of a file; the index, or ``waiting``, has or gets their descriptors.
 
         Raises ValueError or LookupError where the arrays do not fit together.
@@ -147,7 +149,7 @@ class Frames:
         self.count += count
 
 
-def points_of(arrays: dict[str, np.ndarray], count: int, finite: bool = True) -> Points:
+def points_of(arrays: Mapping[str, Any], count: int, finite: bool = True) -> Points:
     """Return the points of ``count`` frames of a file; ``finite``: read them all, and check that each is a number.
 
     Raises ValueError where the arrays do not fit together.

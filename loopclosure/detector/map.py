@@ -26,7 +26,7 @@ from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.index.index import INDEXES, open_index
 from loopclosure.progress import Progress, silent
-from netspec.files.arrays import check_array, map_npy, read_npz
+from netspec.files.arrays import Rows, check_array, read_npz, regular
 from netspec.files.whole_file import only_one, whole_file, whole_folder, write_whole
 
 FORMAT = 1
@@ -44,7 +44,7 @@ class Session:
 
     folder: Path
     names: list[str]
-    arrays: dict[str, np.ndarray]
+    arrays: dict[str, Any]
     points: Points
 
     def blocks(self, start: int = 0) -> Iterator[np.ndarray]:
@@ -64,7 +64,7 @@ class Map:
         self.folder = Path(folder)
         path = self.folder / "map.json"
         try:
-            about = json.loads(path.read_text(encoding="utf-8"))
+            about = json.loads(regular(path, "the head of a map").read_text(encoding="utf-8"))
             if about["format"] != FORMAT:
                 raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
             self.describer = checked_name(about["describer"])
@@ -77,7 +77,13 @@ class Map:
 
     def _read_sessions(self) -> None:
         while (self.folder / f"{len(self.sessions):06d}").is_dir():
-            self.sessions.append(_read_session(self.folder / f"{len(self.sessions):06d}"))
+            session = _read_session(self.folder / f"{len(self.sessions):06d}")
+            first = [*self.sessions, session][0]
+            width, expected = (each.arrays["rows"].shape[1] for each in (session, first))
+            if width != expected:
+                told = f"has {width} numbers a frame, that of {first.folder.name} {expected}; they are of one net"
+                raise InputError(told, session.folder / "rows.npy")
+            self.sessions.append(session)
 
     @classmethod
     def create(cls, folder: str | Path, describer: str) -> Map:
@@ -144,7 +150,7 @@ class Map:
                 np.savez(unfinished / "frames.npz", names=names, source=np.array(str(recording.source)), **arrays)
                 every = [*self.names, *(f"{folder.name}/{name}" for name in recording.names)]
                 write_loops_csv(unfinished / "loops.csv", [r for r in results if r], detector.stamps, every)
-            self.sessions.append(_read_session(folder))
+            self._read_sessions()
             self._learn_projection(described.views)
         return results
 
@@ -153,7 +159,7 @@ class Map:
         path = self.folder / "projection.npz"
         if index not in INDEXES or not path.exists():
             return None
-        arrays = read_npz(path, "the projection of a map")
+        arrays = read_npz(regular(path, "the projection of a map"), "the projection of a map")
         try:
             size = len(arrays["mean"])
             check_array(arrays, "mean", "f", (size,))
@@ -170,7 +176,8 @@ class Map:
         parts, first = [], 0
         for session in self.sessions:
             inside = wanted[(wanted >= first) & (wanted < first + len(session.names))] - first
-            parts.append(session.arrays["rows"][inside].astype(np.float32))
+            rows = session.arrays["rows"]
+            parts += [rows[i : i + 1].astype(np.float32) for i in inside]
             first += len(session.names)
         rows = np.concatenate(parts)
         learned = learn_whitening(rows.reshape(len(rows) * views, -1)[::views], COMPONENTS, 0.0)
@@ -213,8 +220,8 @@ def checked_name(describer: str) -> str:
 
 
 def _read_session(folder: Path) -> Session:
-    arrays = read_npz(folder / "frames.npz", SESSION)
-    arrays |= {name: map_npy(folder / f"{name}.npy", SESSION) for name in MAPPED}
+    arrays: dict[str, Any] = read_npz(regular(folder / "frames.npz", SESSION), SESSION)
+    arrays |= {name: Rows(folder / f"{name}.npy", SESSION) for name in MAPPED}
     try:
         names = [str(name) for name in arrays["names"].reshape(-1)]
         count = len(names)

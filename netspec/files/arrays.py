@@ -14,7 +14,7 @@ import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -61,14 +61,40 @@ def read_npy(path: str | Path, expected: str) -> np.ndarray:
         return _read(stream, os.fstat(stream.fileno()).st_size)
 
 
-def map_npy(path: str | Path, expected: str) -> np.ndarray:
-    """Return the array of an .npy file as :func:`read_npy`, but each part read from disk only when it is used."""
-    with _opened(Path(path), expected) as stream:
-        shape, by_columns, dtype = _header(stream, os.fstat(stream.fileno()).st_size)
-        if not math.prod(shape):
-            return np.zeros(shape, dtype)
-        order = "F" if by_columns else "C"
-        return np.asarray(np.memmap(stream, dtype, "r", stream.tell(), shape, order))
+class Rows:
+    """The array (N, ...) of an .npy file, of which only the rows that are asked for are read: ``rows[first:end]``.
+
+    They are read and not mapped: where the file was cut meanwhile, a page of a map would end the process. Raises
+    InputError, which says what was expected, for any other file.
+    """
+
+    def __init__(self, path: str | Path, expected: str) -> None:
+        self._path, self._expected = regular(path, expected), expected
+        with _opened(self._path, expected) as stream:
+            self.shape, by_columns, self.dtype = _header(stream, os.fstat(stream.fileno()).st_size)
+            self._start = stream.tell()
+            if by_columns or not self.shape:
+                raise ValueError("an array that is not stored row by row")
+        self.size = math.prod(self.shape)
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        first, end, _ = rows.indices(self.shape[0])
+        shape = (max(0, end - first), *self.shape[1:])
+        width = math.prod(self.shape[1:]) * self.dtype.itemsize
+        with _opened(self._path, self._expected) as stream:
+            stream.seek(self._start + first * width)
+            data = stream.read(shape[0] * width)
+            if len(data) < shape[0] * width:
+                raise ValueError("it was cut since it was opened")
+        return np.frombuffer(data, self.dtype).reshape(shape) if data else np.zeros(shape, self.dtype)
+
+
+def regular(path: str | Path, expected: str) -> Path:
+    """Return the path of a file. Raises InputError for a pipe or a device, which might be waited for without end."""
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise InputError(f"is no regular file; expected {expected}", path)
+    return path
 
 
 def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
@@ -125,9 +151,7 @@ def _fault(error: BaseException, path: Path, expected: str) -> InputError:
     return InputError(f"cannot be read ({reason}); expected {expected}", path)
 
 
-def check_array(
-    arrays: dict[str, np.ndarray], name: str, kinds: str, shape: tuple[int, ...], finite: bool = True
-) -> None:
+def check_array(arrays: Mapping[str, Any], name: str, kinds: str, shape: tuple[int, ...], finite: bool = True) -> None:
     """Raise ValueError for an array that is missing, of another kind or shape, or has a number that is not finite."""
     values = arrays.get(name)
     if values is None:

@@ -34,6 +34,7 @@ NO_NUL = "a name has no character NUL"
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
 _MARK = re.compile(rb"a lock of netspec, held by process (\d+)\n")
 _AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # no link, and no pipe that nobody writes to
+_FORMULA = tuple("=+-@\t\r\n")  # what a formula begins with, for some spreadsheet
 _swept: set[Path] = set()
 
 
@@ -80,10 +81,24 @@ def write_whole(path: str | Path, content: str | bytes, errors: str = "strict") 
 
 
 def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[object]], errors: str = "strict") -> None:
-    """Write a table as CSV to a file that appears whole; ``errors`` as in :func:`write_whole`."""
+    """Write a table as CSV to a file that appears whole; ``errors`` as in :func:`write_whole`.
+
+    The cells are those of :func:`safe_cell`.
+    """
     text = io.StringIO()
-    csv.writer(text).writerows([head, *rows])
+    csv.writer(text).writerows([head, *([safe_cell(value) for value in row] for row in rows)])
     write_whole(path, text.getvalue(), errors)
+
+
+def safe_cell(value: object) -> object:
+    """Return what stands in a table for a value: a text that a spreadsheet would compute gets an apostrophe."""
+    if not isinstance(value, str) or value[:1] not in _FORMULA:
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from loopclosure.cli import main
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector import map as maps
 from loopclosure.detector.map import Map
-from loopclosure.detector.run import open_recording
+from loopclosure.detector.run import open_recording, run_detector
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
 from netspec.errors import SpecError
@@ -120,7 +120,7 @@ import os, signal, sys
 import numpy as np
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector.map import Map
-from loopclosure.detector.run import open_recording
+from loopclosure.detector.run import open_recording, run_detector
 save = np.savez
 def dying(*arrays, **named):
     save(*arrays, **named)
@@ -169,12 +169,36 @@ def test_one_adds_at_a_time_and_others_read(a_map: Map, drives: Path, tmp_path: 
         (lambda m: np.savez(m / "000000" / "frames.npz", names=np.array(["a"])), '"rows" has shape|stamps'),
         (lambda m: np.save(m / "000000" / "rows.npy", np.full((10, 8), np.nan)), "a number that is not finite"),
         (lambda m: np.savez(m / "projection.npz", mean=np.zeros(3)), "loopclosure map add makes it again"),
+        (lambda m: other_width(m), "000001/rows.npy: has 5 numbers a frame, that of 000000 768; they are of one net"),
+        (lambda m: pipe(m / "map.json"), "is no regular file"),
+        (lambda m: pipe(m / "000000" / "rows.npy"), "rows.npy: is no regular file"),
+        (lambda m: pipe(m / "000000" / "frames.npz"), "frames.npz: is no regular file"),
+        (lambda m: pipe(m / "projection.npz"), "projection.npz: is no regular file"),
     ],
 )
 def test_damage_is_one_line(damage, sentence: str, a_map: Map, tmp_path: Path) -> None:
     damage(tmp_path / "M")
     with pytest.raises(InputError, match=sentence):
         Map(tmp_path / "M").detector(Thumbnailer())
+
+
+def other_width(folder: Path) -> None:
+    shutil.copytree(folder / "000000", folder / "000001")
+    np.save(folder / "000001" / "rows.npy", np.zeros((PLACES, 5), np.float16))
+
+
+def pipe(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("name", ["rows", "points", "descriptors"])
+def test_a_file_that_is_cut_while_it_is_open_is_a_fault(name: str, a_map: Map, drives: Path) -> None:
+    """A mapped one would end the process (SIGBUS)."""
+    before = a_map.detector(Thumbnailer())
+    os.truncate(a_map.folder / "000000" / f"{name}.npy", 200)
+    with pytest.raises(InputError, match=f"{name}.npy: cannot be read .it was cut since it was opened"):
+        a_map.detector(Thumbnailer()) if name == "rows" else run_detector(before, open_recording(drives / "b"))
 
 
 def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
