@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -23,6 +24,7 @@ DIRECTIONS = ("forward", "both")
 ANCHORS = ("center", "start")
 EDGES = ("shorten", "drop")
 STANDARDIZE = ("no", "yes", "traverses")
+TILE = 64, 256  # pairs whose sums stay in the cache
 LONGEST = 10_000  # frames in a sequence; memory grows with it
 
 
@@ -148,17 +150,31 @@ def trajectory_costs(distances: np.ndarray, settings: SequenceSettings) -> np.nd
     margins = ((half, settings.length - half), (reach, reach))
     inside = np.pad(np.isfinite(distances), margins)
     padded = np.pad(np.where(np.isfinite(distances), distances, 0.0), margins)
-    best = np.full((queries, references), np.inf)
-    for path in offsets:
-        total = np.zeros((queries, references))
-        count = np.zeros((queries, references), np.int32)
+    costs = np.full((queries, references), np.nan)
+    for top, left in product(range(0, queries, TILE[0]), range(0, references, TILE[1])):
+        tile = costs[top : top + TILE[0], left : left + TILE[1]]
+        around = np.s_[top : top + len(tile) + settings.length, left : left + tile.shape[1] + 2 * reach]
+        if inside[around].any():
+            _tile_costs(padded[around].astype(float), inside[around], offsets + reach, needed, tile)
+    return costs
+
+
+def _tile_costs(padded: np.ndarray, inside: np.ndarray, offsets: np.ndarray, needed: int, costs: np.ndarray) -> None:
+    """Write the costs of some pairs, of which ``padded`` and ``inside`` hold the surroundings, into ``costs``."""
+    height, width = costs.shape
+    total, mean = np.empty((height, width)), np.empty((height, width))
+    count = np.empty((height, width), np.min_scalar_type(offsets.shape[1]))
+    whole, best = inside.all(), np.full((height, width), np.inf)
+    for path in offsets.tolist():
+        total[:], count[:] = 0, len(path) if whole else 0
         for step, offset in enumerate(path):
-            window = np.s_[step : step + queries, reach + offset : reach + offset + references]
-            total += padded[window]
-            count += inside[window]
-        enough = count >= needed
-        best[enough] = np.minimum(best[enough], total[enough] / count[enough])
-    return np.where(np.isfinite(best), best, np.nan)
+            total += padded[step : step + height, offset : offset + width]
+            if not whole:
+                count += inside[step : step + height, offset : offset + width]
+        np.divide(total, count, out=mean, where=count > 0)
+        mean[count < needed] = np.inf
+        np.minimum(best, mean, out=best)
+    np.copyto(costs, best, where=np.isfinite(best))
 
 
 def least_cost_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray, np.ndarray]:
