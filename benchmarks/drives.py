@@ -29,6 +29,7 @@ NEAR, OVERLAP = 1, 4  # frames of one route: the same place, and views that over
 KEYFRAMES = 4
 VIEWPOINT = 0.3  # of lmdb_build.views: how differently a place is seen in another season
 SMALL = (64, 32)
+NOISE = 4.0  # gray levels, of a camera that stands
 SEASONS, SAME = (2, 3), 0
 WALKS = (41, 42)  # seeds
 GAP = 30  # frames of one drive that are no loop
@@ -109,8 +110,10 @@ def _of_route(name: str, route: list[Path], other: list[Path], work: Path) -> It
     yield Drive(name, "twice, small", _one_drive(_resized(passes, work / f"{name}_passes_small"), np.tile(every, 2)))
     yield Drive(name, "twice, season 2", _one_drive([*route, *second], np.tile(every, 2)))
     standing = _standing(len(route))
-    yield Drive(name, "stands", _traverses([second[i] for i in standing], every[standing], route, every))
-    yield Drive(name, "stood", _traverses(second, every, [route[i] for i in standing], every[standing]))
+    stands = _stood([second[i] for i in standing], work / f"{name}_2_standing")
+    yield Drive(name, "stands", _traverses(stands, every[standing], route, every))
+    stood = _stood([route[i] for i in standing], work / f"{name}_standing")
+    yield Drive(name, "stood", _traverses(second, every, stood, every[standing]))
     yield Drive(name, "shares nothing", _traverses(foreign, np.full(len(foreign), np.nan), route, every))
 
 
@@ -120,6 +123,18 @@ def _standing(frames: int) -> np.ndarray:
     times = np.ones(frames, int)
     times[rng.integers(0, frames, 3)] = rng.integers(10, 40, 3)
     return np.repeat(np.arange(frames), times)
+
+
+def _stood(images: list[Path], folder: Path) -> list[Path]:
+    """Return the same images, of which repeated ones differ by a camera's noise; files in ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    made = [folder / f"{number:06d}.jpg" for number in range(len(images))]
+    for number, (image, path) in enumerate(zip(images, made, strict=True)):
+        if not path.exists():
+            picture = read_bgr(image)
+            noise = np.random.default_rng(number).normal(0, NOISE, picture.shape)
+            write_jpeg(path, np.clip(picture + noise, 0, 255).astype(np.uint8))
+    return made
 
 
 def _of_walk(seed: int, size: tuple[int, int], work: Path) -> Iterator[Drive]:

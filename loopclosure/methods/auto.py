@@ -17,7 +17,7 @@ from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
-from loopclosure.methods.candidates import candidates, far_apart
+from loopclosure.methods.candidates import Candidates, candidates, far_apart
 from loopclosure.methods.decoys import Lines, Matches, best_setting
 from loopclosure.methods.geometry import Agree, kept, try_geometry, verify
 from loopclosure.methods.settings import configure
@@ -88,25 +88,32 @@ def answer(
         matches.accepted if lines is not None else matches.inliers >= 0, "not verified", "below threshold"
     )
     verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
+    results = _results(given, matches, verdicts.tolist(), np.full(len(scores), np.nan) if stamps is None else stamps)
     unknown = int(np.count_nonzero(matches.few & (matches.inliers <= 0)))
     reasons = [*filter(None, [given.said]), _sequences_said(lines, precision, given.others)]
     reasons.append(said + (f"; {unknown} cannot be" if unknown else ""))
-    reasons.append(_total_said(int(np.count_nonzero(loops)), int(np.count_nonzero(matches.there))))
-    return Answer([_result(matches, query, str(verdicts[query]), stamps) for query in range(len(verdicts))], reasons)
+    reasons.append(_total_said(sum(map(bool, results)), sum(bool(result.candidates) for result in results)))
+    return Answer(results, reasons)
 
 
-def _result(matches: Matches, query: int, verdict: str, stamps: np.ndarray | None) -> LoopResult:
-    match, score, inliers = int(matches.match[query]), float(matches.score[query]), int(matches.inliers[query])
-    stamp = np.nan if stamps is None else float(stamps[query])
-    return LoopResult(
-        query,
-        [(match, score)] if match >= 0 else [],
-        match if verdict == "accepted" else None,
-        verdict,
-        score,
-        inliers if inliers >= 0 else None,
-        None if np.isnan(stamp) else stamp,
-    )
+def _results(given: Candidates, matches: Matches, verdicts: list[str], stamps: np.ndarray) -> list[LoopResult]:
+    """Return the result of each query of the whole drive: that of the last one in which the camera had moved."""
+    results = []
+    for query, row in enumerate(np.searchsorted(given.queries, np.arange(len(stamps)), side="right") - 1):
+        match = int(given.references[matches.match[row]]) if matches.there[row] else -1
+        score, inliers, verdict = float(matches.score[row]), int(matches.inliers[row]), verdicts[row]
+        results.append(
+            LoopResult(
+                query,
+                [(match, score)] if match >= 0 else [],
+                match if verdict == "accepted" else None,
+                verdict,
+                score,
+                inliers if inliers >= 0 and given.queries[row] == query else None,
+                None if np.isnan(stamps[query]) else float(stamps[query]),
+            )
+        )
+    return results
 
 
 def _sequences_said(lines: Lines | None, precision: float, others: str) -> str:

@@ -12,6 +12,7 @@ from loopclosure.places.same_place import MAX_DISTANCE_M
 DRIFT = 0.1  # of the way: more than odometry is usually off
 FAR_M = 2 * MAX_DISTANCE_M  # from there on two frames show different places
 AWAY = 2  # frames in a row
+STILL = 0.5  # of a usual step from frame to frame
 ENOUGH = 0.5  # of the queries with a candidate must have frames far apart, for these to show how others score
 
 
@@ -22,6 +23,7 @@ class Candidates:
     scores     higher = more alike
     allowed    which pairs are candidates
     two        two traverses, or one sequence with itself
+    queries, references  the numbers of the frames that these are, in the whole drive
     different  pairs that are known to show different places; None: not known of enough queries
     said       how long a visit to a place lasts, in a sentence; empty for two traverses
     """
@@ -29,6 +31,8 @@ class Candidates:
     scores: np.ndarray
     allowed: np.ndarray
     two: bool
+    queries: np.ndarray
+    references: np.ndarray
     different: np.ndarray | None = None
     said: str = ""
 
@@ -46,40 +50,70 @@ class Candidates:
 def candidates(
     scores: np.ndarray, allowed: np.ndarray, two: bool, far: np.ndarray | None, visit: int | None
 ) -> Candidates:
-    """Return the pairs that can be loops; the arguments are those of :func:`loopclosure.methods.auto.answer`."""
+    """Return the pairs that can be loops, of frames in which the camera has moved.
+
+    The arguments are those of :func:`loopclosure.methods.auto.answer`.
+    """
+    if not two and visit is not None:
+        allowed = allowed & earlier(len(scores), visit)
+    queries = moved(scores)
+    references = moved(scores.T) if two else queries
+    part = np.ix_(queries, references)
+    scores, allowed, far = scores[part], allowed[part], None if far is None else far[part]
     allowed, different, said = allowed & np.isfinite(scores), None, ""
     if far is not None:
         different, allowed = allowed & far, allowed & ~far
         if np.count_nonzero(different.any(axis=1)) < ENOUGH * np.count_nonzero(allowed.any(axis=1)):
             different = None
-    if not two and visit is not None:
-        allowed &= earlier(len(scores), visit)
+    if visit is not None:
         said = f"a visit to a place lasts {visit} frames, as was said"
     elif not two:
-        back, lasted = _returned(scores, allowed)
+        back, lasted = _returned(scores, allowed, queries)
         allowed &= back
         said = f"a visit to a place lasts {np.median(lasted):.0f} frames in the middle, {lasted.max()} at most"
-    return Candidates(scores, allowed, two, different, said)
+    return Candidates(scores, allowed, two, queries, references, different, said)
 
 
-def _returned(scores: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which pairs (n, n) of one drive have a leave-taking between them, and how long each visit lasts, (n,).
+def moved(scores: np.ndarray) -> np.ndarray:
+    """Return the numbers of the frames, rows of scores (N, M), in which the camera has moved since the one before.
+
+    A frame is left out that is alike to all others as the last that was taken, within ``STILL`` of a usual step: of a
+    robot that stands, one frame is taken. Lines through all of them would lead past the place.
+    """
+    known = np.isfinite(scores)
+    rows = np.where(known, scores, 0.0)
+
+    def step(a: int, b: int) -> float:
+        both = known[a] & known[b]
+        return float(np.abs(rows[a] - rows[b])[both].mean()) if both.any() else np.inf
+
+    steps = np.array([step(i, i + 1) for i in range(len(scores) - 1)])
+    usual = np.median(steps[np.isfinite(steps)]) if np.isfinite(steps).any() else 0.0
+    taken = [0]
+    for number in range(1, len(scores)):
+        if step(taken[-1], number) >= STILL * usual:
+            taken.append(number)
+    return np.array(taken)
+
+
+def _returned(scores: np.ndarray, allowed: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which pairs (n, n) of ``frames`` (n,) have a leave-taking between them, and how long each visit lasts.
 
     A visit to a frame's place ends with ``AWAY`` frames in a row that are as unlike it as different places are: the
     median of all. A camera that stands, or a straight road, is like itself for long; that is no loop.
     """
-    frames = len(scores)
-    numbers = np.arange(frames)
+    count = len(scores)
+    numbers = np.arange(count)
     if not allowed.any():
-        return allowed, np.full(frames, frames)
+        return allowed, np.full(count, count)
     unlike = scores <= np.median(scores[allowed])
-    away = np.logical_and.reduce([unlike[k : frames - AWAY + 1 + k] for k in range(AWAY)])  # from frame i, of frame j
+    away = np.logical_and.reduce([unlike[k : count - AWAY + 1 + k] for k in range(AWAY)])  # from frame i, of frame j
     after = away & (numbers[: len(away), None] > numbers)
-    left = np.where(after.any(axis=0), after.argmax(axis=0) + AWAY, frames)  # the first frame that may be back
+    left = np.where(after.any(axis=0), after.argmax(axis=0), count)
     before = away & (numbers[: len(away), None] + AWAY <= numbers)
     entered = np.where(before.any(axis=0), len(away) - 1 - before[::-1].argmax(axis=0), -1)
-    back = (numbers[:, None] >= left) & (numbers < entered[:, None])
-    return back, left - AWAY - numbers
+    back = (numbers[:, None] >= left + AWAY) & (numbers < entered[:, None])
+    return back, frames[np.minimum(left, count - 1)] - frames
 
 
 def far_apart(poses: np.ndarray) -> np.ndarray:

@@ -49,23 +49,27 @@ class Geometry:
 def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agree: Agree) -> Geometry:
     """Verify some matches and some unlike pairs."""
     accepted, match = matches.accepted, matches.match
+
+    def of_part(query: int, reference: int) -> Agreement:
+        return agree(int(given.queries[query]), int(given.references[reference]))
+
     likely = np.flatnonzero(accepted) if accepted.any() else np.argsort(-matches.score, kind="stable")[:SAMPLE]
     likely = _sample(likely[match[likely] >= 0])
     if not len(likely):
-        return Geometry(check, agree, None, True, "verification: not tried, no query has a candidate")
-    same = sum(check.enough(agree(int(query), int(match[query]))) > 0 for query in likely)
-    against = _unlike(given.known, check, agree)
+        return Geometry(check, of_part, None, True, "verification: not tried, no query has a candidate")
+    same = sum(check.enough(of_part(query, match[query])) > 0 for query in likely)
+    against = _unlike(given.known, check, of_part)
     unlike = np.count_nonzero(against >= 1)
     tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(against)} unlike pairs"
     if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
         said = f"{tried}: these images cannot be verified, so that nothing is rejected for it"
-        return Geometry(check, agree, None, True, said)
+        return Geometry(check, of_part, None, True, said)
     # Unlike pairs of a small place, a desk, do show the same things, and so does a dashboard in all images.
     if unlike > LEAST_SHARE * len(against):
         what = "something is the same in all images, so that only what has far more in common is verified"
     else:
         what = "what is verified is a loop, and what has no verified pair near it is none"
-    return Geometry(check, agree, against, True, f"{tried}: {what}")
+    return Geometry(check, of_part, against, True, f"{tried}: {what}")
 
 
 def _sample(numbers: np.ndarray) -> np.ndarray:
@@ -83,7 +87,7 @@ def _unlike(known: np.ndarray, check: GeometricCheck, agree: Agree) -> np.ndarra
         candidates = order[np.isfinite(known[query, order])]
         # One of the least alike quarter, another quarter of them each time.
         reference = candidates[int(query) % max(1, len(candidates) // 4)]
-        against.append(check.evidence(agree(int(query), int(reference))))
+        against.append(check.evidence(agree(query, reference)))
     return np.array(against)
 
 
@@ -94,7 +98,7 @@ def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: G
         # Lamps of a tunnel repeat: one image that is verified does not overrule a sequence that is accepted.
         other = matches.match if matches.accepted[query] else single
         for reference in dict.fromkeys((int(matches.match[query]), int(other[query]))):
-            agreement = geometry.agree(int(query), reference)
+            agreement = geometry.agree(query, reference)
             matches.inliers[query] = check.enough(agreement)
             matches.evidence[query] = check.evidence(agreement)
             matches.few[query] = agreement.matches < LEAST_MATCHES

@@ -206,11 +206,25 @@ def test_a_visit_to_a_place_has_an_end(length):
     views = again(np.tile(drive(1, 1), (8, 1)), 0.8, 2)[visits % 8]
     scores, earlier = alike(*[again(views, 0.3, 3)] * 2), np.tri(480, k=-1, dtype=bool)
     given = candidates(scores, earlier, False, None, None)
+    visits = visits[given.queries]
     apart = np.subtract.outer(visits, visits)
     assert np.mean(given.allowed[(apart > 0) & (apart % 8 == 0)]) > 0.95
     assert not given.allowed[apart == 0].any()
     assert int(given.said.split()[6]) <= 3 * length
-    assert np.array_equal(candidates(scores, earlier, False, None, 7).allowed, np.tri(480, k=-8, dtype=bool))
+    said = candidates(scores, earlier, False, None, 7)
+    assert np.array_equal(said.allowed, np.subtract.outer(said.queries, said.queries) > 7)
+
+
+@pytest.mark.parametrize("stands", ["query", "reference"])
+def test_a_robot_that_stands_adds_no_frames_to_a_sequence(stands):
+    road = drive(150, 6)
+    places = np.repeat(np.arange(150), np.where(np.isin(np.arange(150), (30, 90)), 40, 1))
+    still, moving = again(again(road, 0.8, 7)[places], 0.03, 8), np.arange(150)
+    there, here = (places, moving) if stands == "query" else (moving, places)
+    scores = alike(still, road) if stands == "query" else alike(road, still)
+    found = answer(scores, everything(scores), two=True)
+    assert np.count_nonzero(found.accepted) > 0.95 * len(there)
+    assert np.all(np.abs(here[found.match] - there)[found.accepted] <= 1)
 
 
 def test_a_loop_does_not_go_on_past_a_seam():
