@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import shutil
 from pathlib import Path
 
@@ -29,7 +30,8 @@ class BuildPy(build_py):
     """An editable installation reads prototxt/ where it is."""
 
     def run(self):
-        """Build the packages, and copy the nets beside them."""
+        """Build the packages, and copy the nets beside them, with their variants."""
+        runpy.run_path(str(NETS / "variants.py"), run_name="__main__")
         super().run()
         if not getattr(self, "editable_mode", False):
             for path in files():

@@ -16,4 +16,5 @@ if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.t
   install -e "$ROOT${NEEDS:+[$NEEDS]}"
   touch "$VENV/installed" "$INSTALLED"
 fi
+"$VENV/bin/python" "$ROOT/prototxt/variants.py"
 export PATH="$VENV/bin:$PATH"
