@@ -12,7 +12,8 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from netspec.exact import libm
-from netspec.exact.blas import add_sums, dots, gemv_routine, one_thread, sum_in_order
+from netspec.exact.blas import array, dots, one_thread, sum_in_order
+from netspec.exact.orders import class_sums
 from netspec.exact.pointwise import Pointwise
 
 
@@ -20,26 +21,20 @@ from netspec.exact.pointwise import Pointwise
 def softmax(scores: torch.Tensor) -> torch.Tensor:
     """Return the softmax along axis 1 of scores (outer, classes, inner) (src/caffe/layers/softmax_layer.cpp)."""
     p = libm.exp(scores - scores.amax(1, keepdim=True))
-    sums = p.new_zeros(len(p), p.shape[2])
-    add_sums(p, sums, axis=0)
-    return p.div_(sums.unsqueeze(1))
+    return p.div_(torch.from_numpy(class_sums(array(p))).unsqueeze(1))
 
 
 def bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return what computes :func:`softmax` of float32 scores of one shape, in memory of its own, with one thread."""
     p = torch.empty(shape)
     largest, sums = torch.empty(2, shape[0], 1, shape[2])
-    values, greatest, totals = p.numpy(), largest.numpy(), sums.numpy()
-    add_up, ones = gemv_routine(values), np.ones(shape[1], np.float32)
-    rows = [(each.T, total[0]) for each, total in zip(values, totals, strict=True)]
+    values, greatest, totals = p.numpy(), largest.numpy(), sums.numpy()[:, 0]
 
     def run(scores: torch.Tensor) -> torch.Tensor:
         np.maximum.reduce(scores.numpy(), 1, out=greatest, keepdims=True)
         torch.sub(scores, largest, out=p)  # never above 0: see libm.exp
         np.copyto(values, np.real(np.exp(values.astype(np.complex64))))
-        totals.fill(0)
-        for each, total in rows:
-            add_up(1.0, each, ones, 1.0, total, 0, 1, 0, 1, 0, 1)
+        totals[:] = class_sums(values)
         return p.div_(sums)
 
     return run
