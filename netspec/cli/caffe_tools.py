@@ -8,7 +8,6 @@ import logging
 from netspec import log
 from netspec.cli.arguments import add_shapes, device, options, positive
 from netspec.cli.run import BUILT, READ, Commands
-from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import WrongUsage
 
@@ -63,9 +62,10 @@ def _device_query(arguments: argparse.Namespace) -> None:
 
     log.info("caffe.cpp:142", f"Querying GPUs {arguments.gpu}")
     count = torch.cuda.device_count()
-    numbers = range(count) if arguments.gpu == "all" else [device(n).index for n in arguments.gpu.split(",")]
     if not count:
-        raise SpecError("torch finds no GPU on this machine")
+        log.info("common.cpp:178", "No GPU: torch finds none on this machine")
+        return
+    numbers = range(count) if arguments.gpu == "all" else [device(n).index for n in arguments.gpu.split(",")]
     for number in numbers:
         properties = torch.cuda.get_device_properties(number)
         for title, value in (

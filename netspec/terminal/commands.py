@@ -9,16 +9,20 @@ one line.
 from __future__ import annotations
 
 import argparse
+import getpass
 import logging
 import os
+import platform
 import re
 import shlex
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from itertools import takewhile
+from pathlib import Path
 from typing import Any
 
 from netspec import log
@@ -30,6 +34,21 @@ SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: there is som
 SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
 CAFFES_LOG = logging.INFO, log.GlogFormatter()
 VARIABLE = "GLOG_minloglevel"
+# Flags that gflags gives every command of Caffe, and glog's: each is taken; what has no effect is said in a line.
+_CAFFES_COMMANDS = ("train", "test", "time", "device_query")
+_CAFFES_FLAGS = ("gpu", "solver", "model", "phase", "level", "stage", "snapshot", "weights", "iterations")
+_CAFFES_FLAGS += ("sigint_effect", "sighup_effect")
+_GLOGS_FLAGS = (
+    "v",
+    "vmodule",
+    "stderrthreshold",
+    "logbuflevel",
+    "logbufsecs",
+    "max_log_size",
+    "log_link",
+    "logfile_mode",
+)
+_GLOGS_SWITCHES = ("colorlogtostderr", "log_prefix", "stop_logging_if_full_disk", "log_backtrace_at")
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 
 
@@ -47,6 +66,7 @@ def refuse(arguments: argparse.Namespace, options: Iterable[str], reason: str) -
 def program(name: str, description: str) -> argparse.ArgumentParser:
     """Return the parser of a program, which has ``--version``; its commands are added with :class:`Commands`."""
     made = _Parser(prog=name, description=description)
+    made.add_argument("-help", action="help", help=argparse.SUPPRESS)
     made.add_argument("--version", "-version", nargs=0, action=_Version, help="show the version and exit")
     return made
 
@@ -95,6 +115,7 @@ class Commands:
         added.add_argument("-q", dest="minloglevel", action="store_const", const=1, help=argparse.SUPPRESS)
         for name in ("--logtostderr", "--alsologtostderr"):  # it always does
             added.add_argument(name, action="store_true", help=argparse.SUPPRESS)
+        added.add_argument("--log_dir", help=argparse.SUPPRESS)
         return added
 
 
@@ -110,7 +131,8 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
         return int(end.code or DONE)
     arguments.command_line = shlex.join([parser.prog, *words])
     try:
-        shown = _logging(_level(arguments), arguments.log_form) if arguments.log_form else nullcontext()
+        form, folder = arguments.log_form, arguments.log_dir
+        shown = _logging(_level(arguments), form, folder) if form else nullcontext()
         with interruptible(), shown:
             arguments.begin(arguments)
             return arguments.run(arguments) or DONE
@@ -193,7 +215,7 @@ class _GflagsParser(_Parser):
         self.register("action", "store_true", _Switch)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        words = [self._translated(word) for word in args or ()]
+        words = [self._translated(word) for word in self._without_effect(list(args or ()))]
         found, unknown = super().parse_known_args(words, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}{self._meant(unknown)}")
@@ -205,6 +227,32 @@ class _GflagsParser(_Parser):
             if (action := self._option_string_actions.get(word.partition("=")[0]))
         }
         return found, unknown
+
+    def _without_effect(self, words: list[str]) -> Iterator[str]:
+        """Give the words, and those of a ``-flagfile``, but for the flags of Caffe and glog that mean nothing here."""
+        caffes = _CAFFES_FLAGS if self.prog.split()[-1] in _CAFFES_COMMANDS else ()
+        own = {name.lstrip("-") for name in self._option_string_actions}
+        while words:
+            word = words.pop(0)
+            name, equals, value = word.lstrip("-").partition("=")
+            if not word.startswith("-") or word == "--" or name in own:
+                yield word
+                if word == "--":
+                    yield from words
+                    return
+            elif name == "flagfile":
+                path = value if equals else words.pop(0) if words else ""
+                try:
+                    lines = Path(path).read_text("utf-8", "replace").splitlines()
+                except OSError as fault:
+                    self.error(f"-flagfile {path}: {fault.strerror}")
+                words = [line.strip() for line in lines if line.strip().startswith("-")] + words
+            elif name in _GLOGS_FLAGS + caffes or name.removeprefix("no") in _GLOGS_SWITCHES:
+                if not equals and name in _GLOGS_FLAGS + caffes and words:
+                    words.pop(0)
+                print(f"{self.prog}: -{name} is a flag of Caffe's or glog's that has no effect here", file=sys.stderr)
+            else:
+                yield word
 
     def _meant(self, unknown: Sequence[str]) -> str:
         """Return a hint at the option that is most like the first unknown one."""
@@ -272,22 +320,31 @@ def _level(arguments: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _logging(level: int, form: logging.Formatter) -> Iterator[None]:
-    """Show Caffe's log on stderr, above the progress bar if there is one.
+def _logging(level: int, form: logging.Formatter, folder: str | None) -> Iterator[None]:
+    """Show Caffe's log on stderr, above the progress bar if there is one; or write it into a folder, as glog does.
 
     A warning is shown once, even if several nets of a solver give it.
     """
-    handler = logging.StreamHandler(_BarAware())
-    handler.setFormatter(form)
-    handler.addFilter(_WarnOnce())
+    handlers: list[logging.Handler] = [logging.StreamHandler(_BarAware())]
+    if folder:
+        handlers[0].setLevel(logging.WARNING)
+        moment = time.strftime("%Y%m%d-%H%M%S")
+        name = f"caffe.{platform.node()}.{getpass.getuser()}.log.INFO.{moment}.{os.getpid()}"
+        handlers.append(logging.FileHandler(os.path.join(folder, name), encoding="utf-8"))
+    for handler in handlers:
+        handler.setFormatter(form)
+        handler.addFilter(_WarnOnce())
     before = log.logger.level, log.logger.propagate
-    log.logger.addHandler(handler)
+    for handler in handlers:
+        log.logger.addHandler(handler)
     log.logger.setLevel(level)
     log.logger.propagate = False
     try:
         yield
     finally:
-        log.logger.removeHandler(handler)
+        for handler in handlers:
+            log.logger.removeHandler(handler)
+            handler.close()
         level, log.logger.propagate = before
         log.logger.setLevel(level)
 

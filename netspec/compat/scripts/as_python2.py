@@ -75,9 +75,9 @@ class Py2Bytes(bytes):
         """Return the same: these are bytes already."""
         return self
 
-    def _taking_text(own):
+    def _taking_text(own):  # pyright: ignore[reportSelfClsParameterName]
         def method(self, *arguments, **named):
-            result = own(
+            result = own(  # pyright: ignore
                 self, *([*map(py2_bytes, a)] if isinstance(a, list) else py2_bytes(a) for a in arguments), **named
             )
             if isinstance(result, (list, tuple)):
@@ -88,9 +88,9 @@ class Py2Bytes(bytes):
 
     for _name in dir(bytes):
         if not _name.startswith("_") and _name not in ("decode", "fromhex", "hex", "maketrans"):
-            locals()[_name] = _taking_text(getattr(bytes, _name))
+            locals()[_name] = _taking_text(getattr(bytes, _name))  # pyright: ignore[reportCallIssue]
     for _name in ("add", "contains", "eq", "ge", "getitem", "gt", "le", "lt", "mul", "ne"):
-        locals()[f"__{_name}__"] = _taking_text(getattr(bytes, f"__{_name}__"))
+        locals()[f"__{_name}__"] = _taking_text(getattr(bytes, f"__{_name}__"))  # pyright: ignore
     del _name, _taking_text
 
 

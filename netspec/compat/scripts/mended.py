@@ -58,9 +58,10 @@ def _call(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
 def _meant(said: str, of_type: bool, arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
     """Return the arguments that were meant, and those by name; None where they are as they should be."""
     if of_type and ("sort() takes" in said or "'cmp'" in said or said.startswith("sorted expected")):
-        *others, comes = (*arguments, *([named["cmp"]] if "cmp" in named else []))
+        others: list[Any] = [*arguments, *([named["cmp"]] if "cmp" in named else [])]
+        comes: Any = others.pop()
         rest = {name: value for name, value in named.items() if name != "cmp"}
-        return (others, {**rest, "key": functools.cmp_to_key(comes)}) if callable(comes) else None
+        return (others, {**rest, "key": functools.cmp_to_key(comes)}) if callable(comes) else None  # pyright: ignore
     if _ASKS_FOR_BYTES.search(said):
         change = _as_bytes
     elif of_type and _ASKS_FOR_TEXT.search(said):

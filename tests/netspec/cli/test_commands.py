@@ -202,6 +202,18 @@ def test_upgrades_write_the_current_format(run: Run) -> None:
     )
 
 
+def test_flags_of_glog_and_of_caffes_other_commands_are_taken(run: Run, tmp_path: Path) -> None:
+    flags = tmp_path / "flags"
+    flags.write_text("# all of them\n-iterations=1\n--stderrthreshold=2\n-colorlogtostderr\n")
+    words = ["time", "-model", NET, f"-flagfile={flags}", "-weights", "w", "-v=1", "-log_prefix=false"]
+    result = run(*words, "-log_dir", str(tmp_path))
+    assert result.status == 0
+    (logged,) = tmp_path.glob("caffe.*.log.INFO.*")
+    assert "] Use CPU." in logged.read_text()
+    wrong = run("time", "-model", NET, "-flagfile", "nowhere")
+    assert wrong.status == 2
+
+
 def test_layers_prints_what_each_says_of_itself(run: Run) -> None:
     rows = [line.split(maxsplit=1) for line in run("layers").out.splitlines()]
     assert [row[0] for row in rows] == layer_types()
@@ -211,7 +223,8 @@ def test_layers_prints_what_each_says_of_itself(run: Run) -> None:
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a GPU")
 def test_without_a_gpu_the_cpu_is_used_and_a_wish_for_a_gpu_refused(run: Run, edited: Edit) -> None:
-    assert run("device_query").fault == "torch finds no GPU on this machine"
+    asked = run("device_query")
+    assert (asked.status, asked.messages[-1]) == (0, "No GPU: torch finds none on this machine")
     refused = "torch finds no GPU(s) on this machine; omit --gpu to use the CPU"
     for words in (["train", SOLVER], ["test", "--model", NET, "--weights", INIT], ["time", "--model", NET]):
         assert run(*words, "-gpu", "0").fault == f"--gpu 0: {refused}"
