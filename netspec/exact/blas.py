@@ -78,10 +78,11 @@ def gemm(
 ) -> None:
     """C = A B, or C += A B; ``a_t`` and ``b_t`` take the transposes of what is stored (caffe_cpu_gemm).
 
-    All three are matrices, stored row by row without gaps. BLAS stores by columns, so it sees their transposes.
+    All three are matrices, C stored row by row without gaps. BLAS stores by columns, so it sees their transposes.
     Stacks of matrices (N, rows, columns) are multiplied one after the other, as Caffe goes from image to image. There a
     single matrix stands for N times itself; as C it sums up the products, with ``add``.
     """
+    a, b = _without_gaps(a), _without_gaps(b)
     flags = [ctypes.create_string_buffer(b"T" if t else b"N") for t in (b_t, a_t)]
     sizes = [ctypes.c_int(n) for n in (c.shape[-1], c.shape[-2], a.shape[-2 if a_t else -1])]
     factors = [_NUMBERS[c.dtype](n) for n in (1.0, add)]
@@ -102,6 +103,7 @@ def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int, factor: float = 1.0
     Of a stack of matrices (N, rows, columns) the sums of each are added, one after the other; with sums of two axes,
     (N, ...), to those of its own.
     """
+    a = _without_gaps(a)
     ones = torch.ones(a.shape[axis - 2], dtype=a.dtype)
     flag = ctypes.create_string_buffer(b"T" if axis == 1 else b"N")
     rows, columns, step = (ctypes.c_int(n) for n in (a.shape[-2], a.shape[-1], 1))
@@ -134,6 +136,13 @@ def _function(name: str, dtype: torch.dtype) -> Callable[..., None]:
 
 def _count(*matrices: torch.Tensor) -> int:
     return max((len(m) for m in matrices if m.dim() == 3), default=1)
+
+
+def _without_gaps(matrices: torch.Tensor) -> torch.Tensor:
+    """Return matrices, or a copy where their rows do not lie one after the other: in part of a blob, after a Slice."""
+    rows, columns = matrices.shape[-2:]
+    side_by_side = (matrices.stride(-1) == 1 or columns == 1) and (matrices.stride(-2) == columns or rows == 1)
+    return matrices if side_by_side else matrices.contiguous()
 
 
 def _step(matrices: torch.Tensor) -> int:

@@ -33,8 +33,8 @@ class ChannelProducts(ParameterSums):
         ctx: Any, values: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, in_place: bool
     ) -> torch.Tensor:
         ParameterSums.keep(ctx, values, (factors, bias), in_place)
-        tops = values.clone() if factors is None else values * factors.view(-1, 1)
-        return tops if bias is None else tops.add_(bias.view(-1, 1))
+        tops = values.clone() if factors is None else values * factors.reshape(-1, 1)
+        return tops if bias is None else tops.add_(bias.reshape(-1, 1))
 
     @staticmethod
     @once_differentiable
@@ -49,7 +49,7 @@ class ChannelProducts(ParameterSums):
             _add_products(values * diff, factors_sums.view(-1))
         values_diff = None
         if ctx.needs_input_grad[0]:
-            values_diff = diff if factors is None else diff * factors.view(-1, 1)
+            values_diff = diff if factors is None else diff * factors.reshape(-1, 1)
         return values_diff, *ParameterSums.for_autograd(ctx, sums), None
 
 
@@ -59,7 +59,7 @@ def _add_products(products: torch.Tensor, sums: torch.Tensor) -> None:
     if inner > 1 and outer * channels == 1:
         sums += _total(products)
         return
-    of_outer = products.view(outer, channels) if inner == 1 else _inner_sums(products)
+    of_outer = products.reshape(outer, channels) if inner == 1 else _inner_sums(products)
     if outer == 1:
         sums += of_outer[0]
     elif channels == 1:
@@ -99,7 +99,7 @@ class Slopes(ParameterSums):
     @staticmethod
     def forward(ctx: Any, values: torch.Tensor, slopes: torch.Tensor, in_place: bool) -> torch.Tensor:
         ParameterSums.keep(ctx, values, (slopes,), in_place)
-        return torch.where(values > 0, values, values * slopes.view(-1, 1))
+        return torch.where(values > 0, values, values * slopes.reshape(-1, 1))
 
     @staticmethod
     @once_differentiable
@@ -112,7 +112,7 @@ class Slopes(ParameterSums):
                 terms = terms.view(len(terms), len(values), -1).transpose(0, 1).reshape(1, -1)
             flat = slopes_sums.view(-1, 1)
             flat.copy_(sum_in_order(torch.cat([flat, terms], 1), 1).unsqueeze(1))
-        values_diff = torch.where(values > 0, diff, diff * slopes.view(-1, 1)) if ctx.needs_input_grad[0] else None
+        values_diff = torch.where(values > 0, diff, diff * slopes.reshape(-1, 1)) if ctx.needs_input_grad[0] else None
         return values_diff, *ParameterSums.for_autograd(ctx, sums), None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -29,7 +30,7 @@ from netspec.layers.contract.preparing import Kernel, Preparation, copies, finis
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.contract.training import Kernels, Learning, weight_and_bias
-from netspec.layers.vision.layout import channels_side_by_side
+from netspec.layers.vision.layout import channels_side_by_side, map_by_map, of_one_channel
 from netspec.layers.vision.sliding import TORCH_USUAL, SlidingFilter
 
 
@@ -117,9 +118,12 @@ class Convolution(SlidingFilter):
             return ColumnProducts.apply(
                 maps, weight, bias, sliding, self.group, self.context.options.accumulate_in_place
             )
+        if self.reads_padding_alone:
+            maps = F.pad(maps, [p for p in reversed(sliding.pad) for _ in range(2)])
+            sliding = replace(sliding, pad=(0,) * len(sliding.pad))
         if not torch.is_grad_enabled():  # weights would be laid out anew for each product
-            return convolution(maps, weight, bias, sliding, self.group)
-        lay_out = channels_side_by_side if maps.numel() > 2 * weight.numel() else torch.Tensor.contiguous
+            return convolution(of_one_channel(maps), weight, bias, sliding, self.group)
+        lay_out = channels_side_by_side if maps.numel() > 2 * weight.numel() else map_by_map
         return self.convolved(maps, weight, bias, sliding, lay_out)
 
     def convolved(
@@ -135,6 +139,11 @@ class Convolution(SlidingFilter):
         if self.context.options.accumulate_in_place and not is_recorded():
             return SummedConvolutions.apply(maps, weight, bias, sliding, self.group, transposed, lay_out)
         return convolution(lay_out(maps), weight, bias, sliding, self.group, transposed)
+
+    @property
+    def reads_padding_alone(self) -> bool:
+        """Whether a filter fits between the edge of the padding and the map: oneDNN may then read beyond the map."""
+        return any(p >= e for p, e in zip(self.pad, self.extent, strict=True))
 
     @property
     def small(self) -> bool:
@@ -153,10 +162,12 @@ class Convolution(SlidingFilter):
         shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
         if self.is_exact(weight, self.small):
             return lent(BoundColumns(shape, sliding, self.group, at_rest(*copies(self.values(), how))), how)
+        if self.reads_padding_alone:
+            return None
         if shape[0] * self._work > SMALL_PRODUCT and how.pack and fused.suits(weight):
             return fused.convolution(shape, weight, bias, sliding, self.group, how)
         geometry = (self.stride, self.pad, self.dilation, self.group)
-        return finished(lambda maps: torch.conv2d(maps, weight, bias, *geometry), how.finish)
+        return finished(lambda maps: torch.conv2d(of_one_channel(maps), weight, bias, *geometry), how.finish)
 
     def prepare_training(self, learning: Learning) -> Kernels | None:
         """Return the kernels for a single bottom (N, C, H, W)."""
@@ -170,7 +181,9 @@ class Convolution(SlidingFilter):
             asked = (learning.wanted[0], learning.steady)
             bound = BoundColumns(shape, sliding, self.group, Weights(weight, bias, *sums), *asked)
             return bound.forward, bound.backward
-        lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else torch.Tensor.contiguous
+        if self.reads_padding_alone:
+            return None
+        lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else map_by_map
         return self.convolutions(sliding, weight, bias, sums, learning.wanted[0], lay_out)
 
     def convolutions(

@@ -21,13 +21,31 @@ FEWEST = 3  # channels from which on the other order pays
 
 def channels_side_by_side(maps: torch.Tensor) -> torch.Tensor:
     """Return maps (N, C, H, W) in the order that suits torch's kernels: on a CPU with their channels side by side."""
-    if maps.dim() != 4 or maps.device.type != "cpu" or maps.shape[1] < FEWEST:
+    if maps.dim() != 4 or maps.device.type != "cpu":
         return maps
+    if maps.shape[1] < FEWEST:
+        return of_one_channel(maps)
     if maps.is_contiguous(memory_format=torch.channels_last):
         return maps
     if is_recorded():
         return maps.contiguous(memory_format=torch.channels_last)
     return _SideBySide.apply(maps)
+
+
+def of_one_channel(maps: torch.Tensor) -> torch.Tensor:
+    """Return maps (N, 1, H, W) with the strides of Caffe's order, others as they are.
+
+    A single channel lies alike in both orders. By its strides torch may take it for the other one, and some of oneDNN's
+    convolutions then compute wrong numbers.
+    """
+    if maps.dim() != 4 or maps.shape[1] != 1 or maps.stride(1) == maps.shape[2] * maps.shape[3]:
+        return maps
+    return maps.reshape(-1).view(maps.shape)
+
+
+def map_by_map(maps: torch.Tensor) -> torch.Tensor:
+    """Return maps (N, C, H, W) in Caffe's order."""
+    return of_one_channel(maps.contiguous())
 
 
 class _SideBySide(torch.autograd.Function):

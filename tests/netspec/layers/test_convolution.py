@@ -114,6 +114,41 @@ def test_the_way_to_sum_does_not_show(build, size: int) -> None:
             torch.testing.assert_close(torchs, other, rtol=1e-4, atol=1e-4 * float(torchs.detach().abs().max()))
 
 
+PADDING = [  # filters that fit into the padding: SIGSEGV in oneDNN; and maps of one channel, wrong numbers there
+    ((5, 2, 12, 1), "kernel_size: 1 stride_h: 1 stride_w: 2 pad_h: 2 pad_w: 1"),
+    ((2, 64, 12, 1), "group: 16 kernel_h: 3 kernel_w: 1 dilation: 2 stride: 2 pad_h: 0 pad_w: 1"),
+    ((5, 8, 12, 1), "group: 8 kernel_size: 1 stride: 2 pad: 1"),
+    ((5, 1, 12, 1), "kernel_size: 2 stride_h: 1 stride_w: 3 pad_h: 0 pad_w: 1"),
+]
+
+
+@pytest.mark.parametrize(("shape", "text"), PADDING)
+@pytest.mark.parametrize("adds", [False, True])
+def test_calls_that_onednn_gets_wrong_are_not_made(build, shape: tuple[int, ...], text: str, adds: bool) -> None:
+    layer = build(
+        f'type: "Convolution" convolution_param {{ num_output: 16 {text} {FILL} }}',
+        shape,
+        exact="none",
+        accumulate_in_place=adds,
+    )
+    assert layer.reads_padding_alone or shape[1] == 1
+    maps = torch.empty_strided(shape, torch.empty(shape).to(memory_format=torch.channels_last).stride())
+    maps.normal_().requires_grad_()
+    (top,) = layer.run(maps)
+    top.sin().sum().backward()
+    with torch.no_grad():
+        (silent,) = layer.run(maps)
+    found = [top, silent, maps.grad, *(blob.grad for blob in layer.blobs)]
+    exactly = layer.double()
+    twin = maps.detach().double().contiguous().requires_grad_()
+    for blob in exactly.blobs:
+        blob.grad = None
+    (expected,) = exactly.run(twin)
+    expected.sin().sum().backward()
+    for mine, theirs in zip(found, [expected, expected, twin.grad, *(b.grad for b in exactly.blobs)], strict=True):
+        torch.testing.assert_close(mine.double(), theirs, rtol=1e-4, atol=1e-4)
+
+
 @pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
 def test_bottoms_add_to_the_filters_gradient_the_first_one_first(build, kind: str) -> None:
     text = f'type: "{kind}" convolution_param {{ num_output: 4 kernel_size: 3 {FILL} }}'
