@@ -29,3 +29,5 @@ from netspec.compat.pycaffe.version import __version__
 from netspec.layers import layer_types as layer_type_list
 from netspec.layers.utility.live_blobs import Blob, BlobVec
 from netspec.layers.utility.pycaffe_shim import Layer
+
+RawBlobVec = BlobVec  # its name in the Caffe of 2015, which layers in Python import

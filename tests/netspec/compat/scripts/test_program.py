@@ -80,6 +80,7 @@ IMPORTS = """
 import caffe
 import caffe.io, caffe.draw, caffe.classifier, caffe.detector, caffe.net_spec, caffe.coord_map
 import caffe.proto.caffe_pb2
+from caffe._caffe import RawBlobVec
 from caffe import layers as L, params as P, to_proto, NetSpec
 from caffe.proto import caffe_pb2
 from caffe.proto.caffe_pb2 import NetParameter, LayerParameter
