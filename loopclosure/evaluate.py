@@ -17,7 +17,7 @@ from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, make_method
 from loopclosure.places.datasets import DataSet
 from loopclosure.places.truth import Truth
-from loopclosure.precision_recall import BestMatches, JudgedScores, PrecisionRecall
+from loopclosure.precision_recall import ALL_PAIRS, BestMatches, JudgedScores, PrecisionRecall
 from loopclosure.progress import Progress, silent
 from netspec.errors import printable
 
@@ -113,6 +113,14 @@ class Outcome:
     def seconds_on_frames(self) -> float:
         """Return the total seconds spent on the frames, without training."""
         return sum(seconds for stage, seconds in self.seconds.items() if stage not in self.training_stages)
+
+    @property
+    def shown(self) -> dict[str, dict[str, float]]:
+        """The measures for a reader; NaN for those over all pairs, where a method scores one pair of a query."""
+        measures = self.measures
+        if self.answer:
+            measures = {**measures, ALL_PAIRS: dict.fromkeys(measures[ALL_PAIRS], np.nan)}
+        return measures
 
     @cached_property
     def measures(self) -> dict[str, dict[str, float]]:

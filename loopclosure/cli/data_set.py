@@ -125,6 +125,7 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     if references is not None and excluded:
         raise WrongUsage("--exclude-frames means nothing with references: nothing is near in time")
     if posed:
+        _check_truth(source, kind)
         if truth:
             raise WrongUsage("truth and poses both say which frames show the same place; give one")
         if references and "poses" in source.settings:
@@ -163,8 +164,24 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     return datasets.load_place_pairs(source.path, chosen)
 
 
+def _check_truth(source: Source, kind: str) -> None:
+    """Refuse a plain folder of images: nothing says which of them show the same place."""
+    path = source.path
+    plain = not kind and not is_recording(path) and "poses" not in source.settings and _layout(source, path) == "tum"
+    if plain and path.is_dir() and not (path / "rgb.txt").exists():
+        expected = "add ,poses=FILE, or write images:FOLDER,truth=MASK; detect finds loops without truth"
+        raise InputError(f"has no truth, which says what frames show the same place; {expected}", path)
+
+
 def _layout(source: Source, path: Path) -> str:
     return layout_of(path, "images" if "poses" in source.settings else "tum")
+
+
+def warn_of_unreadable(recording: Recording) -> Recording:
+    """Name the images that could not be read; return the recording without them."""
+    if said := recording.left_out():
+        warn(said)
+    return recording.readable()
 
 
 def recording_of(text: str, frames: Path) -> Recording:

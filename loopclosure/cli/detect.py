@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.cli.data_set import recording_of, typed
+from loopclosure.cli.data_set import recording_of, typed, warn_of_unreadable
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -131,14 +131,19 @@ def _detect(a: argparse.Namespace) -> None:
         results = run.run_detector(detector, recording, features, bar)
         said = [run.verdicts_said(results)]
     if recording is not None:
+        recording = warn_of_unreadable(recording)
         names += recording.names
         if a.rerun:
             write_detected(Path(a.rerun), recording, results, bar)
     write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names)
     write_whole(out / "chosen.txt", "\n".join(said) + "\n")
+    # Drawing takes a second to import.
+    from loopclosure.report.drive import write_drive
+
+    write_drive(out / "report.html", results, said, recording, a.command_line)
     loops = sum(result.accepted is not None for result in results)
+    print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}; to be looked at: {out / 'report.html'}")
     print("\n".join(said))
-    print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}")
     if np.isfinite(detector.poses).any():
         left_out = write_g2o(out / "loops.g2o", detector.poses, detector.loops, run.from_poses(detector))
         note = f", {left_out} loops without a pose left out" if left_out else ""

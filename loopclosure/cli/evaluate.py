@@ -52,7 +52,7 @@ def _training(text: str) -> Source:
 def _evaluate(a: argparse.Namespace) -> None:
     # Drawing takes seconds to import, which the other commands need not wait for.
     from loopclosure.report.files import measures_text
-    from loopclosure.report.page import write_report
+    from loopclosure.report.page import verdict, write_report
 
     data = data_set(a)
     context = MethodContext(data.exclude_frames, a.seed, data.stamps)
@@ -64,5 +64,6 @@ def _evaluate(a: argparse.Namespace) -> None:
     training = f"{len(train)} images of {', '.join(t.path.name for t in a.train)}" if train else "no training images"
     evaluation = evaluate.evaluate(data, methods, train, training, bar)
     page = write_report(evaluation, a.out, a.title, a.command_line)
+    print(verdict(evaluation))
     print(measures_text(evaluation))
     print(f"report: {page}")

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from loopclosure.cli.data_set import recording_of
+from loopclosure.cli.data_set import recording_of, warn_of_unreadable
 from loopclosure.detector import run
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe
@@ -52,7 +52,9 @@ def _add(a: argparse.Namespace) -> None:
 def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
     for text in a.source:
         before, number = len(into), len(into.sessions)
-        results = into.add(recording_of(text, Path(a.map) / "frames" / f"{number:06d}"), describe, a.index, bar)
+        recording = recording_of(text, Path(a.map) / "frames" / f"{number:06d}")
+        results = into.add(recording, describe, a.index, bar)
+        warn_of_unreadable(recording)
         loops = [result.accepted for result in results if result.accepted is not None]
         between = sum(frame < before for frame in loops)
         said = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
@@ -65,6 +67,7 @@ def _query(a: argparse.Namespace) -> None:
     recording = recording_of(a.source, out / "frames")
     detector = known.detector(run.load_describe(known.describer), a.index)
     results: Sequence[LoopResult] = run.run_detector(Visitor(detector), recording, progress=bar)
+    recording = warn_of_unreadable(recording)
     found = [result for result in results if result]
     write_loops_csv(out / "loops.csv", found, recording.stamps, recording.names, detector.stamps, known.names)
     print(run.verdicts_said(results))

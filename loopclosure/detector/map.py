@@ -139,6 +139,7 @@ class Map:
             detector = self._detector(described, index)
             before = len(detector)
             results = run_detector(detector, recording, progress=progress)
+            recording = recording.readable()
             rows = np.array(described.kept)
             folder = self.folder / f"{len(self.sessions):06d}"
             arrays: dict[str, Any] = detector.arrays_since(before)

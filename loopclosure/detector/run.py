@@ -6,8 +6,8 @@ import importlib
 import importlib.util
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast
@@ -36,6 +36,7 @@ from loopclosure.progress import Progress, silent
 
 DESCRIBERS = "loopclosure.describers"  # the group of entry points: name -> function that makes a describer
 NAME = r"[\w-]+"  # of such an entry point
+NAMED = 10  # images that cannot be read
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
 
 
@@ -47,6 +48,7 @@ class Recording:
     stamps  (N,) seconds, None if not known
     poses   (N, 7) tx ty tz qx qy qz qw, NaN or None if not known
     doubts  sentences about poses that look wrong
+    unreadable  numbers of images that ``frames`` could not read
     """
 
     source: Path
@@ -56,28 +58,59 @@ class Recording:
     stamps: np.ndarray | None = None
     poses: np.ndarray | None = None
     doubts: tuple[str, ...] = ()
+    unreadable: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def frames(self) -> Iterator[tuple[np.ndarray, float | None]]:
-        """Yield each image (H, W, 3) uint8 BGR and its stamp."""
+    def frames(self, wanted: Collection[int] | None = None) -> Iterator[tuple[int, np.ndarray, float | None]]:
+        """Yield the number from 0, the image (H, W, 3) uint8 BGR and the stamp of each frame, or of those ``wanted``.
+
+        An image that cannot be read is left out. Raises InputError where none can be read.
+        """
+        chosen = range(len(self)) if wanted is None else sorted(wanted)
         if self.images is not None:
-            for i, path in enumerate(self.images):
-                yield read_bgr(path), None if self.stamps is None else float(self.stamps[i])
+            for i in chosen:
+                try:
+                    image = read_bgr(self.images[i])
+                except InputError:
+                    self.unreadable.append(i)
+                    if len(self.unreadable) == len(self):
+                        raise
+                    continue
+                yield i, image, None if self.stamps is None else float(self.stamps[i])
             return
-        wanted = iter(self.numbers.tolist())
-        following = next(wanted, None)
+        following_ones = iter(chosen)
+        i = next(following_ones, None)
+        following = None if i is None else int(self.numbers[i])
         number = -1
-        for number, (seconds, image) in enumerate(video_frames(self.source)):
+        for number, (seconds, image) in enumerate(video_frames(self.source) if following is not None else ()):
             if number == following:
-                yield image, seconds
-                following = next(wanted, None)
+                assert i is not None
+                yield i, image, seconds
+                i = next(following_ones, None)
+                following = None if i is None else int(self.numbers[i])
                 if following is None:
                     return
         if following is not None:
             message = f"ends after {number + 1} frames, though frame {following} is wanted and it says that it has it"
             raise InputError(f"{message}; give --stop {number + 1}", self.source)
+
+    def left_out(self) -> str:
+        """Say which images were left out, in a sentence; empty where all could be read."""
+        names = [self.names[i] for i in self.unreadable]
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        said = f"{len(names)} of {len(self)} images cannot be read and are left out: {', '.join(names[:NAMED])}{more}"
+        return said if names else ""
+
+    def readable(self) -> Recording:
+        """Return the recording without the images that could not be read."""
+        if not self.unreadable or self.images is None:
+            return self
+        kept = [i for i in range(len(self)) if i not in set(self.unreadable)]
+        names, images = [self.names[i] for i in kept], [self.images[i] for i in kept]
+        stamps, poses = (None if of is None else of[kept] for of in (self.stamps, self.poses))
+        return Recording(self.source, names, images, self.numbers[kept], stamps, poses, self.doubts)
 
 
 def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Recording:
@@ -102,7 +135,10 @@ def run_detector(
     features: Features | None = None,
     progress: Progress = silent,
 ) -> list[LoopResult]:
-    """Add every frame of a recording; ``features``, with a descriptor of each image, replace ``describe``."""
+    """Add every frame of a recording; ``features``, with a descriptor of each image, replace ``describe``.
+
+    Images that cannot be read are left out: the frames are then those of ``recording.readable()``.
+    """
     rows = None
     if features is not None:
         if recording.images is None:
@@ -114,7 +150,7 @@ def run_detector(
             stamp = None if recording.stamps is None else float(recording.stamps[i])
             results.append(detector.add_descriptor(row, stamp, _pose(recording, i)))
         return results
-    for i, (image, stamp) in enumerate(progress(recording.frames(), "frames", len(recording))):
+    for i, image, stamp in progress(recording.frames(), "frames", len(recording)):
         if rows is None:
             results.append(detector.add(image, stamp, _pose(recording, i)))
         else:

@@ -9,11 +9,14 @@ from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import Recording, run_detector
 from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
+from loopclosure.errors import InputError
 from loopclosure.methods.auto import PRECISION, Answer, answer
 from loopclosure.methods.candidates import far_apart
 from loopclosure.places.frames import gray, read_gray
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
+
+NOTHING = np.zeros((8, 8), np.uint8)
 
 
 def whole_drive(
@@ -32,17 +35,20 @@ def whole_drive(
     least threshold that accepts none of this drive's others.
     """
     run_detector(detector, recording, features, progress)
+    if recording.unreadable and odometry is not None:
+        odometry = np.delete(odometry, recording.unreadable, axis=0)
+    recording = recording.readable()
     settings, rows = detector.settings, detector.descriptors
     scores = similarity_matrix(rows, None, settings.metric, settings.views)
     numbers = np.arange(len(rows))
     exclusion = Exclusion(seconds=settings.exclude_seconds)
     allowed = np.tri(len(rows), k=-1, dtype=bool)
     allowed &= ~exclusion.excludes(numbers, numbers, detector.stamps, detector.stamps)
-    check, pairs = GeometricCheck(), Pairs(lambda number: read_gray((recording.images or [])[number]))
+    check, pairs = GeometricCheck(), Pairs(lambda number: _gray_image(recording, number))
 
     def agree(query: int, reference: int) -> Agreement:
         if recording.images is None and not pairs:
-            for number, (image, _) in enumerate(progress(recording.frames(), "local features", len(recording))):
+            for number, image, _ in progress(recording.frames(), "local features", len(recording)):
                 pairs.put(check, number, gray(image))
         return pairs.agreement(check, query, reference)
 
@@ -53,3 +59,12 @@ def whole_drive(
     above = single[found.accepted & (single > others)]
     detector.decided([result for result in found.results if result], above.min() if len(above) else None)
     return found
+
+
+def _gray_image(recording: Recording, number: int) -> np.ndarray:
+    """Return an image file as gray values; black where it cannot be read, since its features were there before."""
+    assert recording.images is not None
+    try:
+        return read_gray(recording.images[number])
+    except InputError:
+        return NOTHING

@@ -96,7 +96,7 @@ def measures_text(evaluation: Evaluation) -> str:
     heads.append("ms/frame")
     rows = []
     for outcome in evaluation.outcomes:
-        values = outcome.measures
+        values = outcome.shown
         cells = [share(v) for v in (*values[ALL_PAIRS].values(), *values[BEST_MATCH].values())]
         if soft:
             cells += [share(values[BEST_MATCH + SOFT_ZONE][name]) for name in SOFT_MEASURES]

@@ -31,7 +31,7 @@ PICTURE_HEIGHT = 120  # pixels of the pictures of pairs
 
 
 @dataclass(frozen=True)
-class _Pair:
+class Pair:
     """A pair of images side by side (JPEG), and what stands below it."""
 
     picture: bytes
@@ -39,12 +39,12 @@ class _Pair:
 
 
 @dataclass(frozen=True)
-class _Kind:
+class Kind:
     """Some pairs of one kind; ``name`` is their CSS class."""
 
     name: str
     title: str
-    pairs: list[_Pair]
+    pairs: list[Pair]
 
 
 def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", command: str = "") -> Path:
@@ -93,6 +93,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, bytes], title: str, comman
     return rendered(
         "report.html.jinja",
         title=title,
+        verdict=verdict(evaluation),
         command=command,
         data=data,
         truth=truth.description,
@@ -112,9 +113,25 @@ def _page(evaluation: Evaluation, pictures: dict[str, bytes], title: str, comman
     )
 
 
+def verdict(evaluation: Evaluation) -> str:
+    """Say in one sentence how good the method is, or the best of several: that with the most right best matches."""
+    outcome = max(evaluation.outcomes, key=lambda outcome: np.count_nonzero(outcome.matches.right))
+    right, matches = int(np.count_nonzero(outcome.matches.right)), outcome.matches
+    loops = int(np.count_nonzero(evaluation.data.truth.queries_with_a_loop))
+    which = f"{outcome.name}: " if len(evaluation.outcomes) == 1 else f"Best of all, {outcome.name}: "
+    if outcome.answer:
+        accepted = int(np.count_nonzero(matches.reference >= 0))
+        return (
+            f"{which}{accepted} of {len(matches.reference)} frames close a loop; {right} are right, {loops} could be."
+        )
+    before = round(outcome.best.recall_at_full_precision * loops) if loops else 0
+    said = f"{right} of the {loops} frames that have a loop find it with their best match"
+    return f"{which}{said}, {before} of them before the first mistake."
+
+
 def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, bool]]]]:
     """Return for each method its name and its measures, each with whether it is the best of several methods."""
-    rows = [[v for values in o.rule.measures().values() for v in values.values()] for o in evaluation.outcomes]
+    rows = [[v for name in (ALL_PAIRS, BEST_MATCH) for v in o.shown[name].values()] for o in evaluation.outcomes]
     for row, outcome in zip(rows, evaluation.outcomes, strict=True):
         if outcome.soft is not None:
             row += [outcome.soft.measures()[BEST_MATCH][name] for name in SOFT_MEASURES]
@@ -134,7 +151,7 @@ def _stages(outcome: Outcome) -> list[tuple[str, float, bool]]:
     ]
 
 
-def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:
+def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
     """Return the best and worst pairs of one method as pictures."""
     truth, matches = evaluation.data.truth, outcome.matches
     answered = matches.reference >= 0
@@ -148,15 +165,15 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[_Kind]:
     excused = plots.overlapping(outcome, wrong)
     lowest = np.argsort(true_scores, kind="stable")
 
-    def pairs(queries: np.ndarray, references: np.ndarray) -> list[_Pair]:
+    def pairs(queries: np.ndarray, references: np.ndarray) -> list[Pair]:
         return [_pair(evaluation, outcome, queries[i], references[i]) for i in _spread(queries, evaluation)]
 
     both = "" if outcome.soft is None else " in both zones"
     kinds = [
-        _Kind("found", "right, highest score", pairs(right, matches.reference[right])),
-        _Kind("false", f"wrong{both}, highest score", pairs(wrong[~excused], matches.reference[wrong[~excused]])),
-        _Kind("excused", "wrong by the rule, views overlap", pairs(wrong[excused], matches.reference[wrong[excused]])),
-        _Kind("missed", "true, lowest score", pairs(loops[lowest], true[lowest])),
+        Kind("found", "right, highest score", pairs(right, matches.reference[right])),
+        Kind("false", f"wrong{both}, highest score", pairs(wrong[~excused], matches.reference[wrong[~excused]])),
+        Kind("excused", "wrong by the rule, views overlap", pairs(wrong[excused], matches.reference[wrong[excused]])),
+        Kind("missed", "true, lowest score", pairs(loops[lowest], true[lowest])),
     ]
     return kinds if outcome.soft is not None else [kind for kind in kinds if kind.name != "excused"]
 
@@ -171,11 +188,16 @@ def _spread(queries: np.ndarray, evaluation: Evaluation) -> list[int]:
     return taken
 
 
-def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) -> _Pair:
+def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) -> Pair:
     score = outcome.scores[query, reference]
     caption = f"{query} and {reference}, {f'score {score:.4g}' if np.isfinite(score) else 'no score'}"
     caption += _apart(evaluation, int(query), int(reference))
     images = [read_bgr(path) for path in (evaluation.data.query_images[query], evaluation.data.references[reference])]
+    return Pair(side_by_side(*images), caption)
+
+
+def side_by_side(*images: np.ndarray) -> bytes:
+    """Return images (H, W, 3) BGR of any size beside each other, small, as JPEG."""
     small = [
         cv2.resize(
             image,
@@ -186,7 +208,7 @@ def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) 
     ]
     gap = np.full((PICTURE_HEIGHT, 2, 3), 255, np.uint8)
     _, jpeg = cv2.imencode(".jpg", np.hstack([small[0], gap, small[1]]), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    return _Pair(jpeg.tobytes(), caption)
+    return jpeg.tobytes()
 
 
 def _apart(evaluation: Evaluation, query: int, reference: int) -> str:

@@ -104,7 +104,7 @@ def write_detected(
             loops = [poses[list(pair)] for pair in ends if min(pair) >= 0]
             made.lines("path/loops", [loop for loop in loops if np.all(np.isfinite(loop))], USED)
         frames = progress(recording.frames(), "rerun", len(recording))
-        for i, ((image, stamp), result) in enumerate(zip(frames, results, strict=True)):
+        for (i, image, stamp), result in zip(frames, results, strict=True):
             jpeg = small_jpeg(image)
             made.frame(result.query_id, stamp, jpeg, result)
             if result.query_id in wanted:

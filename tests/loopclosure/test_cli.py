@@ -162,17 +162,40 @@ def test_detect_chooses_by_itself(tmp_path, capsys):
     assert main([*line, "--save", str(tmp_path / "d.npz")]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == 6
-    assert (tmp_path / "found" / "chosen.txt").read_text().splitlines() == printed[:5]
-    assert printed[0].startswith("a visit to a place lasts ")
-    assert printed[1].startswith("sequences")
-    assert printed[2].startswith("verification: ")
-    assert "best score" in printed[4]
+    assert (tmp_path / "found" / "chosen.txt").read_text().splitlines() == printed[1:]
+    assert " loops in 200 frames: " in printed[0]
+    page = (tmp_path / "found" / "report.html").read_text()
+    count = int(printed[0].split()[0])
+    assert f"<h1>{count} of 200 frames show a place that was seen before</h1>" in page
+    assert (page.count('<div class="pair found">'), page.count('<div class="pair rejected">')) == (7, 3)
     with (tmp_path / "found" / "loops.csv").open() as stream:
         loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
     assert len(loops) > 60
     assert all(abs(query - 100 - match) <= 5 for query, match in loops)
     resumed = ["detect", str(tmp_path / "drive"), "--resume", str(tmp_path / "d.npz"), "--out", str(tmp_path / "again")]
     assert main([*resumed, *thumbnails]) == 0
+
+
+def test_images_that_cannot_be_read_are_left_out(two_laps, tmp_path, capsys):
+    """Two of forty: loops, map and report have the others; a folder without one image is refused."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for i, path in enumerate(sorted((two_laps / "rgb").iterdir(), key=lambda path: int(path.stem))):
+        (folder / f"{i:02d}.png").write_bytes(b"" if i in (3, 20) else path.read_bytes())
+    describe = ["--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]
+    line = ["detect", str(folder), *describe, "--metric", "cosine", "--threshold", "0.9", "--exclude-recent", "10"]
+    assert main([*line, "--out", str(tmp_path / "found")]) == 0
+    printed = capsys.readouterr()
+    assert "2 of 40 images cannot be read and are left out: 03.png, 20.png" in printed.err
+    assert " loops in 38 frames" in printed.out
+    with (tmp_path / "found" / "loops.csv").open() as stream:
+        names = {row["query_name"]: row["match_name"] for row in csv.DictReader(stream)}
+    assert names["22.png"] == "02.png"
+    assert names["39.png"] == "19.png"
+    (folder / "only").mkdir()
+    (folder / "only" / "0.png").write_bytes(b"no picture")
+    assert main(["detect", str(folder / "only"), *describe, "--out", str(tmp_path / "none")]) == 1
+    assert "0.png: is not a readable image" in capsys.readouterr().err
 
 
 def test_similarity(two_laps_features, tmp_path, capsys):
@@ -202,6 +225,7 @@ def expanded(line: str, **names: object) -> list[str]:
     [
         ("evaluate NOWHERE --method thumbnails --out OUT", "NOWHERE: no such folder"),
         ("evaluate LAPS --method magic --out OUT", 'unknown method "magic"'),
+        ("evaluate LAPS/rgb --method thumbnails --out OUT", "has no truth, which says what frames show the same place"),
         ("evaluate LAPS,start=50% --method thumbnails --out OUT", "no judged pair shows the same place"),
         ("evaluate LAPS --method bow --train LAPS --out OUT", "test images are training images"),
         ("evaluate LAPS --method features:NOWHERE.npz --out OUT", "NOWHERE.npz: no such file"),

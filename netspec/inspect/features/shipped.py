@@ -28,7 +28,10 @@ def folder(net: str = "") -> Path:
 
 
 def default(**options: Any) -> Any:
-    """Return the recommended net as a :class:`~netspec.inspect.features.describer.Describer` with these keywords."""
+    """Return the recommended net as a :class:`~netspec.inspect.features.describer.Describer` with these keywords.
+
+    Without ``engine`` the fastest one that is installed runs it.
+    """
     return _describer(DEFAULT, options)
 
 
@@ -38,7 +41,9 @@ def small(**options: Any) -> Any:
 
 
 def _describer(net: str, options: dict[str, Any]) -> Any:
-    from netspec.inspect.features.describer import Describer  # setup.py reads this file, and has no torch
+    # setup.py reads this file, and has none of these.
+    from netspec.export.engines.choice import fastest
+    from netspec.inspect.features.describer import Describer
 
-    files = folder(net)
+    files, options = folder(net), {"engine": fastest(), **options}
     return Describer(files / "deploy.prototxt", files / f"{files.name}.caffemodel", **options)

@@ -109,7 +109,7 @@ def test_long_descriptors_are_projected(drives: Path, tmp_path: Path, monkeypatc
         detector = again.detector(Thumbnailer())
         assert detector.descriptors.shape == (10, 8)
         visitor = Visitor(detector)
-        found = [visitor.add(image).accepted for image, _ in open_recording(drives / "b").frames()]
+        found = [visitor.add(image).accepted for _, image, _ in open_recording(drives / "b").frames()]
         assert found == list(range(PLACES))
     results = opened.add(open_recording(drives / "b"), Thumbnailer())
     assert [result.accepted for result in results] == list(range(PLACES))

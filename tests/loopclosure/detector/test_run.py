@@ -137,7 +137,7 @@ def test_a_video_that_is_shorter_than_it_says(tmp_path, monkeypatch):
     recording = Recording(tmp_path / "v.avi", ["frame"] * 3, None, np.array([0, 5, 99]))
     monkeypatch.setattr("loopclosure.detector.run.video_frames", lambda path: ((i / 10, image) for i in range(30)))
     frames = recording.frames()
-    assert [next(frames)[1], next(frames)[1]] == [0.0, 0.5]
+    assert [next(frames)[2], next(frames)[2]] == [0.0, 0.5]
     with pytest.raises(InputError, match=r"v\.avi: ends after 30 frames, though frame 99 is wanted .* give --stop 30"):
         next(frames)
     with pytest.raises(InputError, match="threshold is nan"):

@@ -1,0 +1,132 @@
+"""The page of ``loopclosure detect``: the verdict, where the loops are, and pairs of images to judge it by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.run import Recording
+from loopclosure.report.page import Kind, Pair, png, rendered, side_by_side
+from loopclosure.report.paths import AXES
+from loopclosure.report.plots import COLORS, FOUND, MISSED, STYLE
+from netspec.files.whole_file import write_whole
+
+BEST, WORST, REJECTED = 4, 3, 3  # pairs shown
+APART = 30  # of so many equal parts of a drive one pair is shown at most
+OF_PATH = "The path from its known poses; green lines join the two frames of each loop."
+OF_FRAMES = (
+    "Each green dot is a loop: a frame (across) and the earlier frame of the same place (upward). "
+    "Gray dots are the best matches that were not accepted. A way driven again makes a rising line."
+)
+
+
+def write_drive(
+    path: Path, results: Sequence[LoopResult], said: Sequence[str], recording: Recording | None, command: str
+) -> None:
+    """Write the page; ``recording`` is None where the images are gone, those of a camera."""
+    loops = sum(1 for result in results if result)
+    known = recording is not None and recording.poses is not None and np.isfinite(recording.poses[:, 0]).sum() > 1
+    picture = _path(recording.poses, results) if known and recording and recording.poses is not None else _dots(results)
+    text = rendered(
+        "drive.html.jinja",
+        verdict=verdict(loops, len(results)),
+        lead="" if recording is None else str(recording.source),
+        picture=png(picture),
+        caption=OF_PATH if known else OF_FRAMES,
+        kinds=[] if recording is None else _kinds(results, recording),
+        said=said,
+        command=command,
+    )
+    write_whole(path, text, "backslashreplace")
+
+
+def verdict(loops: int, frames: int) -> str:
+    """Say in one sentence what was found."""
+    if not loops:
+        return f"None of {frames} frames shows a place that was surely seen before"
+    return f"{loops} of {frames} frames show a place that was seen before"
+
+
+def _dots(results: Sequence[LoopResult]) -> Figure:
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7, 4), layout="constrained")
+        axis = figure.subplots()
+        for accepted, color, size in ((False, MISSED, 2), (True, FOUND, 5)):
+            some = [(r.query_id, r.candidates[0][0]) for r in results if bool(r) is accepted and r.candidates]
+            axis.plot(*np.array(some).reshape(-1, 2).T, ".", color=color, markersize=size)
+        axis.set_xlabel("frame")
+        axis.set_ylabel("earlier frame")
+        axis.grid(color="#e6e6e6", linewidth=0.5)
+        return figure
+
+
+def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
+    """Draw the path from the side from which it looks largest."""
+    positions = poses[:, :3]
+    across = np.sort(np.argsort(np.nanmax(positions, axis=0) - np.nanmin(positions, axis=0), kind="stable")[1:])
+    places = positions[:, across]
+    ends = np.array([pair for pair in _ends(results) if np.all(np.isfinite(places[list(pair)]))], int).reshape(-1, 2)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7, 4.5), layout="constrained")
+        axis = figure.subplots()
+        axis.plot(*places.T, color=COLORS[0], lw=1)
+        axis.add_collection(LineCollection(list(places[ends]), colors=FOUND, linewidths=0.8, alpha=0.7))
+        axis.plot(*places[ends].reshape(-1, 2).T, ".", color=FOUND, markersize=3)
+        axis.set_aspect("equal")
+        axis.set_xlabel(AXES[across[0]])
+        axis.set_ylabel(AXES[across[1]])
+        return figure
+
+
+def _ends(results: Sequence[LoopResult]) -> list[tuple[int, int]]:
+    """Return the loops as pairs of this drive's frames; those to frames of an earlier run are left out."""
+    first = results[0].query_id if results else 0
+    ends = [(r.query_id - first, r.accepted - first) for r in results if r.accepted is not None]
+    return [pair for pair in ends if pair[1] >= 0]
+
+
+def _kinds(results: Sequence[LoopResult], recording: Recording) -> list[Kind]:
+    """Return the loops of the highest and of the lowest scores, and what is most alike of what was rejected."""
+    first = results[0].query_id if results else 0
+    there = [r for r in results if r.candidates and r.candidates[0][0] >= first]
+    loops = sorted((r for r in there if r), key=lambda r: -r.score)
+    best = _spread(loops, BEST, len(results))
+    taken = {r.query_id for r in best}
+    worst = _spread([r for r in reversed(loops) if r.query_id not in taken], WORST, len(results))
+    rejected = _spread(sorted((r for r in there if not r), key=lambda r: -r.score), REJECTED, len(results))
+    groups = {
+        ("found", "loops, the surest"): best,
+        ("found", "loops, the least sure"): worst,
+        ("rejected", "not accepted, the most alike"): rejected,
+    }
+    wanted = {end - first for some in groups.values() for r in some for end in (r.query_id, _match(r))}
+    images = {number: image for number, image, _ in recording.frames(wanted)}
+    return [Kind(name, title, [_pair(r, images, first) for r in some]) for (name, title), some in groups.items()]
+
+
+def _match(result: LoopResult) -> int:
+    return result.candidates[0][0] if result.accepted is None else result.accepted
+
+
+def _pair(result: LoopResult, images: dict[int, np.ndarray], first: int) -> Pair:
+    match = _match(result)
+    points = "" if result.inliers is None else f", {result.inliers} points agree"
+    why = "" if result else f", {result.verdict}"
+    picture = side_by_side(images[result.query_id - first], images[match - first])
+    return Pair(picture, f"{result.query_id} and {match}{points}{why}")
+
+
+def _spread(results: Sequence[LoopResult], count: int, frames: int) -> list[LoopResult]:
+    """Return the first results, without neighbors of those already taken, which look the same."""
+    taken: list[LoopResult] = []
+    for result in results:
+        apart = all(abs(result.query_id - other.query_id) >= frames / APART for other in taken)
+        if apart and len(taken) < count:
+            taken.append(result)
+    return taken
