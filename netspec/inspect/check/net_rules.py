@@ -13,6 +13,7 @@ from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, NetParameter, fields_of
 from netspec.proto.source_map import SourceMap
 
+WITHOUT_GRADIENT = frozenset({"Threshold", "ArgMax"})
 BEFORE_NET = ("mean_value", "mean_file", "scale")  # of transform_param: what changes all images alike
 
 
@@ -189,6 +190,25 @@ def _losses(net: Net) -> Said:
                 _place(net.plan, i),
                 "this loss depends on no learnable parameter; is an lr_mult 0?",
             )
+
+
+@rule("caffe-stops", NET)
+def _caffe_stops(net: Net) -> Said:
+    """Caffe ends the program at layers that compute no gradient where one is asked for, or may not work in place.
+
+    Here such a net runs: no gradient passes.
+    """
+    for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
+        if node.type == "AbsVal" and any(node.in_place):
+            yield (
+                _place(net.plan, i, "top"),
+                "Caffe stops here: AbsVal may not work in place; give its top another name",
+            )
+        asked = net.backward_plan.bottoms[i] if net.phase == TRAIN and net.backward_plan.layers[i] else ()
+        for j, wanted in enumerate(asked):
+            if wanted and (node.type in WITHOUT_GRADIENT or j in layer.label_bottoms):
+                message = f"Caffe stops in the backward pass: {node.type} has no gradient for bottom {j}"
+                yield _place(net.plan, i, "bottom", j), f"{message}; set propagate_down: false"
 
 
 @rule("never-learns", NET)

@@ -90,6 +90,10 @@ BN_TRUE = "batch_norm_param { use_global_stats: true }"
             + 'layer { name: "hush" type: "Silence" bottom: "e" }',
             ["never-learns 8:1"],
         ),
+        (SOUND.replace(LOSS, "") + 'layer { name: "a" type: "AbsVal" bottom: "f" top: "f" }\n' + LOSS,
+         ["caffe-stops 7:46"]),
+        (SOUND.replace(LOSS, "") + 'layer { name: "a" type: "Threshold" bottom: "f" top: "g" }\n'
+         + LOSS.replace('bottom: "f"', 'bottom: "g"'), ["caffe-stops 7:37"]),
         (SOUND.replace("top: \"c\"\n", f'top: "c" param {{ {FREE} }} param {{ {FREE} }}\n')
          .replace("top: \"f\"\n", f'top: "f" param {{ {FREE} }} param {{ {FREE} }}\n'), ["loss-learns-nothing 7:1"]),
     ],
