@@ -17,13 +17,14 @@ from netspec import log
 from netspec.errors import Report, SpecError, Where
 from netspec.files.limits import amount, is_out_of_memory
 from netspec.files.limits import memory as memory_of_machine
+from netspec.graph.alignment import align_crops
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Backward, Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
 from netspec.layers.contract.registry import dialects_of
-from netspec.net.ignored_fields import unused_fields
+from netspec.net.ignored_fields import unsure_layers, unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.run.eager import last_uses
 
@@ -50,7 +51,9 @@ class Assembly:
 
     def __init__(self, plan: Plan, options: BuildOptions) -> None:
         self._plan, self._report = plan, plan.source.report
-        self.options = replace(options, dialects=tuple(sorted({*options.dialects, *dialects_of(plan.net)})))
+        dialects = {*options.dialects, *plan.source.dialects, *dialects_of(plan.net)}
+        self.options = replace(options, dialects=tuple(sorted(dialects)))
+        self._warnings = list(align_crops(plan, self.options.dialects))
         self.layers: dict[int, Layer] = {}
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
@@ -199,7 +202,7 @@ class Assembly:
         for name in self._plan.outputs:
             log.info("net.cpp:244", f"This network produces output {name}")
         log.info("net.cpp:257", "Network initialization done.")
-        for line in unused_fields(self._plan, layers):
+        for line in (*self._warnings, *unsure_layers(self._plan, layers), *unused_fields(self._plan, layers)):
             log.warning("net.cpp:257", line)
         return backward
 
@@ -251,4 +254,4 @@ def _loss_weights(layer: Layer, report: Report) -> list[float]:
             return given
         message = f"found {len(given)} loss_weight, expected none or one per top blob ({layer.num_tops})"
         report(layer.error(message, "loss_weight"))
-    return [1.0 if layer.is_loss and j == 0 else 0.0 for j in range(layer.num_tops)]
+    return [1.0 if layer.is_loss and layer.counts and j == 0 else 0.0 for j in range(layer.num_tops)]

@@ -40,6 +40,13 @@ def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
         yield f"{plan.source.net.find('debug_info')}: debug_info has no effect in a net; set it in the solver"
 
 
+def unsure_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
+    """Yield a line for each type of layers of which nothing shows which fork's they are: the first of them."""
+    first = {layer.unsure: i for i, layer in reversed(list(enumerate(layers))) if layer.unsure}
+    for message, i in sorted(first.items(), key=lambda item: item[1]):
+        yield f"{plan.source.at(i, layer=plan.nodes[i].name, type=plan.nodes[i].type)}: {message}"
+
+
 def _unused(layer: Layer) -> Iterator[tuple[Path, str]]:
     partly = {name.partition(".")[0] for name in layer.reads if "." in name}
     for field, value in layer.param.ListFields():

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from netspec import log
 from netspec.errors import SpecError
 from netspec.exact import SMALL
 from netspec.graph.options import BuildOptions
@@ -79,7 +80,8 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
     net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Place(place.where), (place,)))
     (param,) = net.layer
     at = partial(source.at, 0, layer=param.name, type=param.type)
-    cls = class_of(param, replace(context.options, dialects=tuple(sorted(dialects_of(net)))))
+    options = replace(context.options, dialects=tuple(sorted(dialects_of(net))))
+    cls = class_of(param, options)
     if cls is None:
         raise SpecError(unknown_type(param.type), at("type"))
     param.bottom.extend(f"bottom{i}" for i in range(len(param.bottom), len(shapes)))
@@ -87,4 +89,7 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
         fewest = len(shapes) if cls.same_tops else cls.tops[0]
         tops = fewest or int(cls.tops[1] is None)
     param.top.extend(f"top{i}" for i in range(len(param.top), tops))
-    return cls(param, shapes, replace(context, at=at) if context.at is nowhere else context)
+    layer = cls(param, shapes, replace(context, options=options, **({"at": at} if context.at is nowhere else {})))
+    if layer.unsure:
+        log.logger.warning(f"{at()}: {layer.unsure}")
+    return layer

@@ -190,7 +190,7 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
     for layer in net.layers:
         written = proto.layer.add()
         written.CopyFrom(layer.param)
-        if layer.is_loss and layer.num_tops == 1 and not written.loss_weight:
+        if layer.is_loss and layer.counts and layer.num_tops == 1 and not written.loss_weight:
             written.loss_weight.append(1)  # Caffe's loss layers note their default (loss_layer.cpp)
         del written.blobs[:]
         for j in range(len(layer.blobs)):
@@ -213,7 +213,7 @@ def _from_message(net: Net, message: Any, path: Path, file: BinaryIO | None, rep
             report(_wrong_count(path, source.name, len(source.blobs), len(target.blobs)))
             continue
         for j, blob in enumerate(source.blobs):
-            if not blobs.fits(blob, target.blob_shapes[j]):
+            if not (blobs.fits(blob, target.blob_shapes[j]) or _fits_loosely(target, j, blobs.shape_of(blob))):
                 report(_wrong_shape(path, source.name, j, blobs.shape_of(blob), target.blob_shapes[j]))
                 continue
             try:
@@ -249,7 +249,7 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
                         continue
                     report(_wrong_count(path, name, len(arrays), len(target.blobs)))
                     break
-                if array.shape != target.blob_shapes[j]:
+                if array.shape != target.blob_shapes[j] and not _fits_loosely(target, j, array.shape):
                     report(_wrong_shape(path, name, j, array.shape, target.blob_shapes[j]))
                     continue
                 copies.append((target, j, array[()].astype(np.float32)))
@@ -297,6 +297,11 @@ def _ignore(name: str) -> None:
 def _wrong_count(path: Path, name: str, found: int, expected: int) -> SpecError:
     message = f"incompatible number of blobs for layer '{name}': {found} in the file, {expected} in the net. "
     return SpecError(message + _RENAME, Where(str(path)))
+
+
+def _fits_loosely(layer: Layer, j: int, shape: tuple[int, ...]) -> bool:
+    """Return whether a file's blob differs in axes of size 1 only, for a layer of which forks differ in that."""
+    return layer.loose and [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1]
 
 
 def _wrong_shape(path: Path, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:

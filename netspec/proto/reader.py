@@ -247,8 +247,13 @@ class _Reader:
                 return values[word].number
             more = fields_of(self._open[-1][0].DESCRIPTOR).get(field.name + MORE)
             names = [*values, *(more.descriptor.enum_type.values_by_name if more else ())]
+            owner = self._open[-1][0].DESCRIPTOR
+            announce_known()
+            dialects = dialect.dialects_with_value(owner.full_name, field.name, word)
             known = did_you_mean(word, names) or f"; it is one of {', '.join(names)}"
-            raise self._error(f'"{field.name}" has no value "{word}"{known}', start)
+            hint = f"; {dialect.advice_for(word, dialects)}" if dialects else known
+            error = self._error(f'"{field.name}" has no value "{word}"{hint}', start)
+            raise ForkFault(error.message, error.where, "value", word, dialects, owner.name) if dialects else error
         negative = self._minus()
         if self.token.kind != INTEGER:
             advice = ""

@@ -198,6 +198,11 @@ def added_value(message: Message, name: str) -> str:
     return field.descriptor.enum_type.values_by_number[field.get(message)].name
 
 
+def given(message: Message) -> set[str]:
+    """Return the names of the fields that were given, those of active dialects too."""
+    return {field.name for field, _ in message.ListFields()}
+
+
 def has(message: Message, name: str) -> bool:
     """Return whether a field was given; ``name`` may be a field of an active dialect."""
     return _field(message, name).present(message)

@@ -39,13 +39,14 @@ class SourceMap:
     """``layers[i]`` is the place of layer ``i`` of the NetParameter.
 
     ``report`` gets each fault that is found in the net, from its first pass until it is built and has its weights. It
-    raises the first one; with another, work goes on where it can.
+    raises the first one; with another, work goes on where it can. ``dialects`` are those that a comment names.
     """
 
     file: str
     net: Place
     layers: tuple[Place, ...] = ()
     report: Report = field(default=raise_fault, compare=False)
+    dialects: tuple[str, ...] = ()
 
     @staticmethod
     def of(net: Place) -> SourceMap:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from netspec.errors import ForkFault, SpecError, Where
 from netspec.files.lfs import pointer_fault
 from netspec.files.limits import read_bytes
-from netspec.proto.dialect.choice import use_dialects_of
+from netspec.proto.dialect.choice import named_dialects, use_dialects_of
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
@@ -51,7 +52,8 @@ def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> 
 def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
     """Return the net that a text describes and where its parts stand; ``file`` is what errors call it."""
     net = NetParameter()
-    source = SourceMap.of(_read(text, file, net, report))
+    named = named_dialects(text, file)
+    source = replace(SourceMap.of(_read(text, file, net, report)), dialects=named)
     return upgrades.upgrade_net(net, source) if upgrade else (net, source)
 
 

@@ -13,17 +13,16 @@ from functools import reduce
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from netspec.dialects.boxes import as_array
 from netspec.dialects.rcnn.faster import RATIOS, SCALES, AnchorTarget, ProposalTarget, RoIData, settings
 from netspec.dialects.rcnn.proposals import all_anchors, base_anchors, moved, suppress
 from netspec.dialects.rcnn.regions import RegionPooling, whole
+from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1Loss
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
-from netspec.layers.loss.base import BATCH_SIZE, Loss, onnx_normalized_sum
+from netspec.layers.contract.targets import OnnxGraph
 from netspec.proto.schema import TRAIN, value
 
 DECLARATIONS = """
@@ -31,6 +30,8 @@ message ROIPoolingParameter {
   optional uint32 pooled_h = 1 [default = 0];
   optional uint32 pooled_w = 2 [default = 0];
   optional float spatial_scale = 3 [default = 1];
+  // MSCNN
+  optional float pad_ratio = 4 [default = 0];
 }
 message SmoothL1LossParameter {
   optional float sigma = 1 [default = 1];
@@ -57,8 +58,9 @@ extend LayerParameter {
 class ROIPooling(RegionPooling):
     """Divide each region of a map into pooled_h x pooled_w bins and return the maximum of each.
 
-    A region's corners are scaled by spatial_scale and rounded to pixels, both included. The first of equal pixels gets
-    the gradient; a bin without a pixel is 0.
+    Where pad_ratio is given (MSCNN), a region first grows on each side by so much of its length. Its corners are scaled
+    by spatial_scale and rounded to pixels, both included. The first of equal pixels gets the gradient; a bin without a
+    pixel is 0. A region that ends before it begins is one pixel, without a gradient.
 
     bottom[0]  the map (N, C, H, W)
     bottom[1]  regions (R, 5): image, x1, y1, x2, y2; gets no gradient
@@ -75,6 +77,7 @@ class ROIPooling(RegionPooling):
                 raise self.error(f"{name} must be at least 1", "roi_pooling_param", name)
         self.bins = (param.pooled_h, param.pooled_w)
         self.scale: float = param.spatial_scale
+        self.pad_ratio: float = param.pad_ratio
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return [(self.check_regions(bottom_shapes), bottom_shapes[0][1], *self.bins)]
@@ -84,7 +87,9 @@ class ROIPooling(RegionPooling):
         with torch.no_grad():
             regions = regions.reshape(-1, 5)
             image = self.images_of(regions, images)
-            corners = whole(regions[:, 1:] * self.scale)
+            first, last = regions[:, 1:3], regions[:, 3:]
+            pad = (last - first + 1) * self.pad_ratio
+            corners = whole(torch.cat([first - pad, last + pad], dim=1) * self.scale)
             rows = self._bins(corners[:, 1], corners[:, 3], self.bins[0], height)[:, :, None]
             columns = self._bins(corners[:, 0], corners[:, 2], self.bins[1], width)[:, None]
             windows = torch.cat(torch.broadcast_tensors(rows, columns), dim=3)
@@ -95,7 +100,9 @@ class ROIPooling(RegionPooling):
             pixel = pixel.permute(0, 3, 1, 2)
             plane = image[:, None] * channels + torch.arange(channels, device=maps.device)
             place = plane[:, :, None, None] * (height * width) + pixel.clamp(min=0)
-        return maps.reshape(-1)[place].where(pixel >= 0, 0)
+            inverted = (corners[:, 2:] < corners[:, :2]).any(1)[:, None, None, None]
+        top = maps.reshape(-1)[place].where(pixel >= 0, 0)
+        return torch.where(inverted, top.detach(), top)
 
     @staticmethod
     def _bins(first: torch.Tensor, last: torch.Tensor, count: int, size: int) -> torch.Tensor:
@@ -106,6 +113,8 @@ class ROIPooling(RegionPooling):
         return ends.clamp(0, size).long()
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.pad_ratio:
+            raise refusal(self, "ONNX", "its regions grow by pad_ratio")
         regions = graph.reshape(bottoms[1], [-1, 5])
         return graph.node("MaxRoiPool", bottoms[0], regions, pooled_shape=self.bins, spatial_scale=self.scale)
 
@@ -243,80 +252,4 @@ class ProposalLayer(Proposal):
 register("rpn.anchor_target_layer.AnchorTargetLayer", "python_param")(AnchorTarget)
 register("rpn.proposal_target_layer.ProposalTargetLayer", "python_param")(ProposalTarget)
 register("roi_data_layer.layer.RoIDataLayer", "python_param")(RoIData)
-
-
-@register("SmoothL1Loss", "smooth_l1_loss_param")
-class SmoothL1Loss(Loss):
-    """Sum of outside weight x smooth(inside weight x (prediction - target)), divided by the number of items N.
-
-    smooth(d) = 0.5 (sigma d)^2 where |d| < 1 / sigma^2, else |d| - 0.5 / sigma^2
-
-    bottom[0]  predictions (N, ...)
-    bottom[1]  targets, the same shape
-    bottom[2]  optional: inside weights, the same shape; gets no gradient
-    bottom[3]  optional: outside weights, the same shape; gets no gradient
-    top[0]     the loss, ()
-    Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/smooth_L1_loss_layer.cu
-    """
-
-    bottoms = (2, 4)
-    label_bottoms = frozenset({2, 3})
-
-    def setup(self) -> None:
-        sigma = value(self.param, "smooth_l1_loss_param").sigma
-        if sigma <= 0:
-            raise self.error(f"sigma must be above 0, found {sigma:g}", "smooth_l1_loss_param", "sigma")
-        self.knee = 1 / (sigma * sigma)
-
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape; the bottoms must be of one shape, but for ones at its end."""
-        full = [(*shape, 1, 1, 1)[: max(4, len(shape))] for shape in bottom_shapes]
-        for i, shape in enumerate(full):
-            if shape != full[0]:
-                message = f"found bottoms of shapes {bottom_shapes[0]} and {bottom_shapes[i]}, expected equal shapes"
-                raise self.error(message, "bottom", i)
-        return super().reshape(bottom_shapes)
-
-    def forward(self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
-        inside, outside = (*(weight.detach().reshape_as(predictions) for weight in weights), None, None)[:2]
-        difference = predictions - targets.reshape_as(predictions)
-        if inside is not None:
-            difference = difference * inside
-        losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=self.knee)
-        return (losses if outside is None else losses * outside).sum() / len(predictions)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        predictions, *others = bottoms
-        shape = graph.shape_of(predictions)
-        aligned = [
-            bottom if self.bottom_shapes[i] == self.bottom_shapes[0] else graph.node("Reshape", bottom, shape)
-            for i, bottom in enumerate(others, 1)
-        ]
-        difference = graph.node("Sub", predictions, aligned[0])
-        if len(aligned) > 1:
-            difference = graph.node("Mul", difference, aligned[1])
-        length = graph.node("Abs", difference)
-        knee = graph.constant(self.knee)
-        square = graph.node("Mul", graph.node("Mul", difference, difference), graph.constant(0.5 / self.knee))
-        linear = graph.node("Sub", length, graph.constant(0.5 * self.knee))
-        losses = graph.node("Where", graph.node("Less", length, knee), square, linear)
-        if len(aligned) > 2:
-            losses = graph.node("Mul", losses, aligned[2])
-        return onnx_normalized_sum(graph, losses, "", BATCH_SIZE)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if len(set(self.bottom_shapes)) > 1:
-            raise refusal(self, "PyTorch", "it is exported for bottoms of one shape")
-        knee = rounded(self.knee)
-        if len(bottoms) == 2:
-            template = 'F.smooth_l1_loss({x}, {y}, beta={knee}, reduction="sum") / {x}.shape[0]'
-            return code.call(template, x=bottoms[0], y=bottoms[1], knee=knee)
-        template = f"{code.function(weighted_smooth_l1_loss)}({', '.join(bottoms)}, beta={{knee}})"
-        return code.call(template, knee=knee)
-
-
-def weighted_smooth_l1_loss(predictions, targets, inside, outside=1.0, beta=1.0):
-    """Return the smooth L1 loss of weighted differences, weighted and summed up, / N."""
-    x, y = inside * predictions, inside * targets
-    losses = F.smooth_l1_loss(x, y, beta=beta, reduction="none")
-    return (outside * losses).sum() / predictions.shape[0]
+register("SmoothL1Loss", "smooth_l1_loss_param", *NORMALIZED)(SmoothL1Loss)

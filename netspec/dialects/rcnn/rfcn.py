@@ -5,18 +5,17 @@ Fork: daijifeng001/caffe-rfcn; the losses on a CPU: Intel's caffe
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.dialects.boxes import as_array, highest
 from netspec.dialects.rcnn.regions import RegionPooling, whole
+from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1LossOHEM, divisor, four
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
-from netspec.layers.loss.base import VALID, Loss, normalization_mode, normalizer, total
+from netspec.layers.loss.base import total
 from netspec.layers.loss.scores import SoftmaxWithLoss
 from netspec.proto.schema import added_value, value
 
@@ -40,8 +39,6 @@ extend LayerParameter {
   optional PSROIPoolingParameter psroi_pooling_param = 10001;
 }
 """
-
-NORMALIZED = ("loss_param", "loss_param.normalization", "loss_param.pre_fixed_normalizer")
 
 
 @register("PSROIPooling", "psroi_pooling_param")
@@ -103,14 +100,6 @@ class PSROIPooling(RegionPooling):
         return ((pixels >= ends[:, :-1, None].floor()) & (pixels < ends[:, 1:, None].ceil())).to(first.dtype)
 
 
-def _divisor(layer: Layer, items: int, each: int, valid: torch.Tensor | None) -> torch.Tensor | float:
-    """Return what the losses of ``items`` times ``each`` predictions are divided by: at least 1."""
-    param = layer.param.loss_param
-    if added_value(param, "normalization") == "PRE_FIXED":
-        return max(1.0, value(param, "pre_fixed_normalizer"))
-    return normalizer(normalization_mode(param, VALID), items, each, valid)
-
-
 @register("SoftmaxWithLossOHEM", "softmax_param", *NORMALIZED)
 class SoftmaxWithLossOHEM(SoftmaxWithLoss):
     """Caffe's SoftmaxWithLoss, which also returns the loss of each prediction; 0 for one that does not count.
@@ -121,7 +110,7 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
     bottom[1]  labels, one per prediction
     top[0]     the loss, ()
     top[1]     optional: the softmax, bottom[0]'s shape; as top[2] it brings no gradient
-    top[2]     optional: the loss of each prediction, bottom[1]'s shape; (N, 1, 1, 1) for (N,), as R-FCN's labels are
+    top[2]     optional: the loss of each prediction, bottom[1]'s shape
     Fork: intel/caffe, src/caffe/layers/softmax_loss_ohem_layer.cpp
     """
 
@@ -129,59 +118,28 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
     not_exported = "it is for training"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return [*super().reshape(bottom_shapes), _four(bottom_shapes[1])][: self.num_tops]
+        return [*super().reshape(bottom_shapes), bottom_shapes[1]][: self.num_tops]
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         tops = super().forward(scores, labels)
-        return (*tops, self._losses.reshape(_four(tuple(labels.shape))))[: self.num_tops]
+        return (*tops, self._losses.reshape(labels.shape))[: self.num_tops]
 
     @override
     def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
         if valid is not None:
             losses = losses.where(valid, 0)
         self._losses = losses.detach()
-        return total(losses, exact) / _divisor(self, self.outer, self.inner, valid)
+        return total(losses, exact) / divisor(self, self.outer, self.inner, valid)
 
 
-@register("SmoothL1LossOHEM", *NORMALIZED)
-class SmoothL1LossOHEM(Loss):
-    """Sum of smooth(weight x (prediction - target)), and the sum of each region.
-
-    smooth(d) = 0.5 d^2 where |d| < 1, else |d| - 0.5. The sum is divided by the number of regions and pixels, N H W,
-    or as loss_param says; with normalization: PRE_FIXED by pre_fixed_normalizer.
-
-    bottom[0]  predictions (N, C) or (N, C, H, W)
-    bottom[1]  targets, the same shape
-    bottom[2]  optional: weights, the same shape; gets no gradient
-    top[0]     the loss, ()
-    top[1]     optional: the loss of each region (N, 1, H, W); brings no gradient
-    Fork: intel/caffe, src/caffe/layers/smooth_L1_loss_ohem_layer.cpp
-    """
-
-    bottoms = (2, 3)
-    tops = (1, 2)
-    label_bottoms = frozenset({2})
-    not_exported = "it is for training"
-
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        full = [_four(shape) for shape in bottom_shapes]
-        for i, shape in enumerate(full):
-            if shape != full[0] or len(shape) != 4:
-                message = f"found shapes {bottom_shapes[0]} and {bottom_shapes[i]}, expected (N, C) or (N, C, H, W)"
-                raise self.error(message, "bottom", i)
-        items, _, *pixels = full[0]
-        return [(), (items, 1, *pixels)][: self.num_tops]
-
-    def forward(
-        self, predictions: torch.Tensor, targets: torch.Tensor, *weights: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
-        difference = (predictions - targets.reshape_as(predictions)).reshape(_four(tuple(predictions.shape)))
-        for weight in weights:
-            difference = difference * weight.detach().reshape_as(difference)
-        losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none")
-        items, _, *pixels = difference.shape
-        loss = losses.sum() / _divisor(self, items, math.prod(pixels), None)
-        return (loss, losses.detach().sum(1, keepdim=True))[: self.num_tops]
+register(
+    "SoftmaxWithLoss",
+    "softmax_param",
+    *NORMALIZED,
+    replaces=SoftmaxWithLoss,
+    where=lambda param: len(param.top) > 2 or added_value(param.loss_param, "normalization") == "PRE_FIXED",
+)(type("SoftmaxWithLoss", (SoftmaxWithLossOHEM,), {"__doc__": SoftmaxWithLossOHEM.__doc__}))
+register("SmoothL1LossOHEM", *NORMALIZED)(SmoothL1LossOHEM)
 
 
 @register("BoxAnnotatorOHEM", "box_annotator_ohem_param")
@@ -209,7 +167,7 @@ class BoxAnnotatorOHEM(Layer):
             raise self.error("roi_per_img must be given and be at least 1", "box_annotator_ohem_param", "roi_per_img")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        full = [_four(shape) for shape in bottom_shapes]
+        full = [four(shape) for shape in bottom_shapes]
         (count, five, *pixels), *others = full
         for i, (shape, channels) in enumerate(zip(full, (5, 1, 1, full[3][1]), strict=True)):
             if five != 5 or pixels != [1, 1] or shape != (count, channels, 1, 1):
@@ -226,7 +184,3 @@ class BoxAnnotatorOHEM(Layer):
             chosen[order[image[order] == i][: self.settings.roi_per_img]] = True
         kept = torch.where(chosen, labels.reshape(-1, 1), self.settings.ignore_label)
         return kept.reshape(-1, 1, 1, 1), (weights.reshape(len(regions), -1) * chosen)[:, :, None, None]
-
-
-def _four(shape: Shape) -> Shape:
-    return (*shape, 1, 1, 1)[: max(4, len(shape))]

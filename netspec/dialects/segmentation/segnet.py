@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +14,7 @@ from netspec.layers.contract.base import Shape
 from netspec.layers.contract.folding import Affine, blob_in_double
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.normalization import as_before, onnx_normalized, torch_batch_norm
-from netspec.proto.schema import TRAIN, value
+from netspec.proto.schema import TRAIN, given, value
 
 INFERENCE = 1  # BNParameter.BNMode
 SEGNET_EPS = 1e-9  # added to the variance by SegNet's BN
@@ -52,20 +52,21 @@ class Upsample(Layer):
 
     bottoms = (1, 2)
     label_bottoms = frozenset({1})
+    forks: ClassVar[Mapping[str, str]] = {"segmentation": "", "yolo": ""}  # its bottoms show which is meant
 
     def setup(self) -> None:
         param = value(self.param, "upsample_param")
-        given = {field.name for field, _ in param.ListFields()}
+        fields = given(param)
         masked = len(self.bottom_shapes) == 2
-        if not masked and given - {"scale"}:
-            extra = min(given - {"scale"})
+        if not masked and fields - {"scale"}:
+            extra = min(fields - {"scale"})
             raise self.error("without a mask as second bottom only scale can be set", "upsample_param", extra)
         for pair in ("upsample_h", "upsample_w"), ("scale_h", "scale_w"):
-            alone = [name for name in pair if name in given]
+            alone = [name for name in pair if name in fields]
             if len(alone) == 1:
                 raise self.error(f"found {alone[0]} alone, expected {' and '.join(pair)}", "upsample_param", alone[0])
-        scale = param.scale if "scale" in given else 2 if masked else 1
-        self.scale_h, self.scale_w = (param.scale_h, param.scale_w) if "scale_h" in given else (scale, scale)
+        scale = param.scale if "scale" in fields else 2 if masked else 1
+        self.scale_h, self.scale_w = (param.scale_h, param.scale_w) if "scale_h" in fields else (scale, scale)
         for name, along in (("pad_out_h", self.scale_h), ("pad_out_w", self.scale_w)):
             if getattr(param, name) and along != 2:
                 raise self.error(f"{name} needs a scale of 2, found {along}", "upsample_param", name)
@@ -138,19 +139,31 @@ class BN(Layer):
     blobs[0]   slopes (1, C, 1, 1), 0 unless a filler is given
     blobs[1]   biases (1, C, 1, 1)
     blobs[2]   moving mean     (1, C, 1, 1)                            PSPNet's only; not learned
-    blobs[3]   moving variance (1, C, 1, 1)                            PSPNet's only; not learned
-    Fork: hszhao/PSPNet and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
+    blobs[3]   moving variance (1, C, 1, 1), in happynear's 1 / std    PSPNet's only; not learned
+    Fork: hszhao/PSPNet, happynear/caffe-windows and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
     """
+
+    loose = True  # TSN's and happynear's files have (1, C)
+    forks: ClassVar[Mapping[str, str]] = {
+        "blocks": "of PSPNet and TSN: the moving variance is in blobs[3]",
+        "tsn": "",
+        "segmentation": "",
+        "happynear": "of happynear, L-Softmax, domain-guided dropout: 1 / std is there",
+    }
 
     def setup(self) -> None:
         param, shape = value(self.param, "bn_param"), self.bottom_shapes[0]
         if not 2 <= len(shape) <= 4:
             raise self.error(f"found a bottom of shape {shape}, expected (N, C, H, W), 2 to 4 axes", "bottom")
-        given = {field.name for field, _ in param.ListFields()}
-        segnet = given & {"scale_filler", "shift_filler", "bn_mode"}
-        if segnet and given - segnet - {"engine"}:
-            other = min(given - segnet - {"engine"})
-            raise self.error(f"{other} is PSPNet's and {min(segnet)} is SegNet's; use one kind only", "bn_param", other)
+        fields = given(param) - {"engine"}
+        segnets = fields & {"scale_filler", "shift_filler", "bn_mode"}
+        if segnets and fields - segnets:
+            other = min(fields - segnets)
+            raise self.error(
+                f"{other} is PSPNet's and {min(segnets)} is SegNet's; use one kind only", "bn_param", other
+            )
+        fork = "segmentation" if segnets else self.whose()
+        segnet = fork == "segmentation" and not fields - segnets
         self.channels = shape[1]
         size = (1, self.channels, 1, 1)
         self.add_blob(size, param.scale_filler if segnet else param.slope_filler)
@@ -158,9 +171,10 @@ class BN(Layer):
         self.by_batch = param.bn_mode != INFERENCE if segnet else self.phase == TRAIN and not param.frozen
         self.moving = not segnet
         self.eps: float = SEGNET_EPS if segnet else param.eps
+        self.inverse = fork == "happynear"  # blobs[3] is 1 / std
         if self.moving:
             self.add_blob(size)
-            self.add_blob(size, value=float(param.frozen))
+            self.add_blob(size, value=float(param.frozen or self.inverse))
             self.not_learned = frozenset(range(4) if param.frozen else (2, 3))
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -178,12 +192,14 @@ class BN(Layer):
                 self._move(mean, variance)
         else:
             mean, variance = (self.blob(i).detach().reshape_as(slope) for i in (2, 3))
+            if self.inverse:
+                return (data - mean) * variance * slope + bias
         return (data - mean) / (variance + self.eps).sqrt() * slope + bias
 
     def _move(self, mean: torch.Tensor, variance: torch.Tensor) -> None:
         momentum = value(self.param, "bn_param").momentum
         with torch.no_grad():
-            for i, batch in ((2, mean), (3, variance)):
+            for i, batch in ((2, mean), (3, (variance + self.eps).rsqrt() if self.inverse else variance)):
                 self.blob(i).mul_(momentum).add_(batch.reshape(self.blob_shapes[i]), alpha=1 - momentum)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
@@ -192,6 +208,10 @@ class BN(Layer):
         if not self.by_batch and not self.moving:
             return graph.node("Add", graph.node("Mul", *bottoms, slope), bias)
         if not self.by_batch:
+            if self.inverse:
+                centered = graph.node("Sub", *bottoms, graph.blob(2, shape))
+                scaled = graph.node("Mul", centered, graph.node("Mul", graph.blob(3, shape), slope))
+                return graph.node("Add", scaled, bias)
             blobs = [graph.blob(i, (self.channels,)) for i in range(4)]
             return graph.node("BatchNormalization", *bottoms, *blobs, epsilon=self.eps)
         normalized = onnx_normalized(graph, bottoms[0], len(self.bottom_shapes[0]), self.eps)
@@ -204,7 +224,7 @@ class BN(Layer):
         if not self.moving:
             return slope, bias
         mean, variance = (blob_in_double(self, i).reshape(-1) for i in (2, 3))
-        scale = slope * (variance + self.eps).rsqrt()
+        scale = slope * (variance if self.inverse else (variance + self.eps).rsqrt())
         return scale, bias - mean * scale
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
@@ -215,6 +235,7 @@ class BN(Layer):
             operands = {"y": code.parameter(0, shape, "slope"), "z": code.parameter(1, shape, "bias")}
             return code.call(f"{template} * {{y}} + {{z}}", x=bottoms[0], eps=eps, **operands)
         weight, bias, mean, variance = (self.blob(i).reshape(-1) for i in range(4))
+        variance = variance.pow(-2) - self.eps if self.inverse else variance
         norm = torch_batch_norm(code, axes, mean, variance, eps, weight=weight, bias=bias)
         return code.call("{norm}({x})", norm=norm, x=bottoms[0])
 

@@ -5,20 +5,17 @@ A database for its layer AnnotatedData is what the fork's convert_annoset writes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import ClassVar
 
-import torch
-
+from netspec.dialects.blocks.normalize import Normalize
 from netspec.dialects.blocks.order import Reordered
 from netspec.dialects.ssd.annotated import AnnotatedData
 from netspec.dialects.ssd.detection import DetectionOutput
 from netspec.dialects.ssd.evaluate import DetectionEvaluate
 from netspec.dialects.ssd.multibox import MultiBoxLoss
 from netspec.dialects.ssd.priors import PriorBox
-from netspec.layers import Layer, register
-from netspec.layers.contract.base import Shape
-from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers import register
 from netspec.proto.schema import value
 
 DECLARATIONS = """
@@ -250,6 +247,7 @@ register(
 register("DetectionEvaluate", "detection_evaluate_param")(DetectionEvaluate)
 register("PriorBox", "prior_box_param")(PriorBox)
 register("DetectionOutput", "detection_output_param")(DetectionOutput)
+register("Normalize", "norm_param", "normalize_param")(Normalize)
 
 
 @register("Permute", "permute_param")
@@ -261,6 +259,8 @@ class Permute(Reordered):
     Fork: src/caffe/layers/permute_layer.cpp
     """
 
+    forks: ClassVar[Mapping[str, str]] = {"ssd": "", "happynear": ""}  # of the same numbers: it shows neither
+
     def setup(self) -> None:
         given = list(value(self.param, "permute_param").order)
         axes = len(self.bottom_shapes[0])
@@ -269,82 +269,3 @@ class Permute(Reordered):
                 message = f"found axis {axis}, expected each of 0 to {axes - 1} at most once"
                 raise self.error(message, "permute_param", "order", i)
         self.order = given + [axis for axis in range(axes) if axis not in given]
-
-
-class _Normalized(torch.autograd.Function):
-    """Normalize's formula. Its gradient is the fork's, not the derivative: the sum leaves the scales out.
-
-    dx = scale / length (dy - x sum(x dy) / length^2), where the derivative has sum(scale x dy). With one scale for all
-    channels the two are the same up to the place of the scale. Every SSD300 was trained with it.
-    Fork: src/caffe/layers/normalize_layer.cpp, Backward_cpu
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: torch.Tensor, scale: torch.Tensor, axes: tuple[int, ...], eps: float) -> torch.Tensor:
-        length = (x.square().sum(axes, keepdim=True) + eps).sqrt()
-        ctx.save_for_backward(x, scale, length)
-        ctx.axes = axes
-        return x / length * scale
-
-    @staticmethod
-    def backward(ctx: Any, dy: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        x, scale, length = ctx.saved_tensors
-        share = (x * dy).sum(ctx.axes, keepdim=True) / length.square()
-        dx = (dy - x * share) / length * scale if ctx.needs_input_grad[0] else None
-        dscale = (x / length * dy).sum_to_size(scale.shape) if ctx.needs_input_grad[1] else None
-        return dx, dscale, None, None
-
-
-@register("Normalize", "norm_param")
-class Normalize(Layer):
-    """Divide by the length over the channels, or with across_spatial over the whole image; multiply by learned scales.
-
-    y = scale x / sqrt(sum of squares + eps)
-
-    bottom[0]  (N, C, ...)
-    top[0]     the same shape
-    blobs[0]   scales (), or (C,) where channel_shared is false; 1 unless scale_filler is given
-    Fork: src/caffe/layers/normalize_layer.cpp
-    """
-
-    def setup(self) -> None:
-        param, shape = value(self.param, "norm_param"), self.bottom_shapes[0]
-        if len(shape) < 2:
-            raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
-        filler = param.scale_filler if param.HasField("scale_filler") else None
-        self.add_blob(() if param.channel_shared else shape[1:2], filler, value=1.0)
-
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape; there must be a scale for each channel."""
-        shape = bottom_shapes[0]
-        if len(shape) < 2 or self.blob_shapes[0] not in ((), shape[1:2]):
-            raise self.error(f"bottom of shape {shape} does not have the {self.blob_shapes[0][0]} channels", "bottom")
-        return [shape]
-
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        param = value(self.param, "norm_param")
-        axes = tuple(range(1, data.dim())) if param.across_spatial else (1,)
-        scale = self.blob(0)
-        scale = scale if scale.dim() == 0 else scale.reshape(-1, *(1,) * (data.dim() - 2))
-        return _Normalized.apply(data, scale, axes, param.eps)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        param, axes = value(self.param, "norm_param"), len(self.bottom_shapes[0])
-        over = graph.constant(list(range(1, axes)) if param.across_spatial else [1])
-        squares = graph.node("ReduceSum", graph.node("Mul", *bottoms, *bottoms), over, keepdims=1)
-        length = graph.node("Sqrt", graph.node("Add", squares, graph.constant(param.eps)))
-        shape = (*self.blob_shapes[0], *(1,) * (axes - 2)) if self.blob_shapes[0] else ()
-        return graph.node("Mul", graph.node("Div", *bottoms, length), graph.blob(0, shape))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, axes = value(self.param, "norm_param"), len(self.bottom_shapes[0])
-        over = tuple(range(1, axes)) if param.across_spatial else 1
-        shape = (*self.blob_shapes[0], *(1,) * (axes - 2)) if self.blob_shapes[0] else ()
-        template = f"{code.function(normalize)}({{x}}, {{scale}}, {{over}}, eps={{eps}})"
-        return code.call(template, scale=code.parameter(0, shape), x=bottoms[0], over=over, eps=rounded(param.eps))
-
-
-def normalize(x, scale, axes, eps):
-    """Divide by the length over some axes, and multiply by learned scales."""
-    length = (x.square().sum(axes, keepdim=True) + eps).sqrt()
-    return scale * x / length

@@ -92,7 +92,7 @@ def first_maxima(scores: torch.Tensor) -> torch.Tensor:
 class LabelsequenceAccuracy(Layer):
     """Say how many sequences are read without a fault: the greedy decoding equals the labels without blanks.
 
-    bottom[0]  scores (T, N, C)
+    bottom[0]  scores (N, T, C)
     bottom[1]  labels (N, L)
     top[0]     the share of right ones, ()
     Fork: xmfbit/warpctc-caffe, src/caffe/layers/labelsequence_accuracy_layer.cpp
@@ -104,13 +104,13 @@ class LabelsequenceAccuracy(Layer):
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores, labels = bottom_shapes
-        if len(scores) < 3 or labels[:1] != scores[1:2]:
-            raise self.error(f"found shapes {scores} and {labels}, expected (T, N, C) and (N, L)", "bottom")
+        if len(scores) < 3 or labels[:1] != scores[:1]:
+            raise self.error(f"found shapes {scores} and {labels}, expected (N, T, C) and (N, L)", "bottom")
         return [()]
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         blank = value(self.param, "labelsequence_accuracy_param").blank_label
-        paths, texts = first_maxima(scores.flatten(2)).T.tolist(), labels.flatten(1).long().tolist()
+        paths, texts = first_maxima(scores.flatten(2)).tolist(), labels.flatten(1).long().tolist()
         right = [
             _collapsed(path, blank, True) == [label for label in text if label != blank]
             for path, text in zip(paths, texts, strict=True)

@@ -11,7 +11,7 @@ database in a layer's constructor, before it logs the layer's bottoms and tops, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -53,12 +53,16 @@ class Layer(torch.nn.Module):
     tops: ClassVar[tuple[int, int | None]] = (1, 1)
     same_tops: ClassVar[bool] = False  # as many tops as bottoms
     is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
+    counts: bool = True  # of a loss: whether it has that loss_weight of 1; in some forks only a given one counts
+    forks: ClassVar[Mapping[str, str]] = {}  # where several forks have the type: dialects, and what their layers do
+    unsure: str = ""  # what the net warns of: nothing shows whose the layer is
     is_input: ClassVar[bool] = False  # its tops are given by the caller
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
     reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
     ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
     shares: frozenset[str] = frozenset()  # of "data", "diff": its tops lie where its bottom lies, in Caffe's memory
     default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
+    loose: ClassVar[bool] = False  # files may have its blobs with other axes of size 1, as its forks do
     not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
     counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
     promises: ClassVar[bool] = True  # its tops have the shapes that ``reshape`` returned, but for ``counted_axis``
@@ -112,6 +116,20 @@ class Layer(torch.nn.Module):
         """Return whether to compute in Caffe's order: :func:`netspec.exact.switch.applies`, for one type of numbers."""
         applies = switch.applies(self.context.options.exact, bottom, bool(small))
         return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
+
+    def whose(self) -> str:
+        """Return the dialect whose layer this is, of ``forks``: one that the net uses, else the first and a warning."""
+        used = [dialect for dialect in self.forks if dialect in self.context.options.dialects]
+        if used:
+            return used[-1]
+        names = [name for name, numbers in self.forks.items() if numbers]
+        first, *others = (f'"{name}" ({self.forks[name]})' for name in names)
+        self.unsure = (
+            "forks have other layers of this type, and nothing here shows whose it is; it is computed as that of "
+            f'{first}, not of {" or ".join(others)}; to choose, write a line "# dialect: {names[-1]}" into the '
+            f"prototxt, or pass --plugin {names[-1]}"
+        )
+        return names[0]
 
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""

@@ -52,10 +52,14 @@ def register(
 
 
 def dialects_of(net: NetParameter) -> frozenset[str]:
-    """Return the dialects that count for a net: those whose fields and layer types it has, and those for every net."""
-    types = {layer.type for layer in net.layer if layer_class(layer.type)}
-    found = {*_everywhere, *(_OWNERS[each] for each in types if each in _OWNERS)}
-    return frozenset(found.union(*(dialects_in(layer) for layer in net.layer)) if _REPLACING else found)
+    """Return the dialects that count for a net: those whose fields and layer types it has, and those for every net.
+
+    A layer of a type that several forks have shows none of them; its class tells by its fields (Layer.whose).
+    """
+    classes = {layer.type: layer_class(layer.type) for layer in net.layer}
+    shown = {name for name, cls in classes.items() if cls and not cls.forks}
+    found = {*_everywhere, *(_OWNERS[each] for each in shown if each in _OWNERS)}
+    return frozenset(found.union(*(dialects_in(layer) for layer in net.layer if layer.type in shown)))
 
 
 def use_everywhere(dialect: str) -> None:

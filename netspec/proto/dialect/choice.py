@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
+
 from netspec import log
+from netspec.errors import SpecError, Where
 from netspec.proto.dialect.files import announce_known, find_file, known_files, switch_on
 from netspec.proto.dialect.registry import Dialect, active, known
 from netspec.proto.lexer import NAME, STRING, SYMBOL, Lexer
 from netspec.proto.schema import caffe_names, fields_with
+
+NAMED = re.compile(r"^[ \t]*#[ \t]*dialect:[ \t]*(\w+)[ \t]*\r?$", re.MULTILINE)
 
 
 def use_dialects_of(text: str, file: str) -> list[str]:
@@ -39,6 +44,23 @@ def use_dialects_of(text: str, file: str) -> list[str]:
     if used:
         log.logger.info(f"{file}: switched on the layers and fields of {' and '.join(used)}")
     return used
+
+
+def named_dialects(text: str, file: str) -> tuple[str, ...]:
+    """Switch on the dialects that comments of a prototxt name, ``# dialect: hed``; return their names.
+
+    Raises SpecError for one that there is not.
+    """
+    names = []
+    for found in NAMED.finditer(text):
+        line = text.count("\n", 0, found.start(1)) + 1
+        try:
+            dialect = find_file(found[1])
+        except SpecError as fault:
+            raise SpecError(fault.message, Where(file, line, 1)) from None
+        switch_on(dialect)
+        names.append(dialect.name)
+    return tuple(names)
 
 
 def _own_words(dialect: Dialect) -> set[str]:

@@ -206,6 +206,11 @@ def dialects_with_field(message: str, field: str) -> tuple[str, ...]:
     return tuple(d.name for d in _known.values() if (message, field) in d.fields())
 
 
+def dialects_with_value(message: str, field: str, value: str) -> tuple[str, ...]:
+    """Return the known dialects that add a value to an enum of Caffe's: that of a field of a message (full name)."""
+    return tuple(d.name for d in _known.values() if value in d.values().get((message, field), ()))
+
+
 def dialects_with_message(name: str) -> tuple[str, ...]:
     """Return the known dialects that have a message or an enum of their own."""
     files = {d.name: d.declarations for d in _known.values()}

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 
+import pytest
 import torch
 
 from netspec.dialects import use_dialect
+from netspec.errors import SpecError
 from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
 
@@ -32,5 +34,88 @@ def test_a_dialect_that_was_asked_for_counts_for_every_net(net_of: Callable[...,
 
 
 def test_a_layer_type_names_its_dialect(net_of: Callable[..., Net]) -> None:
-    swish = 'layer { name: "swish" type: "Normalize" bottom: "data" top: "n" }'
-    assert net_of(PLAIN + swish).options.dialects == ("ssd",)
+    sure = (
+        'layer { name: "n" type: "CropCenter" bottom: "data" top: "n" crop_center_param { crop_size: [0, 0, 1, 1] } }'
+    )
+    assert net_of(PLAIN + sure).options.dialects == ("layout",)
+    assert net_of(PLAIN + NORMALIZE).options.dialects == ()
+
+
+NORMALIZE = 'layer { name: "n" type: "Normalize" bottom: "data" top: "n" }'
+INTERP = 'layer { name: "v" type: "Interp" bottom: "n" top: "v" interp_param { zoom_factor: 2 } }'
+BN = 'layer { name: "n" type: "BN" bottom: "data" top: "n" }'
+SMOOTH = 'layer { name: "n" type: "SmoothL1Loss" bottom: "data" bottom: "data" top: "n" %s }'
+TWO_TOPS = NORMALIZE.replace('top: "n"', 'top: "n" top: "l"')
+
+
+@pytest.mark.parametrize(
+    ("text", "others"),
+    [
+        (NORMALIZE, '"ssd" (a learned scale'),
+        ("# dialect: happynear\n" + NORMALIZE, ""),
+        (TWO_TOPS, ""),
+        (BN, '"blocks" (of PSPNet and TSN'),
+        ("  # dialect: tsn\n" + BN, ""),
+        (BN + INTERP, ""),
+        (BN.replace("}", "bn_param { bn_mode: LEARN } }"), ""),
+        (SMOOTH % "loss_weight: 1", '"rcnn" (divided by N;'),
+        (SMOOTH % "loss_weight: 1 smooth_l1_loss_param { sigma: 1 }", ""),
+        (SMOOTH % "loss_weight: 1 loss_param { normalization: NONE }", ""),
+    ],
+)
+def test_a_layer_of_several_forks_is_taken_as_the_file_shows(
+    net_of: Callable[..., Net], caplog: pytest.LogCaptureFixture, text: str, others: str
+) -> None:
+    net_of(PLAIN + text)
+    said = [record.getMessage() for record in caplog.records if "forks have other layers" in record.getMessage()]
+    assert len(said) == bool(others)
+    assert all(others in line and "# dialect: " in line and "--plugin" in line for line in said)
+
+
+def test_a_comment_names_a_dialect_that_there_is(net_of: Callable[..., Net]) -> None:
+    with pytest.raises(SpecError, match=r':2:1: unknown dialect "hd"; did you mean "hed"'):
+        net_of("\n# dialect: hd\n" + PLAIN)
+
+
+def conv(pad: int) -> str:
+    """Return a net of a convolution and a Crop without crop_param."""
+    kernel = f"num_output: 1 kernel_size: 3 pad: {pad}"
+    return PLAIN.replace("num_output: 2 kernel_size: 3", kernel) + (
+        'layer { name: "crop" type: "Crop" bottom: "conv" bottom: "data" top: "crop" }'
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "offset", "said"),
+    [
+        (conv(1), 0, ""),
+        (conv(2), 0, "cuts from the corner, as in Caffe; HED's branch aligns its bottoms, by 1 and 1"),
+        ("# dialect: hed\n" + conv(2), 1, ""),
+        (conv(35), 34, "aligns its bottoms as HED's branch does, by 34 and 34"),
+        (conv(35).replace('"crop" }', '"crop" crop_param { offset: 0 } }'), 0, ""),
+    ],
+)
+def test_crop_without_offsets_aligns_its_bottoms_in_heds_branch(
+    net_of: Callable[..., Net], caplog: pytest.LogCaptureFixture, text: str, offset: int, said: str
+) -> None:
+    if "crop_param" in text:
+        text = text.replace("offset: 0", "axis: 2 offset: 0")
+    assert net_of(text).layers[-1].window[2:] == [slice(offset, offset + 9)] * 2
+    lines = [record.getMessage() for record in caplog.records if "without crop_param" in record.getMessage()]
+    assert len(lines) == bool(said)
+    assert all(said in line for line in lines)
+
+
+def test_crops_of_a_hed_lie_where_coord_map_says(net_of: Callable[..., Net]) -> None:
+    last, text = "c", conv(35).partition('layer { name: "crop"')[0].replace('"conv"', '"c"')
+    for step in range(5):
+        if step:
+            text += f'layer {{ name: "p{step}" type: "Pooling" bottom: "{last}" top: "p{step}" '
+            text += "pooling_param { kernel_size: 2 stride: 2 } }"
+            last = f"p{step}"
+        factor = 2**step
+        text += f'layer {{ name: "u{step}" type: "Deconvolution" bottom: "{last}" top: "u{step}" '
+        text += f"convolution_param {{ num_output: 1 kernel_size: {2 * factor if step else 1} stride: {factor} }} }}"
+        text += f'layer {{ name: "o{step}" type: "Crop" bottom: "u{step}" bottom: "data" top: "o{step}" }}'
+    crops = [layer for layer in net_of("# dialect: hed\n" + text).layers if layer.type == "Crop"]
+    assert [crop.window[2].start for crop in crops] == [34, 35, 36, 38, 42]  # by BVLC's coord_map

@@ -89,8 +89,9 @@ def test_how_well_decoded_texts_agree_with_labels(build: Build) -> None:
     labels = torch.tensor([[1.0, 1, 0], [1, 1, 0]])
     layer = build("text", "type: 'CTCGreedyDecoder'", SCORES.shape, labels.shape)
     assert layer.run(SCORES, labels)[0].flatten().tolist() == [0.75, 0.5]
-    layer = build("text", "type: 'LabelsequenceAccuracy'", SCORES.shape, labels.shape)
-    assert layer.run(SCORES, labels)[0].item() == 0.5
+    scores = SCORES.transpose(0, 1)
+    layer = build("text", "type: 'LabelsequenceAccuracy'", scores.shape, labels.shape)
+    assert layer.run(scores, labels)[0].item() == 0.5
 
 
 def test_edit_distance(build: Build) -> None:

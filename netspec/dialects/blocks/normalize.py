@@ -1,0 +1,141 @@
+"""Normalize, under which several forks have layers of other numbers: SSD's, that of TSN, and happynear's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+
+from netspec.layers import Layer
+from netspec.layers.contract.base import Shape
+from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.proto.schema import given, value
+
+SSD, TSN, HAPPYNEAR = "ssd", "tsn", "happynear"
+HAPPYNEARS_EPS = 1e-6  # added to the sum
+
+
+class _Normalized(torch.autograd.Function):
+    """Normalize's formula. Its gradient is the fork's, not the derivative: the sum leaves the scales out.
+
+    dx = scale / length (dy - x sum(x dy) / length^2), where the derivative has sum(scale x dy). With one scale for all
+    channels the two are the same up to the place of the scale. Every SSD300 was trained with it.
+    Fork: src/caffe/layers/normalize_layer.cpp, Backward_cpu
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, scale: torch.Tensor, axes: tuple[int, ...], eps: float) -> torch.Tensor:
+        length = (x.square().sum(axes, keepdim=True) + eps).sqrt()
+        ctx.save_for_backward(x, scale, length)
+        ctx.axes = axes
+        return x / length * scale
+
+    @staticmethod
+    def backward(ctx: Any, dy: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        x, scale, length = ctx.saved_tensors
+        share = (x * dy).sum(ctx.axes, keepdim=True) / length.square()
+        dx = (dy - x * share) / length * scale if ctx.needs_input_grad[0] else None
+        dscale = (x / length * dy).sum_to_size(scale.shape) if ctx.needs_input_grad[1] else None
+        return dx, dscale, None, None
+
+
+class Normalize(Layer):
+    """Divide by the length over the channels of each pixel, or over the whole image.
+
+    SSD's (norm_param): y = scale x / sqrt(sum of squares + eps), over the whole image unless across_spatial is false;
+    the scales are learned. TSN's has no scale and no eps, and is over the whole image. happynear's (normalize_param, or
+    a second top) has no scale and is over the channels; with normalize_type: "L1" it divides by the sum of absolute
+    values. The gradient of its second top counts with bp_norm only.
+
+    bottom[0]  (N, C, ...)
+    top[0]     the same shape
+    top[1]     optional, happynear's: the lengths (N, 1, H, W)
+    blobs[0]   scales (), or (C,) where channel_shared is false; 1 unless scale_filler is given        SSD's only
+    Fork: weiliu89/caffe (ssd), yjxiong/caffe and happynear/caffe-windows, src/caffe/layers/normalize_layer.cpp
+    """
+
+    tops = (1, 2)
+    forks: ClassVar[Mapping[str, str]] = {
+        SSD: "a learned scale, the length of the whole image",
+        TSN: "no scale, the length of the whole image",
+        HAPPYNEAR: "no scale, the length over the channels of each pixel",
+    }
+
+    def setup(self) -> None:
+        fields, shape = given(self.param), self.bottom_shapes[0]
+        if len(shape) < 2:
+            raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
+        of_happynear = self.num_tops > 1 or "normalize_param" in fields
+        self.fork = HAPPYNEAR if of_happynear else SSD if "norm_param" in fields else self.whose()
+        self.across, self.eps, self.squares = self.fork == TSN, 0.0, True
+        if self.fork == HAPPYNEAR:
+            self._set_up_as_happynears(value(self.param, "normalize_param") if "normalize_param" in fields else None)
+        elif self.fork == SSD:
+            param = value(self.param, "norm_param")
+            self.across, self.eps = param.across_spatial, param.eps
+            filler = param.scale_filler if param.HasField("scale_filler") else None
+            self.add_blob(() if param.channel_shared else shape[1:2], filler, value=1.0)
+
+    def _set_up_as_happynears(self, param: Any) -> None:
+        kind = param.normalize_type if param else "L2"
+        if kind not in ("L1", "L2"):
+            raise self.error(f'found "{kind}", expected "L1" or "L2"', "normalize_param", "normalize_type")
+        if param and param.fix_gradient:
+            message = "the gradient of fix_gradient is not here; without it, it is the derivative"
+            raise self.error(message, "normalize_param", "fix_gradient")
+        self.eps, self.squares, self.passes_length = HAPPYNEARS_EPS, kind == "L2", bool(param and param.bp_norm)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the bottom's shape, and that of the lengths; there must be a scale for each channel."""
+        shape = bottom_shapes[0]
+        if self.blobs and self.blob_shapes[0] not in ((), shape[1:2]):
+            raise self.error(f"bottom of shape {shape} does not have the {self.blob_shapes[0][0]} channels", "bottom")
+        return [shape, (*shape[:1], 1, *shape[2:], 1, 1)[: max(4, len(shape))]][: self.num_tops]
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        axes = tuple(range(1, data.dim())) if self.across else (1,)
+        if self.fork == SSD:
+            scale = self.blob(0)
+            scale = scale if scale.dim() == 0 else scale.reshape(-1, *(1,) * (data.dim() - 2))
+            return _Normalized.apply(data, scale, axes, self.eps)
+        size = length(data, axes, self.eps, self.squares)
+        lengths = size if self.num_tops == 1 or self.passes_length else size.detach()
+        return (
+            (data / size, lengths.reshape(self.top_shapes[-1]))[: self.num_tops] if self.num_tops > 1 else data / size
+        )
+
+    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
+        axes = len(self.bottom_shapes[0])
+        over = graph.constant(list(range(1, axes)) if self.across else [1])
+        parts = graph.node("Mul", *bottoms, *bottoms) if self.squares else graph.node("Abs", *bottoms)
+        size = graph.node("Add", graph.node("ReduceSum", parts, over, keepdims=1), graph.constant(self.eps))
+        size = graph.node("Sqrt", size) if self.squares else size
+        top = graph.node("Div", *bottoms, size)
+        if self.blobs:
+            shape = (*self.blob_shapes[0], *(1,) * (axes - 2)) if self.blob_shapes[0] else ()
+            top = graph.node("Mul", top, graph.blob(0, shape))
+        return top if self.num_tops == 1 else [top, size]
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+        axes = len(self.bottom_shapes[0])
+        over = tuple(range(1, axes)) if self.across else 1
+        given = {"x": bottoms[0], "over": over, "eps": rounded(self.eps)}
+        if self.blobs:
+            shape = (*self.blob_shapes[0], *(1,) * (axes - 2)) if self.blob_shapes[0] else ()
+            template = f"{code.function(normalize)}({{x}}, {{scale}}, {{over}}, eps={{eps}})"
+            return code.call(template, scale=code.parameter(0, shape), **given)
+        size = code.call(f"{code.function(length)}({{x}}, {{over}}, {{eps}}, {self.squares})", **given)
+        top = code.call("{x} / {size}", x=bottoms[0], size=size)
+        return top if self.num_tops == 1 else [top, size]
+
+
+def normalize(x, scale, axes, eps):
+    """Divide by the length over some axes, and multiply by learned scales."""
+    length = (x.square().sum(axes, keepdim=True) + eps).sqrt()
+    return scale * x / length
+
+
+def length(x, axes, eps, squares):
+    """Return the length over some axes, or the sum of absolute values."""
+    return (x.square().sum(axes, keepdim=True) + eps).sqrt() if squares else x.abs().sum(axes, keepdim=True) + eps

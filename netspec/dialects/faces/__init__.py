@@ -1,0 +1,1 @@
+"""Nets that tell faces apart: their normalization and losses."""
