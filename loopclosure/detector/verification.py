@@ -8,13 +8,14 @@ probabilistic criterion to detect rigid point matches between two images and est
 2004). Small images are enlarged first: SIFT finds points down to about two pixels of what it is given.
 
 A flat scene, or a camera that only rotates, does not determine the fundamental matrix. Its inliers still count points
-that agree, so such pairs are accepted. A pair needs texture: two views of a bare wall fail.
+that agree, so such pairs are accepted. A pair needs texture: two views of a bare wall fail. It needs texture in several
+parts of the image, too: a sign or a printed code stands in many places.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -33,6 +34,12 @@ BY_CHANCE = 1e-6
 # decide against a score. No other place of the drives that this was chosen on had three times as many.
 SURE, DOUBTLESS = 1.5, 3.0
 SAMPLE, SOLUTIONS = 7, 3  # matches that make a fundamental matrix, and how many they may make
+PARTS = (8, 6)  # of an image, across and down
+SPREAD = 5  # parts: of one, no more than this share of the inliers needed count
+# Points that match where they are, within the error of an inlier, in this share of unlike pairs, and at least so many:
+# a clock, a watermark, the hood of the car.
+FIXED, LEAST_FIXED = 0.1, 3
+CELLS = (48, 36)  # of an image, across and down, that are fixed or not
 # The most by which an image is enlarged; beyond it only the interpolation gets finer.
 MOST_ENLARGED = 4.0
 
@@ -50,7 +57,10 @@ class LocalFeatures:
 
 
 class Agreement(NamedTuple):
-    """How many points of two images match, how many matches agree with one matrix, and how many chance may not."""
+    """How many points of two images match, how many matches agree with one matrix, and how many chance may not.
+
+    Where inliers crowd in few parts of an image, those that count are fewer than are needed.
+    """
 
     matches: int
     inliers: int
@@ -135,8 +145,12 @@ class GeometricCheck:
         else:
             matrix, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, error, self.confidence)
         # Without a matrix OpenCV 5.0.0 does not fill in the mask. Of several solutions the mask says nothing.
-        known = matrix is not None and matrix.shape == (3, 3)
-        return Agreement(len(matches), int(np.count_nonzero(mask)) if known else 0, needed)
+        if matrix is None or matrix.shape != (3, 3):
+            return Agreement(len(matches), 0, needed)
+        agree = mask.reshape(-1) > 0
+        count = int(np.count_nonzero(agree))
+        spread = min(_spread(p[agree], image.size, needed) for p, image in zip(points, (a, b), strict=True))
+        return Agreement(len(matches), count if spread >= needed else min(count, spread), needed)
 
     def enough(self, found: Agreement) -> int:
         """Return the inliers of an agreement; 0 if there are fewer than this check asks for."""
@@ -168,6 +182,17 @@ class GeometricCheck:
             )
 
 
+def _part(points: np.ndarray, size: tuple[int, int], parts: tuple[int, int]) -> np.ndarray:
+    """Return in which of so many parts, across and down, of an image of a size points (N, 2) lie: (N,) numbers."""
+    column, row = (np.floor(points * parts / size).astype(int).clip(0, np.subtract(parts, 1))).T
+    return row * parts[0] + column
+
+
+def _spread(points: np.ndarray, size: tuple[int, int], needed: int) -> int:
+    """Count points (N, 2) of an image, no more than a share of those ``needed`` in one part."""
+    return int(np.minimum(np.bincount(_part(points, size, PARTS)), math.ceil(needed / SPREAD)).sum())
+
+
 @lru_cache(4096)
 def _needed(matches: int, width: int, height: int, error_px: float) -> int:
     """Return the least k with (n - 7) C(n, k) C(k, 7) 3 p^(k - 7) <= BY_CHANCE, n + 1 if there is none.
@@ -186,10 +211,12 @@ def _needed(matches: int, width: int, height: int, error_px: float) -> int:
 class Pairs:
     """Verified pairs of images, each image described and each pair matched once for all that ask.
 
-    image  how an image is read: its key -> (H, W) or (H, W, 3) uint8
+    image   how an image is read: its key -> (H, W) or (H, W, 3) uint8
+    hidden  (CELLS) bool, the cells of all images, row by row, whose points do not count; None: all points do
     """
 
     image: Callable[[Any], np.ndarray]
+    hidden: np.ndarray | None = None
     _local: dict[tuple[GeometricCheck, Any], LocalFeatures] = field(default_factory=dict)
     _found: dict[tuple[GeometricCheck, Any, Any], Agreement] = field(default_factory=dict)
 
@@ -198,14 +225,18 @@ class Pairs:
         of = (_by_points(check), key)
         if of not in self._local:
             self._local[of] = check.describe(self.image(key))
-        return self._local[of]
+        local = self._local[of]
+        if self.hidden is None:
+            return local
+        seen = ~self.hidden[_part(local.points, local.size, CELLS)]
+        return LocalFeatures(local.points[seen], local.descriptors[seen], local.size)
 
     def __bool__(self) -> bool:
         return bool(self._local)
 
-    def put(self, check: GeometricCheck, key: Any, image: np.ndarray) -> None:
-        """Find the points of an image that cannot be read later, a video's."""
-        self._local[_by_points(check), key] = check.describe(image)
+    def put(self, check: GeometricCheck, key: Any, local: LocalFeatures) -> None:
+        """Take the points of an image that cannot be read later, a video's."""
+        self._local[_by_points(check), key] = local
 
     def agreement(self, check: GeometricCheck, a: Any, b: Any) -> Agreement:
         """Return how many points of two images agree."""
@@ -213,6 +244,46 @@ class Pairs:
         if of not in self._found:
             self._found[of] = check.agreement(self.features(check, a), self.features(check, b))
         return self._found[of]
+
+    def without_fixed(self, check: GeometricCheck, unlike: Sequence[tuple[Any, Any]]) -> Pairs:
+        """Return pairs without what stays where it is in many ``unlike`` pairs of images; itself if nothing does."""
+        hits = np.zeros(CELLS[0] * CELLS[1], int)
+        for one, other in unlike:
+            a, b = self.features(check, one), self.features(check, other)
+            matches = check.matches(a, b)
+            points = a.points[matches[:, 0]]
+            still = np.abs(points - b.points[matches[:, 1]]).max(axis=1) <= check.max_error_px / check.enlarged(a.size)
+            hits[np.unique(_part(points[still], a.size, CELLS))] += 1
+        fixed = (hits >= max(LEAST_FIXED, FIXED * len(unlike))).reshape(CELLS[1], CELLS[0])
+        if not fixed.any():
+            return self
+        around = cv2.dilate(fixed.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        return Pairs(self.image, around.reshape(-1), self._local)
+
+
+@dataclass(frozen=True)
+class Between:
+    """Verification of queries and references by number: their keys in ``pairs``."""
+
+    check: GeometricCheck
+    pairs: Pairs
+    queries: Sequence[Any]
+    references: Sequence[Any]
+
+    def __call__(self, query: int, reference: int) -> Agreement:
+        """Return how many points of the two agree."""
+        return self.pairs.agreement(self.check, self.queries[query], self.references[reference])
+
+    def without_fixed(self, unlike: Sequence[tuple[int, int]]) -> Between:
+        """Return the same without what is fixed in the images; itself if nothing is."""
+        keys = [(self.queries[query], self.references[reference]) for query, reference in unlike]
+        pairs = self.pairs.without_fixed(self.check, keys)
+        return self if pairs is self.pairs else replace(self, pairs=pairs)
+
+    @property
+    def hidden(self) -> float:
+        """The share of the image that is not looked at."""
+        return 0.0 if self.pairs.hidden is None else float(self.pairs.hidden.mean())
 
 
 def _by_points(check: GeometricCheck) -> GeometricCheck:

@@ -14,7 +14,7 @@ import numpy as np
 
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.run import verdicts_said
-from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
+from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
 from loopclosure.methods.candidates import Candidates, candidates, far_apart
@@ -66,7 +66,8 @@ def answer(
     allowed    (Q, R) bool: the candidates
     two        two traverses, in the order of time each, or one sequence with itself
     precision  the share of what is accepted that should be right
-    check, agree  verification of a query and a reference, by number; None: there are no images
+    check, agree  verification of a query and a reference, by number; None: there are no images. A
+               :class:`~loopclosure.detector.verification.Between` leaves out what is fixed in the images
     far        (Q, R) bool: pairs that odometry puts far apart; they are no candidates, and show how others score
     stamps     (Q,) seconds of the queries, NaN or None where not known
     visit      in one sequence, a reference is a candidate of a query if it is more than so many frames older; None: if
@@ -170,9 +171,7 @@ class Auto:
         if not two:
             allowed &= earlier(len(images.queries), self.exclude_frames)
 
-        def agree(query: int, reference: int) -> Agreement:
-            return self.pairs.agreement(self.check, images.queries[query], references[reference])
-
+        agree = Between(self.check, self.pairs, images.queries, references)
         visit = None if self.visit < 0 else self.visit
         with timed(seconds, "choice and verification"):
             decided = answer(found.scores, allowed, two, self.precision, self.check, agree, progress, far, visit=visit)

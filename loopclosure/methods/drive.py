@@ -8,7 +8,7 @@ from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import Recording, run_detector
-from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
+from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.auto import PRECISION, Answer, answer
 from loopclosure.methods.candidates import far_apart
@@ -45,13 +45,10 @@ def whole_drive(
     allowed = np.tri(len(rows), k=-1, dtype=bool)
     allowed &= ~exclusion.excludes(numbers, numbers, detector.stamps, detector.stamps)
     check, pairs = GeometricCheck(), Pairs(lambda number: _gray_image(recording, number))
-
-    def agree(query: int, reference: int) -> Agreement:
-        if recording.images is None and not pairs:
-            for number, image, _ in progress(recording.frames(), "local features", len(recording)):
-                pairs.put(check, number, gray(image))
-        return pairs.agreement(check, query, reference)
-
+    if recording.images is None:
+        for number, image, _ in progress(recording.frames(), "local features", len(recording)):
+            pairs.put(check, number, check.describe(gray(image)))
+    agree = Between(check, pairs, numbers.tolist(), numbers.tolist())
     far = None if odometry is None else far_apart(odometry)
     found = answer(scores, allowed, False, precision, check, agree, progress, far, detector.stamps, visit)
     single = np.where(allowed, scores, -np.inf).max(axis=1)

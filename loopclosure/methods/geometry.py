@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopclosure.detector.verification import DOUBTLESS, LEAST_MATCHES, SURE, Agreement, GeometricCheck
+from loopclosure.detector.verification import DOUBTLESS, LEAST_MATCHES, SURE, Agreement, Between, GeometricCheck
 from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.decoys import UNEVEN, Lines, Matches, threshold
 from loopclosure.methods.seqslam import SequenceSettings
@@ -30,14 +30,12 @@ class Geometry:
 
     check, agree  of a query and a reference, by number
     unlike  the evidence of pairs that the scores call unlike; None where nothing can be verified
-    keeps   whether matches of sequences are loops where unlike pairs are verified too
     said    what was tried, in a sentence
     """
 
     check: GeometricCheck
     agree: Agree
     unlike: np.ndarray | None
-    keeps: bool
     said: str
 
     def common(self, evidence: float) -> bool:
@@ -49,6 +47,11 @@ class Geometry:
 def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agree: Agree) -> Geometry:
     """Verify some matches and some unlike pairs."""
     accepted, match = matches.accepted, matches.match
+    pairs, hidden = _unlike(given), ""
+    if isinstance(agree, Between) and pairs:
+        agree = agree.without_fixed([(int(given.queries[q]), int(given.references[r])) for q, r in pairs])
+        if agree.hidden:
+            hidden = f" ({100 * agree.hidden:.1f} % of the image is the same over the drive, and left out)"
 
     def of_part(query: int, reference: int) -> Agreement:
         return agree(int(given.queries[query]), int(given.references[reference]))
@@ -56,20 +59,20 @@ def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agr
     likely = np.flatnonzero(accepted) if accepted.any() else np.argsort(-matches.score, kind="stable")[:SAMPLE]
     likely = _sample(likely[match[likely] >= 0])
     if not len(likely):
-        return Geometry(check, of_part, None, True, "verification: not tried, no query has a candidate")
-    same = sum(check.enough(of_part(query, match[query])) > 0 for query in likely)
-    against = _unlike(given.known, check, of_part)
+        return Geometry(check, of_part, None, "verification: not tried, no query has a candidate")
+    same = sum(check.enough(of_part(int(query), int(match[query]))) > 0 for query in likely)
+    against = np.array([check.evidence(of_part(query, reference)) for query, reference in pairs])
     unlike = np.count_nonzero(against >= 1)
-    tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(against)} unlike pairs"
+    tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(against)} unlike pairs{hidden}"
     if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
         said = f"{tried}: these images cannot be verified, so that nothing is rejected for it"
-        return Geometry(check, of_part, None, True, said)
+        return Geometry(check, of_part, None, said)
     # Unlike pairs of a small place, a desk, do show the same things, and so does a dashboard in all images.
     if unlike > LEAST_SHARE * len(against):
         what = "something is the same in all images, so that only what has far more in common is verified"
     else:
         what = "what is verified is a loop, and what has no verified pair near it is none"
-    return Geometry(check, of_part, against, True, f"{tried}: {what}")
+    return Geometry(check, of_part, against, f"{tried}: {what}")
 
 
 def _sample(numbers: np.ndarray) -> np.ndarray:
@@ -79,16 +82,15 @@ def _sample(numbers: np.ndarray) -> np.ndarray:
     return numbers[np.unique(np.linspace(0, len(numbers) - 1, SAMPLE).round().astype(int))]
 
 
-def _unlike(known: np.ndarray, check: GeometricCheck, agree: Agree) -> np.ndarray:
-    """Return the evidence of pairs that the scores (Q, R), -inf for no candidate, call unlike."""
-    against = []
+def _unlike(given: Candidates) -> list[tuple[int, int]]:
+    """Return pairs that the scores call unlike."""
+    known, pairs = given.known, []
     for query in _sample(np.flatnonzero(np.count_nonzero(np.isfinite(known), axis=1) >= 8)):
         order = np.argsort(known[query], kind="stable")
         candidates = order[np.isfinite(known[query, order])]
         # One of the least alike quarter, another quarter of them each time.
-        reference = candidates[int(query) % max(1, len(candidates) // 4)]
-        against.append(check.evidence(agree(query, reference)))
-    return np.array(against)
+        pairs.append((int(query), int(candidates[int(query) % max(1, len(candidates) // 4)])))
+    return pairs
 
 
 def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
@@ -98,7 +100,7 @@ def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: G
         # Lamps of a tunnel repeat: one image that is verified does not overrule a sequence that is accepted.
         other = matches.match if matches.accepted[query] else single
         for reference in dict.fromkeys((int(matches.match[query]), int(other[query]))):
-            agreement = geometry.agree(query, reference)
+            agreement = geometry.agree(int(query), reference)
             matches.inliers[query] = check.enough(agreement)
             matches.evidence[query] = check.evidence(agreement)
             matches.few[query] = agreement.matches < LEAST_MATCHES
@@ -121,7 +123,7 @@ def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: f
     # From afar a place is seen before the camera is there: other queries fit it better.
     near = np.ones(len(accepted), bool) if lines is None else lines.near
     sure = near & (evidence >= least)
-    verified = sure | (accepted & geometry.keeps) if geometry.common(1) else matches.inliers > 0
+    verified = sure | accepted if geometry.common(1) else matches.inliers > 0
     before, after = _beside(matches.match, verified, lines)
     # Past the last verified match a loop has ended, though the line through it goes on.
     loops = sure | (accepted & (verified | (before & after)))

@@ -157,3 +157,42 @@ def test_images_and_pairs_are_looked_at_once(monkeypatch):
     assert pairs.agreement(GeometricCheck(min_inliers=30), 0, 1) is found
     pairs.agreement(GeometricCheck(ratio=0.7), 0, 1)
     assert read == [0, 1]
+
+
+def with_patch(image, patch, corner):
+    seen = image.copy()
+    seen[corner[1] : corner[1] + len(patch), corner[0] : corner[0] + len(patch[0])] = patch
+    return seen
+
+
+def test_a_printed_code_in_two_places_is_no_evidence(check):
+    """A code of 60 pixels has more inliers than rule out chance; a poster of half the image is a place."""
+    code = np.random.default_rng(5).integers(0, 2, (20, 20)).repeat(3, 0).repeat(3, 1)[..., None].repeat(3, 2) * 255
+    here, there = with_patch(wall(0), code, (40, 50)), with_patch(wall(1), code, (190, 120))
+    found = check.agreement(check.describe(here), check.describe(there))
+    assert found.matches > 2 * found.needed > 0 == check.enough(found)
+    poster = wall(2)[:160, :200]
+    here, there = with_patch(wall(0), poster, (20, 30)), with_patch(wall(1), poster, (90, 50))
+    assert check.inliers(check.describe(here), check.describe(there)) > 30
+
+
+def test_what_is_fixed_in_all_images_is_left_out(check):
+    """A frame around each image, as a dashboard has it; each place is seen twice, the second time from elsewhere."""
+    frame = wall(9)
+
+    def framed(image):
+        seen = frame.copy()
+        seen[40:200, 50:270] = image[40:200, 50:270]
+        return seen
+
+    images = [framed(wall(seed)) for seed in range(8)] + [framed(np.roll(wall(seed), 25, axis=1)) for seed in range(8)]
+    pairs = Pairs(images.__getitem__)
+    unlike = [(a, b) for a in range(8) for b in range(8) if a != b]
+    assert all(check.enough(pairs.agreement(check, a, b)) for a, b in unlike)
+    masked = pairs.without_fixed(check, unlike)
+    assert masked.hidden is not None
+    assert 0.2 < masked.hidden.mean() < 0.75
+    assert not any(check.enough(masked.agreement(check, a, b)) for a, b in unlike)
+    assert all(check.enough(masked.agreement(check, a + 8, a)) for a in range(8))
+    moving = Pairs([wall(seed) for seed in range(8)].__getitem__)
+    assert moving.without_fixed(check, unlike) is moving

@@ -321,6 +321,7 @@ def test_as_a_method(tmp_path, monkeypatch):
     assert method.precision == 0.9
     method.inner = Fixed(scores)
     monkeypatch.setattr(type(method.pairs), "agreement", lambda *_: Agreement(0, 0, 20))
+    monkeypatch.setattr(type(method.pairs), "without_fixed", lambda pairs, *_: pairs)
     paths = [tmp_path / f"{i}.png" for i in range(150)]
     result = method.score(Images(paths, paths), silent)
     assert np.count_nonzero(np.isfinite(result.scores)) > 0.9 * 150
