@@ -211,7 +211,7 @@ def table_source(table: Path, root: Path, group: str | None = None, index: Path 
     group_of: dict[str, str] = {}
     if index is not None:
         if group is None:
-            raise InputError("an index needs --group, the column that names the places", index)
+            raise InputError("an index needs group=COLUMN, the column that names the places", index)
         rows, (column,) = read_table(index, 1)
         group_of = {row[column]: cell(index, number, row, group) for number, row in rows}
     elif group is not None:

@@ -94,7 +94,7 @@ class Recording:
                     return
         if following is not None:
             message = f"ends after {number + 1} frames, though frame {following} is wanted and it says that it has it"
-            raise InputError(f"{message}; give --stop {number + 1}", self.source)
+            raise InputError(f"{message}; write {self.source},stop={number + 1}", self.source)
 
     def left_out(self) -> str:
         """Say which images were left out, in a sentence; empty where all could be read."""

@@ -1,7 +1,9 @@
 """No option is ignored: each one of each command, given alone, is read, or refused by its name."""
 
 import argparse
+import ast
 import os
+import re
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -256,3 +258,25 @@ def frozen() -> str:
 
 if __name__ == "__main__":
     FROZEN.write_text(frozen())
+
+
+OTHERS = {"--help", "--version", "--verbose", "--no-train", "--minloglevel", "--logtostderr", "--alsologtostderr"}
+OF_OTHER_PROGRAMS = {"--nproc-per-node"}  # torchrun's
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def test_options_that_a_message_names_are_there() -> None:
+    """Each ``--word`` of a text in the programs, but those of docstrings, is an option of some command."""
+    known = set(re.findall(r"--[a-z0-9_-]+", FROZEN.read_text())) | OTHERS | OF_OTHER_PROGRAMS
+    found, gone = set(), []
+    for path in [path for room in PROGRAMS for path in (ROOT / room).rglob("*.py")]:
+        tree = ast.parse(path.read_text())
+        bodies = [node.body[0] for node in ast.walk(tree) if isinstance(node, DOCUMENTED) and node.body]
+        docstrings = {id(first.value) for first in bodies if isinstance(first, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+                words = re.findall(r"(?<![\w(-])--[a-z][a-z0-9_-]+(?![\w:])", node.value)  # no name of CSS
+                found.update(words)
+                gone += [f"{path}:{node.lineno}: {word}" for word in words if word not in known | {"--no"}]
+    assert not gone
+    assert {"--weights", "--resume", "--gpu"} <= found, "messages are not looked at"

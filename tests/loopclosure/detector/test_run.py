@@ -138,7 +138,7 @@ def test_a_video_that_is_shorter_than_it_says(tmp_path, monkeypatch):
     monkeypatch.setattr("loopclosure.detector.run.video_frames", lambda path: ((i / 10, image) for i in range(30)))
     frames = recording.frames()
     assert [next(frames)[2], next(frames)[2]] == [0.0, 0.5]
-    with pytest.raises(InputError, match=r"v\.avi: ends after 30 frames, though frame 99 is wanted .* give --stop 30"):
+    with pytest.raises(InputError, match=r"v\.avi: ends after 30 frames, though .* 99 is wanted .* write .*,stop=30"):
         next(frames)
     with pytest.raises(InputError, match="threshold is nan"):
         LoopDetector(threshold=float("nan"))

@@ -59,7 +59,7 @@ def test_weights_logs_folders_and_what_is_none_of_them(tmp_path: Path) -> None:
         "a folder; `netspec data stat` describes a database",
         "27 bytes\nno text, and no .caffemodel",
         "no regular file",
-        "3.0 GiB\nno text",
+        "3 GiB\nno text",
         "caf\\udce9",
         "cannot be read: No such file or directory",
     ):
