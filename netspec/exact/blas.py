@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 import scipy
 import torch
-from threadpoolctl import ThreadpoolController
 
 from netspec.process.environment import environment
+
+with environment({"KMP_DUPLICATE_LIB_OK": "True"}):  # it sets that and leaves it set
+    from threadpoolctl import ThreadpoolController
 
 CAFFES = "SkylakeX"  # OpenBLAS' name of its kernels for AVX-512, with which the golden files were computed
 CORE_TYPE = "OPENBLAS_CORETYPE"  # the environment variable by which OpenBLAS chooses its kernels, when it is loaded

@@ -1,7 +1,7 @@
 """Environment variables that must stand while a library is loaded: set around that, and put back afterwards.
 
-These are all: the most pixels of an image, for OpenCV (netspec/files/opencv.py), and OpenBLAS's kernels, for SciPy
-(netspec/exact/blas.py).
+These are all: the most pixels of an image, for OpenCV (netspec/files/opencv.py), OpenBLAS's kernels, for SciPy, and
+what threadpoolctl sets itself (netspec/exact/blas.py).
 """
 
 from __future__ import annotations

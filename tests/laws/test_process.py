@@ -93,7 +93,8 @@ def test_a_library_changes_no_setting_of_its_process(work: str, tmp_path: Path) 
         (tmp_path / folder).symlink_to(found)
     (tmp_path / "deploy.prototxt").write_text(SMALL)
     code = CODE.replace("{libraries}", LIBRARIES).replace("{work}", work)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "2"}
+    kept = {name: os.environ[name] for name in ("PATH", "HOME", "SYSTEMROOT") if name in os.environ}
+    environment = {**kept, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "2"}  # this process may have been changed before
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
