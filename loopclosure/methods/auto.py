@@ -26,6 +26,7 @@ from loopclosure.places.pose_files import read_poses
 from loopclosure.progress import Progress, silent, timed
 
 PRECISION = 0.99
+TRIED = 10  # matches that a user who wants more may look at first
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ def answer(
     unknown = int(np.count_nonzero(matches.few & (matches.inliers <= 0)))
     reasons = [*filter(None, [given.said]), _sequences_said(lines, precision, given.others)]
     reasons.append(said + (f"; {unknown} cannot be" if unknown else ""))
-    reasons.append(_total_said(sum(map(bool, results)), sum(bool(result.candidates) for result in results)))
+    there = sum(bool(result.candidates) for result in results)
+    reasons.append(_total_said(sum(map(bool, results)), there, given))
     return Answer(results, reasons)
 
 
@@ -119,17 +121,25 @@ def _results(given: Candidates, matches: Matches, verdicts: list[str], stamps: n
 
 def _sequences_said(lines: Lines | None, precision: float, others: str) -> str:
     if lines is None:
-        return f"sequences: none is better than others {others}, so that images are compared one by one"
+        return f"sequences: none is better than those {others}, so that images are compared one by one"
+    decoys = lines.decoys[np.isfinite(lines.decoys)]
     return (
-        f"{lines.setting}: a score of {lines.threshold(precision):.4g} or more, since {others} the best of a query is "
-        f"{np.median(lines.decoys):.4g} in the middle and {lines.decoys.max():.4g} at most"
+        f"sequences: better than all but a few {others} (a score of {lines.threshold(precision):.4g} or more; {others} "
+        f"{np.median(decoys):.4g} in the middle, {decoys.max():.4g} at most); {lines.setting}"
     )
 
 
-def _total_said(loops: int, queries: int) -> str:
+def _total_said(loops: int, queries: int, given: Candidates) -> str:
     if loops:
         return f"{loops} of {queries} queries with a candidate close a loop"
-    return "nothing here tells loops from chance: none is accepted (a threshold of your own accepts more)"
+    if not queries:
+        return "no frame has a candidate: the camera did not come back, or the drive is too short to tell"
+    known = given.known
+    alike = np.argsort(-known.max(axis=1), kind="stable")[:TRIED]
+    least, ages = known[alike].max(axis=1).min(), given.queries[alike] - given.references[known[alike].argmax(axis=1)]
+    recent = "" if given.two else f" --exclude-recent {max(0, ages.min() - 1)}"
+    tried = f"detect --threshold {np.floor(1e3 * least) / 1e3:g}{recent} accepts the most alike, to be looked at"
+    return f"nothing here tells loops from chance: none is accepted ({tried})"
 
 
 @dataclass

@@ -18,6 +18,7 @@ from loopclosure.report.plots import COLORS, FOUND, MISSED, STYLE
 from netspec.files.whole_file import write_whole
 
 BEST, WORST, REJECTED = 4, 3, 3  # pairs shown
+IN_WORDS = {"below threshold": "not alike enough", "not verified": "their points do not agree"}
 APART = 30  # of so many equal parts of a drive one pair is shown at most
 OF_PATH = "The path from its known poses; green lines join the two frames of each loop."
 OF_FRAMES = (
@@ -55,13 +56,16 @@ def verdict(loops: int, frames: int) -> str:
 
 def _dots(results: Sequence[LoopResult]) -> Figure:
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7, 4), layout="constrained")
+        figure = Figure(figsize=(6, 3.6), layout="constrained")
         axis = figure.subplots()
         for accepted, color, size in ((False, MISSED, 2), (True, FOUND, 5)):
             some = [(r.query_id, r.candidates[0][0]) for r in results if bool(r) is accepted and r.candidates]
             axis.plot(*np.array(some).reshape(-1, 2).T, ".", color=color, markersize=size)
         axis.set_xlabel("frame")
         axis.set_ylabel("earlier frame")
+        first, last = (results[0].query_id, results[-1].query_id) if results else (0, 1)
+        axis.set_xlim(first - 0.5, last + 0.5)
+        axis.set_ylim(-0.5, last + 0.5)
         axis.grid(color="#e6e6e6", linewidth=0.5)
         return figure
 
@@ -73,7 +77,7 @@ def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
     places = positions[:, across]
     ends = np.array([pair for pair in _ends(results) if np.all(np.isfinite(places[list(pair)]))], int).reshape(-1, 2)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7, 4.5), layout="constrained")
+        figure = Figure(figsize=(6, 4), layout="constrained")
         axis = figure.subplots()
         axis.plot(*places.T, color=COLORS[0], lw=1)
         axis.add_collection(LineCollection(list(places[ends]), colors=FOUND, linewidths=0.8, alpha=0.7))
@@ -117,7 +121,7 @@ def _match(result: LoopResult) -> int:
 def _pair(result: LoopResult, images: dict[int, np.ndarray], first: int) -> Pair:
     match = _match(result)
     points = "" if result.inliers is None else f", {result.inliers} points agree"
-    why = "" if result else f", {result.verdict}"
+    why = "" if result else f", {IN_WORDS.get(result.verdict, result.verdict)}"
     picture = side_by_side(images[result.query_id - first], images[match - first])
     return Pair(picture, f"{result.query_id} and {match}{points}{why}")
 
