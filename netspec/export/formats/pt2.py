@@ -96,11 +96,11 @@ class _ProgramModule(nn.Module):
         self.program, self.expected = program, expected
         self.attributes = program.attributes()
         libraries = {"torch": torch, "nn": nn, "F": F, "math": math}
-        self.known = {**libraries, **program.functions, **{f"n{i}": n for i, (_, n) in enumerate(program.numbers)}}
+        self.known = {**libraries, **program.functions}
         state = {}
         for m, attribute in self.attributes.items():
             module = program.modules[m]
-            made = _value(_parsed(module.constructor({})), libraries)
+            made = _value(_parsed(module.constructor()), libraries)
             if module.kind == "buffer":
                 self.register_buffer(attribute, made)
             else:

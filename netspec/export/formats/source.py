@@ -1,7 +1,6 @@
 """A PyTorch program while it is written: statements, the modules they call, and the text of both.
 
-An expression is text in which marks stand for values, modules and numbers, so that the same expression in two places
-can be recognized, and names given when all is known.
+An expression is text in which marks stand for values and modules: names are given when all is known.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import builtins
 import keyword
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,13 +18,13 @@ import torch
 
 WIDTH = 88  # ruff's and black's line length where nothing else is configured
 _STRING = re.compile(r'"(?:[^"\\]|\\.)*"')
-MARK = re.compile("\x02([vmn])(\\d+)\x03")  # a value, a module, a number
+MARK = re.compile("\x02([vm])(\\d+)\x03")  # a value, a module
 _TAKEN = {"self", "x", "torch", "nn", "F", "math", "Path", "load_file", "load", "forward", "main"}
 _TAKEN |= {name for name in dir(torch.nn.Module) if not name.startswith("__")} | {"training", "T_destination"}
 
 
 def mark(kind: str, number: int) -> str:
-    """Return the mark of a value (v), a module (m) or a number (n)."""
+    """Return the mark of a value (v) or a module (m)."""
     return f"\x02{kind}{number}\x03"
 
 
@@ -33,8 +32,7 @@ def mark(kind: str, number: int) -> str:
 class Module:
     """A submodule, or a parameter or buffer of the module itself: its constructor's call, and its tensors by name.
 
-    ``numbers`` are the values of the fields of the template. Where it is a repeated block, ``parts`` are the block's
-    submodules by attribute, which hold the tensors.
+    ``numbers`` are the values of the fields of the template; those that are the ``usual`` ones are left out.
     """
 
     layer: str
@@ -42,24 +40,19 @@ class Module:
     numbers: dict[str, Any]
     state: dict[str, torch.Tensor]
     kind: str = "module"  # or "buffer"
-    parts: dict[str, Module] = field(default_factory=dict)
-    statements: int = 0  # of the block
     usual: dict[str, Any] = field(default_factory=dict)
 
-    def constructor(self, named: Mapping[str, str]) -> str:
-        """Return the constructor's call; ``named`` are the fields that an argument gives."""
+    def constructor(self) -> str:
+        """Return the constructor's call."""
         template = self.template
         for name, value in self.usual.items():
-            if name not in named and self.numbers[name] == value:
+            if self.numbers[name] == value:
                 template = template.replace(f", {name}={{{name}}}", "")
-        return template.format(**{name: named.get(name, number(value)) for name, value in self.numbers.items()})
+        return template.format(**{name: number(value) for name, value in self.numbers.items()})
 
     def tensors(self, prefix: str) -> dict[str, torch.Tensor]:
         """Return all tensors as they are named in a state_dict, for the attribute ``prefix``."""
-        found = {f"{prefix}.{name}" if name else prefix: tensor for name, tensor in self.state.items()}
-        for name, part in self.parts.items():
-            found.update(part.tensors(f"{prefix}.{name}"))
-        return found
+        return {f"{prefix}.{name}" if name else prefix: tensor for name, tensor in self.state.items()}
 
 
 @dataclass(eq=False)
@@ -79,22 +72,17 @@ class Statement:
         """Return the modules that it uses, in order."""
         return [int(number) for kind, number in MARK.findall(self.expression) if kind == "m"]
 
-    def numbers(self) -> list[int]:
-        """Return the numbers in it, in order."""
-        return [int(number) for kind, number in MARK.findall(self.expression) if kind == "n"]
-
 
 @dataclass
 class Program:
     """A whole module: what it takes and gives, and how it computes it.
 
-    ``names`` are the blobs' names of values; ``inputs`` and ``outputs`` are values; ``modules`` and ``numbers`` are
-    what marks stand for; ``functions`` are copied as they are.
+    ``names`` are the blobs' names of values; ``inputs`` and ``outputs`` are values; ``modules`` are what
+    marks stand for; ``functions`` are copied as they are.
     """
 
     statements: list[Statement] = field(default_factory=list)
     modules: list[Module] = field(default_factory=list)
-    numbers: list[tuple[str, Any]] = field(default_factory=list)
     names: dict[int, str] = field(default_factory=dict)
     inputs: list[int] = field(default_factory=list)
     outputs: dict[str, int] = field(default_factory=dict)

@@ -1,7 +1,7 @@
 """``--to torch``: a net as the source of a PyTorch module, with its weights beside it.
 
-The source reads as if a person had written it: submodules named after the layers, repeated blocks as classes, no trace
-of this project but the line that says where it came from. It computes what the net computes.
+The source reads as if a person had written it: submodules named after the layers, no trace of this
+project but the line that says where it came from. It computes what the net computes.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ import json
 import re
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
 
 from netspec.errors import SpecError
-from netspec.export.formats.blocks import Block, find_blocks
 from netspec.export.formats.inputs import check_shapes
 from netspec.export.formats.shapes import NetShapes, input_shapes, settled
 from netspec.export.formats.source import (
@@ -26,7 +25,6 @@ from netspec.export.formats.source import (
     Program,
     Statement,
     class_name,
-    joined,
     lay_out,
     legal,
     mark,
@@ -81,8 +79,6 @@ def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, t
     """Return a net as PyTorch source, the state_dict of the class in it, and notes for its user, in lines."""
     program, shapes = settled(net, lambda shapes: write_program(net, shapes))
     name = class_name(net.name or "net")
-    blocks = find_blocks(program, name)
-    _join_chains(program)
     attributes = program.attributes()
     expected = input_shapes(net, shapes)
     sizes = [f"{program.names[v]} {_shape(shapes, v)}" for v in program.inputs]
@@ -91,7 +87,6 @@ def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, t
         program.functions[check_shapes.__name__] = check_shapes
     example = ", ".join(f"torch.zeros({', '.join(map(str, shapes.built[v]))})" for v in program.inputs)
     parts = [textwrap.dedent(inspect.getsource(function)).strip() for function in program.functions.values()]
-    parts += [_block_class(program, block) for block in blocks]
     parts += [
         _net_class(program, name, attributes, f"{', '.join(sizes)} -> {', '.join(made)}", expected),
         _loader(name),
@@ -160,67 +155,24 @@ def _net_class(
 ) -> str:
     taken = set(program.functions)
     inputs = {v: unique(legal(program.names[v], "blob_"), taken) for v in program.inputs}
-    made = [_constructed(program.modules[m], attribute, {}) for m, attribute in attributes.items()]
-    body = _forward(
-        program,
-        program.statements,
-        inputs,
-        program.outputs,
-        attributes,
-        lambda v, _: program.names[v],
-        lambda n: number(program.numbers[n][1]),
-    )
+    made = [_constructed(program.modules[m], attribute) for m, attribute in attributes.items()]
+    body = _forward(program, inputs, attributes)
     if expected:
         shapes = ", ".join(f"{quoted(program.names[v])}: {argument}.shape" for v, argument in inputs.items())
         wanted = ", ".join(f"{quoted(blob)}: {number(sizes)}" for blob, sizes in expected.items())
         body = [f"{check_shapes.__name__}({{{shapes}}}, {{{wanted}}})", *body]
     lines = [f"class {name}(nn.Module):", *_docstring(f"{description}.", 4), ""]
-    return "\n".join([*lines, *_methods("", [], made, ", ".join(inputs.values()), body)])
+    return "\n".join([*lines, *_methods(made, ", ".join(inputs.values()), body)])
 
 
-def _block_class(program: Program, block: Block) -> str:
-    numbers = [(n, program.numbers[n][0]) for statement in block.statements for n in statement.numbers()]
-    kept = [block.named[n] for n, _ in numbers if n in block.named]
-    made = []
-    for m, attribute in block.attributes.items():
-        named = {field: block.named[m, field] for field in program.modules[m].numbers if (m, field) in block.named}
-        made.append(_constructed(program.modules[m], attribute, named))
-    body = _forward(
-        program,
-        block.statements,
-        {block.input: "x"},
-        {"": block.output},
-        block.attributes,
-        lambda v, statement: _local_name(program, block, v, statement),
-        lambda n: f"self.{block.named[n]}" if n in block.named else number(program.numbers[n][1]),
-    )
-    arguments = list(dict.fromkeys(block.named.values()))
-    places = list(dict.fromkeys(block.places))
-    told = f"As in {joined(places)}."
-    if len(told) > WIDTH - 10:
-        told = f"As in {places[0]} and so on to {places[-1]}, {len(places)} times."
-    lines = [f"class {block.name}(nn.Module):", *_docstring(told, 4), ""]
-    return "\n".join([*lines, *_methods(", ".join(arguments), kept, made, "x", body)])
-
-
-def _local_name(program: Program, block: Block, value: int, statement: Statement) -> str:
-    modules = statement.modules()
-    if modules:
-        return block.attributes[modules[0]]
-    return statement.layer.removeprefix(block.places[0]).strip("/_-. ") or "out"
-
-
-def _methods(arguments: str, kept: Sequence[str], made: Sequence[str], inputs: str, body: Sequence[str]) -> list[str]:
-    stored = [f"self.{name} = {name}" for name in dict.fromkeys(kept)]
-    lines = lay_out(f"def __init__(self{', ' if arguments else ''}{arguments}):", 4)
-    lines.append("        super().__init__()")
-    for statement in (*stored, *made):
+def _methods(made: Sequence[str], inputs: str, body: Sequence[str]) -> list[str]:
+    lines = ["    def __init__(self):", "        super().__init__()"] if made else []
+    for statement in made:
         lines += lay_out(statement, 8)
-    signature = lay_out(f"def forward(self, {inputs}):", 4)
-    lines += ["", *signature]
+    lines += [*([""] if made else []), *lay_out(f"def forward(self, {inputs}):", 4)]
     for statement in body:
         lines += lay_out(statement, 8)
-    return lines if made or stored else [*signature, *(line for statement in body for line in lay_out(statement, 8))]
+    return lines
 
 
 def _docstring(text: str, indent: int) -> list[str]:
@@ -232,68 +184,24 @@ def _docstring(text: str, indent: int) -> list[str]:
     return [f'{space}"""Inputs and outputs.', "", *lines, f'{space}"""']
 
 
-def _constructed(module: Module, attribute: str, named: Mapping[str, str]) -> str:
-    call = module.constructor(named)
+def _constructed(module: Module, attribute: str) -> str:
+    call = module.constructor()
     if module.kind == "buffer":
         return f'self.register_buffer("{attribute}", {call})'
     return f"self.{attribute} = {call}"
 
 
-def _join_chains(program: Program) -> None:
-    """Make one nn.Sequential of three or more equal blocks in a row."""
-    reads = Counter(v for statement in program.statements for v in statement.values())
-    reads.update(program.outputs.values())
-    uses = Counter(m for statement in program.statements for m in statement.modules())
-
-    def block(statement: Statement) -> Module | None:
-        """Return the block that the statement calls, if that is all it does and no one else calls it."""
-        for m, v in zip(statement.modules(), statement.values(), strict=False):
-            module = program.modules[m]
-            if statement.expression == f"{mark('m', m)}({mark('v', v)})" and module.parts and uses[m] == 1:
-                return module
-        return None
-
-    start = 0
-    while start < len(program.statements):
-        first, end = block(program.statements[start]), start + 1
-        while first is not None and end < len(program.statements):
-            before, statement = program.statements[end - 1], program.statements[end]
-            again = block(statement)
-            goes_on = again is not None and statement.values() == list(before.targets) and reads[before.targets[0]] == 1
-            if not goes_on or again is None or (again.template, again.numbers) != (first.template, first.numbers):
-                break
-            end += 1
-        if first is not None and end - start >= 3:
-            run = program.statements[start:end]
-            blocks = [module for module in map(block, run) if module is not None]
-            template = f"nn.Sequential(*({first.template} for _ in range({{count}})))"
-            parts = {str(k): module for k, module in enumerate(blocks)}
-            name = f"{blocks[0].layer}_to_{blocks[-1].layer}"
-            program.modules.append(Module(name, template, {**first.numbers, "count": len(blocks)}, {}, parts=parts))
-            call = f"{mark('m', len(program.modules) - 1)}({mark('v', run[0].values()[0])})"
-            program.statements[start:end] = [Statement(run[-1].targets, call, name)]
-        start += 1
-
-
 # forward()
 
 
-def _forward(
-    program: Program,
-    statements: Sequence[Statement],
-    inputs: Mapping[int, str],
-    outputs: Mapping[str, int],
-    attributes: Mapping[int, str],
-    name_of: Callable[[int, Statement], str],
-    number_text: Callable[[int], str],
-) -> list[str]:
-    """Return the statements of a forward method, as text."""
-    names = dict(inputs)
+def _forward(program: Program, inputs: Mapping[int, str], attributes: Mapping[int, str]) -> list[str]:
+    """Return the statements of the forward method, as text."""
+    names, outputs = dict(inputs), program.outputs
 
     def text(kind: str, n: int) -> str:
-        return names[n] if kind == "v" else f"self.{attributes[n]}" if kind == "m" else number_text(n)
+        return names[n] if kind == "v" else f"self.{attributes[n]}"
 
-    statements = _nested(program, statements, set(outputs.values()))
+    statements = _nested(program, program.statements, set(outputs.values()))
     last_read = {v: i for i, statement in enumerate(statements) for v in statement.values()}
     last_read.update(dict.fromkeys(outputs.values(), len(statements)))
     holder = {name: v for v, name in inputs.items()}
@@ -308,7 +216,7 @@ def _forward(
         if only_output and i == len(statements) - 1:
             return [*lines, f"return {expression}"]
         for v in statement.targets:
-            wanted = legal(name_of(v, statement), "blob_")
+            wanted = legal(program.names[v], "blob_")
             wanted = f"{wanted}_" if wanted in program.functions else wanted
             passed = last_read.get(v, -1) == i + 1 and sum(v in s.values() for s in statements) == 1
             candidates = [*("x", "y")[: 2 * passed], wanted, *(f"{wanted}_{k}" for k in range(2, 1000))]

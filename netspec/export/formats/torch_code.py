@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from netspec.export.formats.shapes import Fixed, NetShapes
-from netspec.export.formats.source import MARK, Module, Program, Statement, mark
+from netspec.export.formats.source import MARK, Module, Program, Statement, mark, number
 from netspec.graph.fold import origins
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.exporting import export
@@ -82,10 +82,7 @@ class _LayerCode:
     def call(self, template: str, **values: Any) -> str:
         def fill(match: re.Match[str]) -> str:
             value = values[match[1]]
-            if isinstance(value, str):
-                return value
-            self.program.numbers.append((match[1], value))
-            return mark("n", len(self.program.numbers) - 1)
+            return value if isinstance(value, str) else number(value)
 
         return _FIELD.sub(fill, template)
 

@@ -95,31 +95,6 @@ def test_reads_as_a_person_would_have_written_it(net_of: Callable[..., Net]) -> 
     assert list(state)[:3] == ["conv1.weight", "conv1.bias", "bn1.running_mean"]
 
 
-REPEATED = SMALL + "".join(
-    f"""
-layer {{ name: "b{k}/a" type: "Convolution" bottom: "{"pool1" if k == 0 else f"sum{k - 1}"}" top: "b{k}/a"
-  convolution_param {{ num_output: {6 + k // 3} kernel_size: 1 weight_filler {{ type: "xavier" }} }} }}
-layer {{ name: "b{k}/relu" type: "ReLU" bottom: "b{k}/a" top: "b{k}/a" }}
-layer {{ name: "b{k}/b" type: "Convolution" bottom: "b{k}/a" top: "b{k}/b"
-  convolution_param {{ num_output: 4 kernel_size: 1 weight_filler {{ type: "xavier" }} }} }}
-layer {{ name: "b{k}/sum" type: "Eltwise" bottom: "{"pool1" if k == 0 else f"sum{k - 1}"}" bottom: "b{k}/b"
-  top: "sum{k}" }}
-"""
-    for k in range(5)
-)
-
-
-def test_what_repeats_is_a_class(net_of: Callable[..., Net]) -> None:
-    net = trained(net_of(REPEATED))
-    text, state, _ = torch_source(net)
-    assert "self.sum0_to_sum2 = nn.Sequential(*(SumBlock(6) for _ in range(3)))" in text
-    assert "self.sum3 = SumBlock(7)" in text
-    assert "sum0_to_sum2.1.a.weight" in state
-    assert text.count("nn.Conv2d(") == 3
-    assert formatted(text)
-    assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
-
-
 TOWERS = """name: "Towers"
 layer { name: "data" type: "Input" top: "data" top: "other" input_param { shape { dim: 2 dim: 6 } } }
 """ + "".join(
