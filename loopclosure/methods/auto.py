@@ -124,8 +124,8 @@ def _sequences_said(lines: Lines | None, precision: float, others: str) -> str:
         return f"sequences: none is better than those {others}, so that images are compared one by one"
     decoys = lines.decoys[np.isfinite(lines.decoys)]
     return (
-        f"sequences: better than all but a few {others} (a score of {lines.threshold(precision):.4g} or more; {others} "
-        f"{np.median(decoys):.4g} in the middle, {decoys.max():.4g} at most); {lines.setting}"
+        f"{lines.setting}: better than all but a few {others} (a score of {lines.threshold(precision):.4g} or more; "
+        f"{others} {np.median(decoys):.4g} in the middle, {decoys.max():.4g} at most)"
     )
 
 
