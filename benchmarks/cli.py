@@ -74,10 +74,11 @@ def parser() -> argparse.ArgumentParser:
     p = commands.add("settings", _settings, "judge loopclosure's auto on drives whose loops are known")
     _add_data(p)
     p.add_argument("families", nargs="*", metavar="FAMILY", help="only the drives made of these (default: all)")
-    p = commands.add("tables", _tables, "measure loopclosure's methods, and write the tables of its pages")
+    p = commands.add("tables", _tables, "measure loopclosure's methods for the tables of its pages")
     _add_data(p)
     p.add_argument("sets", nargs="*", metavar="SET", help="only on these (default: all)")
     p.add_argument("--methods", nargs="+", default=[], metavar="NAME", help="only these, as the tables name them")
+    commands.add("pages", _pages, "write the figures of the pages from benchmarks/results")
     commands.add("list", _list, "list the nets of the catalog")
     return made
 
@@ -132,9 +133,16 @@ def _settings(arguments: argparse.Namespace) -> None:
 
 
 def _tables(arguments: argparse.Namespace) -> None:
-    from benchmarks.tables import measure, write
+    from benchmarks.tables import measure
 
-    write(measure(arguments.data, arguments.work, arguments.sets, arguments.methods, partial(print, flush=True)))
+    say = partial(print, flush=True)
+    measure(arguments.data, arguments.work, arguments.sets, arguments.methods, say, arguments.words)
+
+
+def _pages(arguments: argparse.Namespace) -> None:
+    from benchmarks import pages
+
+    print("\n".join(f"written: {page.relative_to(pages.ROOT)}" for page in pages.write()) or "no figure changed")
 
 
 def _list(arguments: argparse.Namespace) -> None:

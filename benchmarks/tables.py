@@ -1,7 +1,7 @@
-"""The tables of loopclosure/README.md and docs/results.md, measured anew: ``tools/bench tables``.
+"""The figures of loopclosure's methods on five sets, measured anew: ``tools/bench tables``.
 
-Figures are kept in ``loops.json`` beside this file, the first that was measured of each and the last; a table shows
-both where they differ. What is not measured in a run keeps its figures.
+They are kept in ``results``, and ``tools/bench pages`` writes them into the pages. What a run does not measure keeps
+its figures.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import results
 from benchmarks.drives import walked
+from benchmarks.pages import RESULTS
 from benchmarks.settings import Kept
 from loopclosure.evaluate import Outcome, judge
 from loopclosure.methods.base import MethodContext, make_method
@@ -23,9 +25,6 @@ from loopclosure.places.frames import Selection, image_paths
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.truth import Exclusion
 
-HERE = Path(__file__).parent
-FIGURES = HERE / "loops.json"
-PAGES = (HERE.parent / "loopclosure" / "README.md", HERE.parent / "docs" / "results.md")
 SETS = ("fr1_rpy", "corridor_loop", "walk", "ESSEX3IN1", "SPED")
 PAIRS = SETS[3:]
 TITLES = {
@@ -52,7 +51,7 @@ METHODS = {
     "verified+FAB-MAP": "verified+fabmap:model=W",
 }
 TABLES = {
-    "average precision": [name for name in METHODS if not name.startswith(("verified", "auto"))],
+    "accuracy": [name for name in METHODS if not name.startswith(("verified", "auto"))],
     "recall": ["FAB-MAP 2.0", *[name for name in METHODS if "net" in name], "verified+FAB-MAP"],
 }
 AUTO = "auto, on the net"
@@ -72,11 +71,16 @@ def data_set(name: str, data: Path, work: Path) -> DataSet:
 
 
 def measure(
-    data: Path, work: Path, sets: Sequence[str], methods: Sequence[str], say: Callable[[str], None]
-) -> dict[str, Any]:
-    """Measure methods on sets, and add the figures to those that are kept."""
+    data: Path,
+    work: Path,
+    sets: Sequence[str],
+    methods: Sequence[str],
+    say: Callable[[str], None],
+    words: Sequence[str],
+) -> None:
+    """Measure methods on sets, and write the figures over those that are kept; ``words`` are those of the command."""
     work.mkdir(parents=True, exist_ok=True)
-    figures: dict[str, Any] = json.loads(FIGURES.read_text(encoding="utf-8"))
+    figures = {kind: _kept(kind) for kind in TABLES}
     train = image_paths(data / "ie_tower")[::4] if any("W" in METHODS[name] for name in methods) else []
     for name in sets or SETS:
         held = data_set(name, data, work)
@@ -85,24 +89,32 @@ def measure(
         np.savez(work / f"{name}.npz", features=kept.descriptors(images), names=[str(image) for image in images])
         context = MethodContext(held.exclude_frames, stamps=held.stamps, pairs=kept.pairs)
         for label in methods or METHODS:
-            if name in PAIRS and (label not in TABLES["average precision"] or "SeqSLAM" in label):
+            if name in PAIRS and (label not in TABLES["accuracy"] or "SeqSLAM" in label):
                 continue
             file = work / {"F": f"{name}.npz", "W": "words.npz", "V": "vlad.npz"}.get(METHODS[label][-1], "")
             spec = re.sub(r"\b[FWV]$", str(file), METHODS[label])
             outcome = judge(label, make_method(spec, context), held, train)
             for kind, value in _figures(label, outcome, name):
                 say(f"{name}, {label}, {kind}: {value}")
-                cell = figures[kind].setdefault(label, {}).setdefault(name, [])
-                figures[kind][label][name] = [*cell[:1], value]
+                figures[kind][label][TITLES[name]] = value
         kept.save()
-        FIGURES.write_text(json.dumps(figures, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    return figures
+        for kind, rows in figures.items():
+            results.write(RESULTS / f"{kind}.json", list(rows.values()), words)
 
 
-def _figures(label: str, outcome: Outcome, name: str) -> Iterator[tuple[str, str]]:
-    if label in TABLES["average precision"]:
+def _kept(kind: str) -> dict[str, dict[str, Any]]:
+    """Return the rows of a table by method, in the order of ``TABLES``; what was never measured is None."""
+    path = RESULTS / f"{kind}.json"
+    rows = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.is_file() else []
+    found = {row["method"]: row for row in rows}
+    columns = [TITLES[name] for name in (SETS if kind == "accuracy" else SETS[:3])]
+    return {name: found.get(name, {"method": name, **dict.fromkeys(columns)}) for name in TABLES[kind]}
+
+
+def _figures(label: str, outcome: Outcome, name: str) -> Iterator[tuple[str, float | str]]:
+    if label in TABLES["accuracy"]:
         found = outcome.recall_at[1] if name in PAIRS else outcome.pairs.average_precision
-        yield "average precision", f"{found:.3f}"
+        yield "accuracy", round(float(found), 3)
     if name not in PAIRS and label in TABLES["recall"]:
         zones = [judged.best for judged in (outcome.rule, outcome.soft) if judged is not None]
         if label == AUTO:
@@ -110,29 +122,3 @@ def _figures(label: str, outcome: Outcome, name: str) -> Iterator[tuple[str, str
         else:
             said = [f"{z.recall_at_full_precision:.3f}" for z in zones]
         yield "recall", said[0] + "".join(f" ({text})" for text in said[1:])
-
-
-def tables(figures: dict[str, Any]) -> dict[str, str]:
-    """Return the tables in Markdown, by name: a cell is the old figure and the new one, or both in one."""
-    made = {}
-    for kind, labels in TABLES.items():
-        sets = SETS if kind == "average precision" else SETS[:3]
-        rows = [["method", *(TITLES[name] for name in sets)], ["---"] * (len(sets) + 1)]
-        for label in labels:
-            cells = [figures[kind].get(label, {}).get(name, []) for name in sets]
-            rows.append([label, *(" → ".join(dict.fromkeys(cell)) for cell in cells)])
-        made[kind] = "\n".join(f"| {' | '.join(row)} |" for row in rows)
-    return made
-
-
-def write(figures: dict[str, Any], pages: Sequence[Path] = PAGES) -> None:
-    """Put the tables between their markers, ``<!-- table: NAME -->`` and ``<!-- end -->``, in the pages."""
-    made = tables(figures)
-    for page in pages:
-        text = page.read_text(encoding="utf-8")
-        for name, table in made.items():
-            begin = f"<!-- table: {name} -->"
-            text = re.sub(
-                f"{begin}.*?<!-- end -->", lambda _, t=table, b=begin: f"{b}\n{t}\n<!-- end -->", text, flags=re.DOTALL
-            )
-        page.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""tools/bench settings and tables: drives whose loops are known, and figures between their markers."""
+"""tools/bench settings: drives whose loops are known."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,21 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import drives, settings, tables
-
-
-def test_figures_that_changed_stand_beside_the_old_ones(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- table: recall -->\nold\n<!-- end -->\nafter\n")
-    recall = {"the net": {"walk": ["0.5", "0.7"], "corridor_loop": ["0.1", "0.1"]}}
-    figures = {"recall": recall, "average precision": {}}
-    tables.write(figures, [page])
-    text = page.read_text()
-    assert text.startswith("before\n<!-- table: recall -->\n| method | fr1_rpy")
-    assert "| the net |  | 0.1 | 0.5 → 0.7 |\n" in text
-    assert text.endswith("<!-- end -->\nafter\n")
-    tables.write(figures, [page])
-    assert page.read_text() == text
+from benchmarks import drives, settings
 
 
 def test_a_route_in_another_season_has_the_same_places(tmp_path: Path) -> None:

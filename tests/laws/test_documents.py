@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import json
 import re
 import shlex
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import benchmarks.cli
+import benchmarks.pages
 import lmdb_build.cli
 import loopclosure.cli
 import netspec
@@ -17,6 +19,7 @@ import netspec.cli
 from documents import DOCUMENTS, PROGRAMS, blocks, commands
 from each import each
 from netspec.cli import run_script
+from netspec.errors import SpecError
 from paths import ROOT
 
 PARSERS = {
@@ -148,3 +151,39 @@ def test_links_lead_to_files(document: str) -> None:
     path = ROOT / document
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text()):
         assert "://" in target or (path.parent / target).exists(), target
+
+
+@each("page", [path.relative_to(ROOT).as_posix() for path in benchmarks.pages.PAGES])
+def test_figures_are_those_of_their_files(page: str) -> None:
+    text = (ROOT / page).read_text()
+    assert benchmarks.pages.made(text) == text, "tools/bench pages writes them"
+
+
+ROWS = [
+    {"net": "a", "run by": "netspec", "ms": 12.345, "CPU / pytorch": 0.7312, "n": 12000},
+    {"net": "a", "run by": "pytorch", "ms": 0.5, "CPU / pytorch": None, "n": 1},
+]
+
+
+@pytest.mark.parametrize(
+    ("marker", "shown"),
+    [
+        (
+            "table: x; net, ms, CPU / pytorch as / P; run by=netspec",
+            "| net | ms | / P |\n| a | 12.3 | 0.73 |",
+        ),
+        ("table: x; net, run by: ms", "| net | netspec | pytorch |\n| a | 12.3 | 0.5 |"),
+        ("table: x; n", "| n |\n| 12,000 |\n| 1 |"),
+        ("figure: x; CPU / pytorch; run by=netspec", "0.73"),
+        ("figure: x; ms", "2 rows"),
+        ("table: x; speed", "no column 'speed'"),
+        ("table: y", "there is no"),
+    ],
+)
+def test_a_marker_becomes_figures_or_is_refused(marker: str, shown: str, tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text(json.dumps({"rows": ROWS}))
+    try:
+        text = benchmarks.pages.made(f"<!-- {marker} -->old<!-- end -->", tmp_path)
+    except SpecError as fault:
+        text = str(fault)
+    assert shown in re.sub(r"\|( --- \|)+\n", "", text)
