@@ -18,7 +18,7 @@ from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import write_g2o, write_loops_csv
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.auto import PRECISION
-from loopclosure.methods.drive import whole_drive
+from loopclosure.methods.drive import last_session, whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.live import live_frames
 from loopclosure.places.pose_files import read_poses
@@ -121,6 +121,11 @@ def _detect(a: argparse.Namespace) -> None:
         results, ended = _watch(a, detector)
         names += [f"frame {number}" for number in range(len(results))]
         said = [run.verdicts_said(results)]
+        if a.threshold is None and not a.resume:
+            seconds = a.exclude_seconds or 0.0
+            found = last_session(detector, results, progress=bar, visit=a.exclude_recent, seconds=seconds)
+            results, said = found.results, [*found.reasons, run.verdicts_said(found.results)]
+            detector.decided([result for result in results if result], None)
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.precision is None else a.precision
         odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None

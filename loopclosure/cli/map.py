@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from loopclosure.cli.data_set import recording_of, warn_of_unreadable
 from loopclosure.detector import run
-from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.map import Map, checked_name
 from loopclosure.detector.visitor import Visitor
+from loopclosure.index.index import INDEXES
+from loopclosure.methods.drive import last_session
 from netspec.terminal.commands import Commands
 from netspec.terminal.progress import bar
 
@@ -53,7 +54,7 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
     for text in a.source:
         before, number = len(into), len(into.sessions)
         recording = recording_of(text, Path(a.map) / "frames" / f"{number:06d}")
-        results = into.add(recording, describe, a.index, bar)
+        results = into.add(recording, describe, a.index, bar, lambda *found: last_session(*found, progress=bar).results)
         warn_of_unreadable(recording)
         loops = [result.accepted for result in results if result.accepted is not None]
         between = sum(frame < before for frame in loops)
@@ -65,10 +66,14 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
 def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
     recording = recording_of(a.source, out / "frames")
-    detector = known.detector(run.load_describe(known.describer), a.index)
-    results: Sequence[LoopResult] = run.run_detector(Visitor(detector), recording, progress=bar)
+    detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
+    if a.index in INDEXES:  # in memory: frames that are added are not in the map
+        found = last_session(detector, run.run_detector(detector, recording, progress=bar), progress=bar, own=False)
+        results = [replace(result, query_id=result.query_id - before) for result in found.results]
+    else:
+        results = run.run_detector(Visitor(detector), recording, progress=bar)
     recording = warn_of_unreadable(recording)
-    found = [result for result in results if result]
-    write_loops_csv(out / "loops.csv", found, recording.stamps, recording.names, detector.stamps, known.names)
+    loops = [result for result in results if result]
+    write_loops_csv(out / "loops.csv", loops, recording.stamps, recording.names, detector.stamps, known.names)
     print(run.verdicts_said(results))
-    print(f"{len(found)} of {len(results)} frames are in the map: {out / 'loops.csv'}")
+    print(f"{len(loops)} of {len(results)} frames are in the map: {out / 'loops.csv'}")

@@ -84,6 +84,11 @@ class LoopDetector:
         return self._frames.count
 
     @property
+    def sessions(self) -> list[int]:
+        """The first frame of each session."""
+        return list(self._sessions)
+
+    @property
     def stamps(self) -> np.ndarray:
         """The stamps (N,) in seconds, NaN for frames without one."""
         return self._frames.stamps[: len(self)].copy()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ METRIC = "euclidean"
 COMPONENTS = 256  # of a projected descriptor
 LEARNED_FROM = 2048  # frames, evenly spread; fewer are compared as they are
 BLOCK = 4096  # frames that are read at a time
+Decide = Callable[[LoopDetector, list[LoopResult]], list[LoopResult]]
 MAPPED = ("rows", "points", "descriptors")  # arrays in files of their own, read where they are used
 
 
@@ -126,19 +127,24 @@ class Map:
         return detector
 
     def add(
-        self, recording: Recording, describe: Describe, index: str = "exact", progress: Progress = silent
+        self,
+        recording: Recording,
+        describe: Describe,
+        index: str = "exact",
+        progress: Progress = silent,
+        decide: Decide = lambda detector, results: results,
     ) -> list[LoopResult]:
         """Add a recording as a session; return what each of its frames found, in all sessions and in its own.
 
-        Its loops are in ``loops.csv`` of its folder. Raises InputError, and adds nothing, where another process is
-        adding.
+        ``decide`` says which are loops, of the detector with all frames and of what each found when it came. Its loops
+        are in ``loops.csv`` of its folder. Raises InputError, and adds nothing, where another process is adding.
         """
         with only_one(self.folder / ".lock", "wait until it has ended"):
             self._read_sessions()  # what others have added
             described = _Described(describe, self._projection(index))
             detector = self._detector(described, index)
             before = len(detector)
-            results = run_detector(detector, recording, progress=progress)
+            results = decide(detector, run_detector(detector, recording, progress=progress))
             recording = recording.readable()
             rows = np.array(described.kept)
             folder = self.folder / f"{len(self.sessions):06d}"

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.similarity import similarity_matrix
+from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import Recording, run_detector
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
@@ -17,6 +21,7 @@ from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
 NOTHING = np.zeros((8, 8), np.uint8)
+MOST_PAIRS = 16_000_000  # of frames that are compared at once, in about a gigabyte
 
 
 def whole_drive(
@@ -38,24 +43,96 @@ def whole_drive(
     if recording.unreadable and odometry is not None:
         odometry = np.delete(odometry, recording.unreadable, axis=0)
     recording = recording.readable()
-    settings, rows = detector.settings, detector.descriptors
-    scores = similarity_matrix(rows, None, settings.metric, settings.views)
-    numbers = np.arange(len(rows))
-    exclusion = Exclusion(seconds=settings.exclude_seconds)
-    allowed = np.tri(len(rows), k=-1, dtype=bool)
-    allowed &= ~exclusion.excludes(numbers, numbers, detector.stamps, detector.stamps)
     check, pairs = GeometricCheck(), Pairs(lambda number: _gray_image(recording, number))
     if recording.images is None:
         for number, image, _ in progress(recording.frames(), "local features", len(recording)):
             pairs.put(check, number, check.describe(gray(image)))
-    agree = Between(check, pairs, numbers.tolist(), numbers.tolist())
     far = None if odometry is None else far_apart(odometry)
-    found = answer(scores, allowed, False, precision, check, agree, progress, far, detector.stamps, visit)
-    single = np.where(allowed, scores, -np.inf).max(axis=1)
+    seconds = detector.settings.exclude_seconds
+    found = _among(detector, 0, len(detector), Between(check, pairs, (), ()), precision, progress, far, visit, seconds)
+    settings, rows = detector.settings, detector.descriptors
+    scores = similarity_matrix(rows, None, settings.metric, settings.views)
+    single = np.where(_earlier(detector, 0, seconds), scores, -np.inf).max(axis=1)
     others = float(np.max(single[~found.accepted], initial=-np.inf))
     above = single[found.accepted & (single > others)]
     detector.decided([result for result in found.results if result], above.min() if len(above) else None)
     return found
+
+
+def last_session(
+    detector: LoopDetector,
+    results: list[LoopResult],
+    precision: float = PRECISION,
+    progress: Progress = silent,
+    visit: int | None = None,
+    seconds: float = 0.0,
+    own: bool = True,
+) -> Answer:
+    """Decide on the last session of a detector that verifies, with all of its frames in view.
+
+    It is compared with each session before as two traverses and, if ``own``, with itself as one drive in which a visit
+    lasts ``visit`` frames (see :func:`loopclosure.methods.auto.answer`) and at least ``seconds``. ``results`` are what
+    its frames found when they came; they stay where there are too many frames to compare.
+    """
+    ends, check = [*detector.sessions, len(detector)], detector.check
+    begin, count = ends[-2:]
+    if check is None or (count - begin) * count > MOST_PAIRS:
+        return Answer(results, ["too many frames to be compared at once: decided frame by frame"])
+    pairs = Pairs(lambda number: NOTHING)
+    for number in range(count):
+        pairs.put(check, number, detector.local_features(number))
+    between, found, reasons = Between(check, pairs, (), ()), list[list[LoopResult]](), list[str]()
+    for first, end in pairwise(ends):
+        if end > first and (own or first < begin):
+            answered = _among(detector, first, end, between, precision, progress, None, visit, seconds)
+            found.append(answered.results)
+            reasons = answered.reasons
+    best = [
+        max(each, key=lambda result: (bool(result), result.inliers or 0, result.score))
+        for each in zip(*found, strict=True)
+    ]
+    return Answer(best or results, reasons)
+
+
+def _among(
+    detector: LoopDetector,
+    first: int,
+    end: int,
+    between: Between,
+    precision: float,
+    progress: Progress,
+    far: np.ndarray | None,
+    visit: int | None,
+    seconds: float,
+) -> Answer:
+    """Decide on the last session among the frames ``first`` to ``end``, another session or this one."""
+    begin, rows, settings = detector.sessions[-1], detector.descriptors, detector.settings
+    queries, references = range(begin, len(detector)), range(first, end)
+    two = first != begin
+    scores = similarity_matrix(rows[begin:], rows[first:end] if two else None, settings.metric, settings.views)
+    allowed = np.ones(scores.shape, bool) if two else _earlier(detector, begin, seconds)
+    agree = replace(between, queries=queries, references=references)
+    stamps = detector.stamps[begin:]
+    answered = answer(scores, allowed, two, precision, between.check, agree, progress, far, stamps, visit)
+    moved = [
+        replace(
+            result,
+            query_id=begin + result.query_id,
+            candidates=[(first + number, score) for number, score in result.candidates],
+            accepted=None if result.accepted is None else first + result.accepted,
+        )
+        for result in answered.results
+    ]
+    return Answer(moved, answered.reasons)
+
+
+def _earlier(detector: LoopDetector, begin: int, seconds: float) -> np.ndarray:
+    """Return which pairs of frames from ``begin`` on are candidates: of each, those before that are old enough."""
+    stamps = detector.stamps[begin:]
+    numbers = np.arange(len(stamps))
+    return np.tri(len(stamps), k=-1, dtype=bool) & ~Exclusion(seconds=seconds).excludes(
+        numbers, numbers, stamps, stamps
+    )
 
 
 def _gray_image(recording: Recording, number: int) -> np.ndarray:

@@ -198,6 +198,59 @@ def test_images_that_cannot_be_read_are_left_out(two_laps, tmp_path, capsys):
     assert "0.png: is not a readable image" in capsys.readouterr().err
 
 
+def loops_in(path):
+    with path.open() as stream:
+        return {int(row["query_id"]): int(row["match_id"]) for row in csv.DictReader(stream)}
+
+
+@pytest.mark.slow
+def test_each_door_gives_the_same_answer(tmp_path, capsys):
+    """A camera passes a wall, and a part of it once more: a folder, a list, videos, two traverses, a map."""
+    rng = np.random.default_rng(1)
+    wall = np.full((128, 2600, 3), 128, np.uint8)
+    for _ in range(2600):
+        center = tuple(int(c) for c in rng.integers(0, (2600, 128)))
+        cv2.circle(wall, center, int(rng.integers(2, 14)), rng.integers(0, 256, 3).tolist(), -1)
+    wall = cv2.GaussianBlur(wall, (0, 0), 1.0)
+    places = [(20 * i, 0) for i in range(110)] + [(20 * i + 5, 6) for i in range(30, 90)]
+    (tmp_path / "drive").mkdir()
+    film = cv2.VideoWriter(str(tmp_path / "drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 2, (160, 112))
+    for number, (x, y) in enumerate(places):
+        image = wall[y : y + 112, x : x + 160]
+        cv2.imwrite(str(tmp_path / "drive" / f"{number:03d}.png"), image)
+        film.write(image)
+    film.release()
+    names = sorted(str(path) for path in (tmp_path / "drive").iterdir())
+    (tmp_path / "list.txt").write_text("\n".join(names) + "\n")
+    for part, lines in (("first", names[:110]), ("second", names[110:])):
+        (tmp_path / part).mkdir()
+        for name in lines:
+            shutil.copy(name, tmp_path / part)
+    small = ["--describe", "small"]
+    found = {}
+    for door, line in {
+        "folder": [str(tmp_path / "drive")],
+        "list": [str(tmp_path / "list.txt")],
+        "mp4": [str(tmp_path / "drive.mp4")],
+        "video": ["--video", str(tmp_path / "drive.mp4")],
+    }.items():
+        assert main(["detect", *line, *small, "--out", str(tmp_path / door)]) == 0
+        found[door] = loops_in(tmp_path / door / "loops.csv")
+    build = ["map", "build", str(tmp_path / "M"), str(tmp_path / "drive"), *small]
+    assert main(build) == 0
+    found["map"] = loops_in(tmp_path / "M" / "000000" / "loops.csv")
+    assert main(["map", "build", str(tmp_path / "N"), str(tmp_path / "first"), *small]) == 0
+    assert main(["map", "query", str(tmp_path / "N"), str(tmp_path / "second"), "--out", str(tmp_path / "query")]) == 0
+    found["query"] = {query + 110: match for query, match in loops_in(tmp_path / "query" / "loops.csv").items()}
+    capsys.readouterr()
+    for loops in found.values():
+        assert all(abs(places[query][0] - places[match][0]) <= 45 for query, match in loops.items())
+        assert len(loops) >= 55
+    for door, loops in found.items():
+        assert len(set(loops) & set(found["folder"])) >= 0.95 * len(set(loops) | set(found["folder"])), door
+    assert found["folder"] == found["list"]
+
+
 def test_similarity(two_laps_features, tmp_path, capsys):
     assert main(["similarity", str(two_laps_features), "--out", str(tmp_path / "s.npy")]) == 0
     matrix = np.load(tmp_path / "s.npy")
