@@ -21,7 +21,8 @@ from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import safe_cell
 
-CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS)
+# A pose is measured in the whole image: the larger, the better.
+CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS, most_side=1_000_000)
 KEPT_VIEWS = 500  # their features, in memory
 
 

@@ -77,6 +77,7 @@ class GeometricCheck:
     confidence     of RANSAC
     min_inliers    the least number of inliers of a loop; 0: as many as rule out chance
     least_side     images whose shorter side has fewer pixels are enlarged to this, at most four times
+    most_side      images whose shorter side has more are reduced to this
     focal_px       focal length in pixels of the images as they are; 0: not known, a fundamental matrix is used
     center_x_px, center_y_px  principal point, with focal_px
     """
@@ -87,27 +88,30 @@ class GeometricCheck:
     confidence: float = 0.985
     min_inliers: int = 0
     least_side: int = 240
+    most_side: int = 480
     focal_px: float = 0.0
     center_x_px: float = 0.0
     center_y_px: float = 0.0
 
-    def enlarged(self, size: tuple[int, int]) -> float:
-        """Return the factor by which images of a width and height are enlarged."""
-        return min(MOST_ENLARGED, max(1.0, self.least_side / max(1, min(size))))
+    def scaled(self, size: tuple[int, int]) -> float:
+        """Return the factor by which images of a width and height are enlarged or reduced."""
+        side = max(1, min(size))
+        return min(MOST_ENLARGED, max(1.0, self.least_side / side), self.most_side / side)
 
     def describe(self, image: np.ndarray) -> LocalFeatures:
         """Find the points of an image (H, W) or (H, W, 3) uint8; there may be none."""
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         size = (gray.shape[1], gray.shape[0])
-        factor = self.enlarged(size)
-        if factor > 1:
-            gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+        factor = self.scaled(size)
+        if factor != 1:
+            how = cv2.INTER_CUBIC if factor > 1 else cv2.INTER_AREA
+            gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=how)
         points, descriptors = cv2.SIFT.create(self.max_features).detectAndCompute(gray, None)
         if descriptors is None or not len(points):
             return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), size)
         # OpenCV's SIFT descriptors are integers up to 255, in float32: bytes hold them without loss.
         places = np.array([point.pt for point in points], np.float32)
-        if factor > 1:  # the middle of pixel 0 lies at 0 in both
+        if factor != 1:  # the middle of pixel 0 lies at 0 in both
             places = (places + 0.5) / np.float32(factor) - 0.5
         kept = slice(self.max_features)
         return LocalFeatures(places[kept], descriptors[kept].astype(np.uint8), size)
@@ -132,13 +136,13 @@ class GeometricCheck:
     def agreement(self, a: LocalFeatures, b: LocalFeatures) -> Agreement:
         """Match the points of two images, and count the matches that agree with one matrix."""
         matches = self.matches(a, b)
-        factor = self.enlarged(b.size)
+        factor = self.scaled(b.size)
         size = (round(b.size[0] * factor), round(b.size[1] * factor))
         needed = _needed(len(matches), *size, self.max_error_px)
         if len(matches) < LEAST_MATCHES:
             return Agreement(len(matches), 0, needed)
         points = a.points[matches[:, 0]], b.points[matches[:, 1]]
-        error = self.max_error_px / max(self.enlarged(a.size), factor)
+        error = self.max_error_px / max(self.scaled(a.size), factor)
         if self.focal_px:
             camera = np.array([[self.focal_px, 0, self.center_x_px], [0, self.focal_px, self.center_y_px], [0, 0, 1]])
             matrix, mask = cv2.findEssentialMat(*points, camera, cv2.RANSAC, self.confidence, error)
@@ -169,10 +173,12 @@ class GeometricCheck:
             self.max_features < LEAST_MATCHES
             or not (self.min_inliers == 0 or self.min_inliers >= LEAST_MATCHES)
             or not 0 < self.ratio <= 1
+            or self.most_side < max(1, self.least_side)
         ):
             raise InputError(
-                f"geometric check: {self.max_features} features, {self.min_inliers} inliers, ratio {self.ratio:g}; "
-                f"expected at least {LEAST_MATCHES} of both and a ratio in 0..1"
+                f"geometric check: {self.max_features} features, {self.min_inliers} inliers, ratio {self.ratio:g}, "
+                f"sides {self.least_side} to {self.most_side}; expected at least {LEAST_MATCHES} of both, "
+                "a ratio in 0..1, and sides in order"
             )
         camera = (self.focal_px, self.center_x_px, self.center_y_px)
         if min(camera) < 0 or (any(camera) and not all(camera)):
@@ -252,7 +258,7 @@ class Pairs:
             a, b = self.features(check, one), self.features(check, other)
             matches = check.matches(a, b)
             points = a.points[matches[:, 0]]
-            still = np.abs(points - b.points[matches[:, 1]]).max(axis=1) <= check.max_error_px / check.enlarged(a.size)
+            still = np.abs(points - b.points[matches[:, 1]]).max(axis=1) <= check.max_error_px / check.scaled(a.size)
             hits[np.unique(_part(points[still], a.size, CELLS))] += 1
         fixed = (hits >= max(LEAST_FIXED, FIXED * len(unlike))).reshape(CELLS[1], CELLS[0])
         if not fixed.any():
@@ -288,4 +294,4 @@ class Between:
 
 def _by_points(check: GeometricCheck) -> GeometricCheck:
     """Return a check that finds the same points, the same for all such."""
-    return GeometricCheck(max_features=check.max_features, least_side=check.least_side)
+    return GeometricCheck(max_features=check.max_features, least_side=check.least_side, most_side=check.most_side)

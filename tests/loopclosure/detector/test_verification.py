@@ -149,6 +149,20 @@ def test_small_images_are_enlarged_and_points_stay_in_their_own_pixels():
     assert check.inliers(large, check.describe(other)) == 0
 
 
+def test_large_images_are_reduced_and_points_stay_in_their_own_pixels():
+    """A picture and the same twice as large: points lie where they lay, and an edge of 480 pixels is searched."""
+    small = cv2.resize(wall(0), (640, 480))
+    large = cv2.resize(small, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    check = GeometricCheck()
+    a, b = check.describe(small), check.describe(large)
+    assert b.size == (1280, 960)
+    pairs = check.matches(a, b)
+    assert len(pairs) > 100
+    moved = b.points[pairs[:, 1]] - (2 * a.points[pairs[:, 0]] + 0.5)
+    assert np.abs(np.median(moved, axis=0)).max() < 0.2
+    assert check.inliers(a, b) > 100
+
+
 def test_images_and_pairs_are_looked_at_once(monkeypatch):
     images = {0: wall(0), 1: seen_from_the_side(wall(0))}
     read = []
