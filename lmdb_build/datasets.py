@@ -16,7 +16,7 @@ from netspec import log
 from netspec.data.database import Writer
 from netspec.data.random_words import words
 from netspec.errors import SpecError, Where
-from netspec.files.lfs import pointer_fault
+from netspec.files.kinds import pointer_fault
 from netspec.proto.schema import Datum
 
 IMAGES, LABELS = 2051, 2049  # the first number of a file of MNIST

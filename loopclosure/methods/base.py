@@ -20,6 +20,7 @@ from loopclosure.detector.verification import Pairs
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
+from netspec.errors import did_you_mean
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,8 @@ def make_method(spec: str, context: MethodContext | None = None) -> Method:
     context = context or MethodContext()
     name = re.split("[:+]", spec, maxsplit=1)[0]
     if name not in METHODS:
-        raise InputError(f'unknown method "{name}" in "{spec}"; known: {", ".join(METHODS)}')
+        close = did_you_mean(name, list(METHODS)) or f"; known: {', '.join(METHODS)}"
+        raise InputError(f'unknown method "{name}" in "{spec}"{close}')
     argument, inner = spec[len(name) :], None
     if name in REFINERS or argument.startswith("+"):
         argument, plus, inner_spec = argument.partition("+")

@@ -25,7 +25,7 @@ import lmdb
 from netspec import log
 from netspec.data.lmdb_file import LmdbFile, Record
 from netspec.errors import SpecError, Where
-from netspec.files.lfs import pointer_fault_at
+from netspec.files.kinds import pointer_fault_at
 from netspec.files.whole_file import whole_folder
 
 BACKENDS = ("lmdb", "leveldb")

@@ -15,7 +15,7 @@ from netspec.data import blobs
 from netspec.data.database import Reader
 from netspec.data.datum import datum_to_array, parse_datum, times
 from netspec.errors import SpecError, Where
-from netspec.files.lfs import pointer_fault
+from netspec.files.kinds import pointer_fault
 from netspec.files.limits import read_bytes
 from netspec.files.whole_file import write_whole
 from netspec.proto.schema import BlobProto

@@ -22,7 +22,7 @@ import numpy as np
 from h5py import h5o, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from netspec.errors import SpecError, Where
-from netspec.files.lfs import pointer_fault_at
+from netspec.files.kinds import pointer_fault_at
 from netspec.files.limits import ALWAYS, amount, bomb
 from netspec.files.whole_file import whole_file
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import gzip
+import io
 import os
 import re
 import stat
+import zlib
 from pathlib import Path
 
 ALWAYS = 1 << 28  # bytes that any file may ask for
@@ -38,13 +41,25 @@ def is_out_of_memory(fault: BaseException) -> bool:
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return what a file or a pipe holds. Raises OSError, for a device too: it may have no end."""
+    """Return what a file or a pipe holds, unpacked where its name ends in .gz.
+
+    Raises OSError, for a device too: it may have no end.
+    """
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "a name has no character NUL", str(path))
     with open(path, "rb") as file:
         if stat.S_ISCHR(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.ENODEV, "it is a device, not a file", str(path))
-        return file.read()
+        data = file.read()
+    if not str(path).endswith(".gz") or not data.startswith(b"\x1f\x8b"):
+        return data
+    try:
+        unpacked = gzip.GzipFile(fileobj=io.BytesIO(data)).read(max(ALWAYS, MOST_PACKED * len(data)) + 1)
+    except (EOFError, zlib.error) as fault:
+        raise OSError(errno.EINVAL, f"a damaged gzip file: {fault}", str(path)) from None
+    if fault := bomb(len(unpacked), len(data)):
+        raise OSError(errno.EFBIG, fault, str(path))
+    return unpacked
 
 
 def bomb(size: int, stored: int) -> str:

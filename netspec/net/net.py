@@ -188,9 +188,9 @@ class Net(torch.nn.Module):
         return {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
 
     def _as_input(self, value: Array) -> torch.Tensor:
-        if isinstance(value, torch.Tensor):
-            return value.to(self.device)
         dtype = self.learnable[0].parameter.dtype if self.learnable else torch.float32
+        if isinstance(value, torch.Tensor):
+            return value.to(self.device, dtype if self.learnable and value.is_floating_point() else None)
         return torch.as_tensor(np.asarray(value)).to(self.device, dtype)
 
     def _kept(self) -> frozenset[int]:

@@ -40,7 +40,7 @@ def load_weights(
     *,
     some: bool = False,
 ) -> None:
-    """Copy the weights of a .caffemodel or .caffemodel.h5 into the layers of the same names, all or none.
+    """Copy the weights of a .caffemodel, .caffemodel.h5 or .safetensors into the layers of the same names, all or none.
 
     Of several files each is loaded in turn, the last one winning. Layers that only a file has are ignored, and named
     in the log. One warning names the layers that no file has, which stay as they were filled; with ``strict`` that is a
@@ -56,6 +56,8 @@ def load_weights(
             check_weights(each)
             if h5py.is_hdf5(each):
                 loaded |= _copy(partial(_from_hdf5, net, each), faults.append)
+            elif each.suffix == ".safetensors" and each.is_file():
+                loaded |= _copy(partial(_from_safetensors, net, each), faults.append)
             else:
                 with net_beside_numbers(each) as (message, file):
                     loaded |= _copy(partial(_from_message, net, message, each, file), faults.append)
@@ -227,32 +229,54 @@ def _from_message(net: Net, message: Any, path: Path, file: BinaryIO | None, rep
 
 
 def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
-    targets = _layers_by_name(net)
-    shared = _shared(net)
-    copies: Copies = []
     with open_hdf5(path) as file:
         data = file.group("data")
         if data is None:
             raise SpecError("this is not a weights file: the HDF5 file has no group /data")
-        for name, arrays in layer_groups(data):
-            target = targets.get(name)
-            if target is None:
-                _ignore(name)
-                continue
-            if len(arrays) > len(target.blobs):
-                report(_wrong_count(path, name, len(arrays), len(target.blobs)))
-                continue
-            for j in range(len(target.blobs)):
-                array = arrays.get(str(j))
-                if array is None:
-                    if (name, j) in shared:
-                        continue
-                    report(_wrong_count(path, name, len(arrays), len(target.blobs)))
-                    break
-                if array.shape != target.blob_shapes[j] and not _fits_loosely(target, j, array.shape):
-                    report(_wrong_shape(path, name, j, array.shape, target.blob_shapes[j]))
+        return _from_arrays(net, layer_groups(data), path, report)
+
+
+def _from_safetensors(net: Net, path: Path, report: Report) -> Copies:
+    """Find the weights in what ``netspec export --to safetensors`` writes: LAYER.INDEX."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    layers: dict[str, dict[str, Any]] = {}
+    try:
+        for name, tensor in load_file(path).items():
+            layer, _, number = name.rpartition(".")
+            if layer and number.isdigit():
+                layers.setdefault(layer, {})[number] = tensor.float().numpy()
+    except (SafetensorError, OSError) as fault:
+        raise SpecError(f"cannot be read: {fault}", Where(str(path))) from None
+    if not layers:
+        raise SpecError("has no tensor named LAYER.NUMBER, as netspec export --to safetensors writes", Where(str(path)))
+    return _from_arrays(net, layers.items(), path, report)
+
+
+def _from_arrays(net: Net, layers: Iterable[tuple[str, Any]], path: Path, report: Report) -> Copies:
+    targets = _layers_by_name(net)
+    shared = _shared(net)
+    copies: Copies = []
+    for name, arrays in layers:
+        target = targets.get(name)
+        if target is None:
+            _ignore(name)
+            continue
+        if len(arrays) > len(target.blobs):
+            report(_wrong_count(path, name, len(arrays), len(target.blobs)))
+            continue
+        for j in range(len(target.blobs)):
+            array = arrays.get(str(j))
+            if array is None:
+                if (name, j) in shared:
                     continue
-                copies.append((target, j, array[()].astype(np.float32)))
+                report(_wrong_count(path, name, len(arrays), len(target.blobs)))
+                break
+            if array.shape != target.blob_shapes[j] and not _fits_loosely(target, j, array.shape):
+                report(_wrong_shape(path, name, j, array.shape, target.blob_shapes[j]))
+                continue
+            copies.append((target, j, array[()].astype(np.float32)))
     return copies
 
 

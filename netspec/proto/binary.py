@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, TypeVar
 from google.protobuf.message import DecodeError, Message
 
 from netspec.errors import SpecError, Where
-from netspec.files.lfs import pointer_fault
+from netspec.files.kinds import kind_of, pointer_fault, unreadable
 from netspec.files.limits import read_bytes
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
@@ -30,7 +30,7 @@ def read_binary(path: str | Path, message_class: type[M]) -> M:
     try:
         data = read_bytes(path)
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+        raise SpecError(unreadable(path, fault), Where(str(path))) from None
     return parse_binary(data, str(path), message_class)
 
 
@@ -158,8 +158,8 @@ def is_hdf5(path: str | Path) -> bool:
 
 def _guess(data: bytes) -> str:
     """Return a guess at what a file is."""
-    if data.startswith(_HDF5):
-        return "an HDF5 file; its name should end in .h5"
+    if kind := kind_of(data):
+        return kind
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:1000]):
         return "text"
     return "another kind of data, or a truncated file"

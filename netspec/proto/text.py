@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from netspec.errors import ForkFault, SpecError, Where
-from netspec.files.lfs import pointer_fault
+from netspec.files.kinds import kind_of, pointer_fault, unreadable
 from netspec.files.limits import read_bytes
 from netspec.proto.dialect.choice import named_dialects, use_dialects_of
 from netspec.proto.reader import read_text
@@ -102,7 +102,7 @@ def text_of(path: str | Path) -> str:
     try:
         data = read_bytes(path)
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
-    if fault := pointer_fault(data):
+        raise SpecError(unreadable(path, fault), Where(str(path))) from None
+    if fault := pointer_fault(data) or (kind_of(data) and f"expected a prototxt, found {kind_of(data)}"):
         raise SpecError(fault, Where(str(path)))
     return data.removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")

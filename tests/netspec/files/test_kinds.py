@@ -1,17 +1,20 @@
 """A clone without Git LFS has pointers in the place of large files: every reader says so, and the remedy."""
 
+import gzip
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 import netspec
+from netspec.cli import main
 from netspec.data.database import open_reader
 from netspec.data.hdf5 import Hdf5Source
 from netspec.data.images import read_image
 from netspec.data.mean import read_mean
 from netspec.errors import SpecError
-from netspec.files.lfs import pointer_fault
+from netspec.files.kinds import pointer_fault
 from netspec.inspect.features.images import read_pixels
 from netspec.net.build import build_net
 from netspec.net.weights import load_weights
@@ -72,3 +75,55 @@ def test_other_texts_are_no_pointers():
     assert pointer_fault(b'name: "net"\n' + POINTER) == ""
     assert "of 3 bytes" in pointer_fault(POINTER.replace(b"243862418\n", b"3"))
     assert "of 3 bytes" in pointer_fault(POINTER.replace(b"243862418", b"3").replace(b"\n", b"\r\n"))
+
+
+NET = """layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 4 } } }
+layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
+  inner_product_param { num_output: 2 weight_filler { type: "xavier" } } }"""
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        ("x.npz", b"PK\x03\x04...", "a ZIP archive"),
+        ("x.pth", b"\x80\x02...", "a pickle"),
+        ("x.jpg", b"\xff\xd8\xff\xe0..", "a JPEG image"),
+        ("x.html", b"\n<!DOCTYPE html>", "a web page: the download failed"),
+        ("x.caffemodel", b"\x10\0\0\0\0\0\0\0{}", "a .safetensors file"),
+        ("x.safetensors", b"\x02\0\0\0\0\0\0\0{}", r"has no tensor named LAYER\.NUMBER"),
+        ("x.caffemodel.gz", b"\x1f\x8bxx", "packed by gzip|cannot be read"),
+    ],
+)
+def test_other_files_are_named(name: str, data: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(SpecError, match=said) as caught:
+        load_weights(EMPTY, tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_web_address_is_no_file() -> None:
+    for read in (read_net, lambda path: load_weights(EMPTY, path)):
+        with pytest.raises(SpecError, match="is a web address; download the file"):
+            read("https://example.org/x.prototxt")
+
+
+def test_packed_files_and_our_own_safetensors_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("n.prototxt").write_text(NET)
+    net = netspec.load_net("n.prototxt", seed=1)
+    netspec.save_weights(net, "x.caffemodel")
+    for name in ("n.prototxt", "x.caffemodel"):
+        Path(f"{name}.gz").write_bytes(gzip.compress(Path(name).read_bytes()))
+    assert (
+        main(["export", "n.prototxt", "--weights", "x.caffemodel", "--to", "safetensors", "--out", "x.safetensors"])
+        == 0
+    )
+    for weights in ("x.caffemodel.gz", "x.safetensors"):
+        found = netspec.load_net("n.prototxt.gz", weights=weights)
+        assert all(map(torch.equal, found.params["fc"], net.params["fc"]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_numbers_of_another_precision_become_the_nets(dtype: torch.dtype, tmp_path: Path) -> None:
+    (tmp_path / "n.prototxt").write_text(NET)
+    assert netspec.load_net(tmp_path / "n.prototxt")(data=torch.ones(1, 4, dtype=dtype))["fc"].dtype == torch.float32

@@ -1,0 +1,64 @@
+"""What a file is that was taken for another: by its first bytes.
+
+A Git LFS pointer is the few lines of text that a clone without Git LFS has in the place of each large file.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+
+_POINTER = re.compile(rb"version https://git-lfs\.github\.com/spec/v1\s.*?^size (\d+)\s*$", re.DOTALL | re.MULTILINE)
+_LONGEST = 1024  # bytes; https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md
+
+
+def pointer_fault(data: bytes) -> str:
+    """Return what to say of a file that begins with these bytes where it is a pointer, and "" where it is not."""
+    match = _POINTER.match(data[:_LONGEST])
+    if not match:
+        return ""
+    remedy = "run `git lfs pull` in its repository, or download the file itself"
+    return f"is a Git LFS pointer to a file of {int(match[1]):,} bytes, not that file; {remedy}"
+
+
+def pointer_fault_at(path: str | os.PathLike[str]) -> str:
+    """Return :func:`pointer_fault` of a file, and "" where it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return pointer_fault(file.read(_LONGEST))
+    except (OSError, ValueError):  # a path with a NUL
+        return ""
+
+
+_COPY = "copy its arrays into net.params[LAYER], then netspec.save_weights"
+_KINDS = {
+    b"\x1f\x8b": "a file packed by gzip",
+    b"\xff\xd8\xff": "a JPEG image",
+    b"\x89PNG": "a PNG image",
+    b"PK\x03\x04": f"a ZIP archive, as .npz and PyTorch's .pth are; {_COPY}",
+    b"\x80\x02": f"a pickle, as old .pth files are; {_COPY}",
+    b"\x89HDF\r\n\x1a\n": "an HDF5 file; its name should end in .h5",
+    b"<!doctype html": "a web page: the download failed; look at it in a browser",
+    b"<html": "a web page: the download failed; look at it in a browser",
+}
+
+
+def is_safetensors(data: bytes) -> bool:
+    """Say whether a file that begins with these bytes is one of safetensors: a length, and an object in JSON."""
+    return len(data) > 9 and data[8:9] == b"{" and int.from_bytes(data[:8], "little") < 1 << 30
+
+
+def kind_of(data: bytes) -> str:
+    """Return what a file that begins with these bytes is, and what to do with it; "" where that is not known."""
+    if is_safetensors(data):
+        return "a .safetensors file"
+    start = data[:64].lstrip().lower() if data[:1].isspace() or data[:1] == b"<" else data[:64]
+    return next((kind for magic, kind in _KINDS.items() if start.startswith(magic)), "")
+
+
+def unreadable(path: object, fault: OSError) -> str:
+    """Return why a file cannot be read, and what to do where it is a web address."""
+    text = str(path)
+    if "://" in text or text.startswith(("http:/", "https:/")):
+        return "is a web address; download the file, and give its path"
+    return f"cannot be read: {fault.strerror or fault}"
