@@ -51,6 +51,7 @@ ALIGNED = (
     "without crop_param it aligns its bottoms as HED's branch does, by {by}, since a convolution before it pads with "
     "more than its kernel; Caffe cuts from the corner: for that write crop_param {{ axis: 2 offset: 0 }}"
 )
+EDGES = "; SigmoidCrossEntropyLoss is computed as Caffe's: HED's and RCF's, which weigh edges, have to be named"
 
 
 def align_crops(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
@@ -75,7 +76,8 @@ def align_crops(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
     for message, crops in found.items():
         where = plan.source.at(crops[0], layer=plan.nodes[crops[0]].name, type="Crop")
         others = f" (also in {len(crops) - 1} more of these layers)" if len(crops) > 1 else ""
-        yield f"{where}: {message.format(by=by[crops[0]])}{others}"
+        edges = any(layer.type == "SigmoidCrossEntropyLoss" for layer in plan.net.layer) and "rcf" not in dialects
+        yield f"{where}: {message.format(by=by[crops[0]])}{others}{EDGES if edges else ''}"
 
 
 def _offsets(plan: Plan, makers: dict[int, int], crop: int) -> tuple[list[int], bool] | None:

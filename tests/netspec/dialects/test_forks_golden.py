@@ -7,7 +7,9 @@ repeated, but for the faults listed below. Each case agrees, is refused by a mes
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,12 @@ import numpy as np
 import pytest
 
 import netspec
+from fresh_dialects import fresh_dialects
 from golden_cases import LayerCase, layer_distances, parameters, set_parameters, train
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
-from paths import GOLDEN
+from netspec.proto.dialect.registry import known
+from paths import GOLDEN, ROOT
 
 FORKS = GOLDEN / "forks"
 CLOSE = 1e-4  # of the largest value
@@ -27,7 +31,7 @@ FAULTS = {
     "hed__sigmoid_loss_three": "labels that are neither 0 nor 1 bring no loss, but a gradient",
     "intel__roi_pooling_2x5_outside": "a region with x2 < x1 gets a gradient, which the code for GPUs does not give it",
     "mscnn__roi_pooling_2x5_outside": "the backward pass clips regions that leave the image, the forward pass does not",
-    "mscnn__roi_pooling_pad_ratio": "the same",
+    "mscnn__roi_pooling_pad_ratio": "the backward pass clips regions that leave the image",
 }
 # Cases whose files do not show whose they are: the dialect that has to be named. Without it a warning asks for it.
 NAMED = {
@@ -144,3 +148,68 @@ def training_differences() -> dict[str, float]:
     losses = np.array(train(solver, 30))
     final = parameters(solver.net, golden, "final/")
     return {"loss": difference(losses, golden["loss"], "loss"), **layer_distances(final, golden)}
+
+
+STEPS = (1e-6, 1e-5, 1e-4)  # differences are stated as the least of these that they do not exceed
+OLDER = {"segnet": "TimoSaemann/caffe-enet", "": "senlinuc/caffe_ocr"}  # of cases without a prefix
+
+
+def test_the_page_has_a_row_for_each_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table of docs/forks.md is made here; where it is not as it should be, the message has all rows."""
+    text = (ROOT / "docs" / "forks.md").read_text()
+    page = [row.strip("| ").split(" | ") for row in text.splitlines() if row.startswith("| `")]
+    found = table(monkeypatch)
+    rows = "\n".join(f"| {' | '.join(row)} |" for row in found)
+    assert [row[:3] for row in page] == [row[:3] for row in found], f"put these rows into docs/forks.md:\n{rows}"
+    for (kind, *_, stated), (*_, now) in zip(page, found, strict=True):
+        assert stated == now or float(now) <= float(stated), f"{kind} is off by {now}"  # CPUs round in several ways
+    assert not [why for why in FAULTS.values() if why not in " ".join(text.split())]
+
+
+def table(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Return the rows: a layer, its dialects, the forks and how many cases of each agree, the largest difference."""
+    worst: dict[str, float] = {}
+    forks: dict[str, list[str]] = {}
+    for folder, fork in golden_cases():
+        name, case = folder.name, LayerCase(folder)
+        if name in (*OPEN, *REFUSED, *FAULTS):
+            continue
+        kind = re.findall(r'layer \{[^{]*?type: "(\w+)"', (folder / "net.prototxt").read_text())[-1]
+        monkeypatch.chdir(GOLDEN / "ssd")  # name_size.txt
+        with pytest.MonkeyPatch.context() as patch, contextmanager(fresh_dialects)(patch):
+            if name in NAMED:
+                use_dialect(NAMED[name])
+            off = max(differences(case).values(), default=0.0)
+        worst[kind] = max(worst.get(kind, 0.0), off)
+        forks.setdefault(kind, []).append(fork)
+    owners = layer_types()
+    rows = []
+    for kind in sorted({*forks, *owners}):
+        counts = ", ".join(f"{fork} {count}" for fork, count in sorted(Counter(forks.get(kind, [])).items()))
+        how = f"{next(s for s in STEPS if worst[kind] <= s):g}" if kind in worst else "-"
+        rows.append([f"`{kind}`", ", ".join(owners.get(kind, ["Caffe"])), counts or "-", how])
+    return rows
+
+
+def layer_types() -> dict[str, list[str]]:
+    """Return the dialects that have a layer type, or put a layer in the place of one of Caffe's."""
+    owners: dict[str, list[str]] = {}
+    for dialect in known():
+        source = Path(dialect.file).read_text()
+        replaced = re.findall(r'register\(\s*"(\w+)",(?:(?!register\(|\nclass).)*?replaces=', source, re.DOTALL)
+        for kind in {*dialect.layer_types, *replaced}:
+            owners.setdefault(kind, []).append(dialect.name)
+    return owners
+
+
+def golden_cases() -> Iterator[tuple[Path, str]]:
+    """Yield the folder of each case of a layer, and the repository of its fork."""
+    readme = (FORKS / "README.md").read_text()
+    names: dict[str, str] = {}
+    for prefixes, repositories in re.findall(r"^\| ([a-z0-9, ]+) \| ([^|]+/[^|]+) \|", readme, re.MULTILINE):
+        names.update(zip(prefixes.split(", "), repositories.split(", "), strict=True))
+    for folder in sorted((FORKS / "layers").iterdir()):
+        prefix, _, rest = folder.name.partition("__")
+        yield folder, names[prefix] if rest else OLDER.get(prefix.split("_")[0], OLDER[""])
+    for folder in sorted((GOLDEN / "ssd" / "layers").iterdir()):
+        yield folder, names["ssd"]
