@@ -7,6 +7,8 @@ Caffe: src/caffe/util/io.cpp (CVMatToDatum, DecodeDatumToCVMat), src/caffe/data_
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -59,22 +61,27 @@ def parse_datum(record: bytes) -> Datum:
         raise ValueError(f"is not a Datum ({len(record)} bytes)") from None
 
 
-def datum_to_array(datum: Any, color: bool | None = None) -> np.ndarray:
+def datum_to_array(datum: Any, color: bool | None = None, warn: Callable[[str], None] | None = None) -> np.ndarray:
     """Return the values (C, H, W): uint8 from ``data``, float32 from ``float_data``; ``data`` if both are given.
 
     An encoded image is decoded: to three channels if ``color`` is true, to one if it is false, to the file's channels
     if it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that
-    contradicts itself or cannot be decoded.
+    contradicts itself or cannot be decoded. Of raw data longer than its shape, Caffe's data layers read the first
+    values (data_transformer.cpp), and its other tools refuse it: it is read so if ``warn`` is there to be told.
     """
     if datum.encoded:
         return decode_image(datum.data, color)
     shape = (datum.channels, datum.height, datum.width)
     data = datum.data
     values = np.frombuffer(data, np.uint8) if data else np.array(datum.float_data, np.float32)
-    if len(values) != np.prod(shape) or len(values) == 0:
+    count = math.prod(shape)
+    if len(values) != count or not count:
         field = "data" if data else "float_data"
-        raise ValueError(f"contains {len(values)} values in {field}, but channels x height x width is {times(shape)}")
-    return values.reshape(shape)
+        fault = f"contains {len(values)} values in {field}, but channels x height x width is {times(shape)}"
+        if warn is None or not 0 < count < len(values) or min(shape) < 0:
+            raise ValueError(fault)
+        warn(fault)
+    return values[:count].reshape(shape)
 
 
 def decode_image(image: bytes, color: bool | None = None) -> np.ndarray:

@@ -177,7 +177,7 @@ class DatabaseSource(_ImageSource):
     def __init__(self, reader: Reader, cursor: Cursor, transformer: Transformer, where: Where | None = None) -> None:
         self._reader, self._where = reader, where
         super().__init__(cursor, transformer)
-        self._stacked = Stacker()
+        self._stacked = Stacker(transformer.decode)
         self._small = self._stacked(reader.records((cursor.first(),))) is not None
 
     def batch(self, iteration: int) -> Arrays:

@@ -6,13 +6,14 @@ but for their numbers and labels, so what was parsed of one holds for all that h
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netspec.data.blobs import Shape
-from netspec.data.datum import parse_datum
+from netspec.data.datum import datum_to_array, parse_datum
 from netspec.proto.schema import Datum
 from netspec.proto.wire import BYTES, FOUR, fields
 
@@ -32,9 +33,13 @@ class _Form(NamedTuple):
 
 
 class Stacker:
-    """Reads records as arrays; it remembers the forms that it has seen."""
+    """Reads records as arrays; it remembers the forms that it has seen.
 
-    def __init__(self) -> None:
+    ``decode`` returns the numbers (C, H, W) of a raw Datum: the first of those stored, or all.
+    """
+
+    def __init__(self, decode: Callable[[Any], np.ndarray] = datum_to_array) -> None:
+        self._decode = decode
         self._forms: dict[int, _Form] = {}
 
     def __call__(self, records: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -63,13 +68,13 @@ class Stacker:
     def _read(self, records: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray] | None:
         """Return images and labels of records of one size."""
         size = len(records[0])
-        form = self._forms.get(size) or _form_of(records[0])
+        form = self._forms.get(size) or _form_of(records[0], self._decode)
         if form is None:
             return None
         rows = np.frombuffer(b"".join(records), np.uint8).reshape(len(records), size)
         found = _unpacked(rows, form)
         if found is None and (rows[0] != form.record).any():  # a form of another database, or of its first records
-            form = _form_of(records[0])
+            form = _form_of(records[0], self._decode)
             found = None if form is None else _unpacked(rows, form)
         if form is not None:
             if len(self._forms) >= _MOST_FORMS:
@@ -98,33 +103,33 @@ def _unpacked(rows: np.ndarray, form: _Form) -> tuple[np.ndarray, np.ndarray] | 
         values = np.ascontiguousarray(values).view("<f4")
     shifts = np.arange(0, 7 * count, 7, dtype=np.uint64)
     label = ((labels & 127).astype(np.uint64) << shifts).sum(axis=1, dtype=np.uint64)
+    values = values[:, : math.prod(form.shape)]
     return values.reshape(len(rows), *form.shape), label.astype(np.uint32).view(np.int32).astype(np.float32)
 
 
-def _form_of(record: bytes) -> _Form | None:
+def _form_of(record: bytes, decode: Callable[[Any], np.ndarray]) -> _Form | None:
     """Return the form of a record; None if it is encoded, contradicts itself, or has a field several times."""
     try:
         found = list(fields(record, 0, len(record)))
         datum = parse_datum(record)
+        if datum.encoded:
+            return None
+        shape = decode(datum).shape
     except ValueError:
         return None
     floats = [field for field in found if field.number == _FLOATS]
     others = [field.number for field in found if field.number != _FLOATS]
-    shape = (datum.channels, datum.height, datum.width)
-    count = shape[0] * shape[1] * shape[2]
-    if datum.encoded or len(set(others)) < len(others) or min(shape) <= 0:
+    if len(set(others)) < len(others):
         return None
     places = {field.number: slice(field.start, field.end) for field in found}
     label = places.get(_LABEL, slice(0, 0))
     if datum.data:
         values, step = places[_DATA], 1
-        if floats or len(datum.data) != count:
+        if floats:
             return None
     else:
-        if len(datum.float_data) != count:
-            return None
         packed = floats[0].kind == BYTES
         step, values = (4, places[_FLOATS]) if packed else (5, slice(floats[0].tag, floats[-1].end))
-        if values.stop - values.start != step * count:
+        if values.stop - values.start != step * len(datum.float_data):
             return None
     return _Form(np.frombuffer(record, np.uint8), shape, values, label, step)

@@ -53,14 +53,21 @@ class Transformer:
         self.mean_values = np.array(param.mean_value, np.float32)
         self._mean_file = param.mean_file
         self._mean = read_mean(param.mean_file, at("transform_param", "mean_file")) if param.mean_file else None
-        self._warned = False
+        self._warned: set[str] = set()
 
     def decode(self, datum: Any) -> np.ndarray:
         """Return a Datum's image (C, H, W), in color or gray if the transform forces it; raises ValueError."""
-        if self.color is not None and not datum.encoded and not self._warned:
-            self._warned = True
-            log.warning("data_transformer.cpp:152", "force_color and force_gray only for encoded datum")
-        return datum_to_array(datum, self.color)
+        if self.color is not None and not datum.encoded:
+            self._warn_once("data_transformer.cpp:152", "force_color and force_gray only for encoded datum")
+        return datum_to_array(datum, self.color, self._warn_long)
+
+    def _warn_long(self, fault: str) -> None:
+        self._warn_once("data_transformer.cpp:63", f"{self._at()}: a record {fault}: only the first values are read")
+
+    def _warn_once(self, site: str, message: str) -> None:
+        if site not in self._warned:
+            self._warned.add(site)
+            log.warning(site, message)
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return the shape of a transformed image of ``shape`` (C, H, W).

@@ -160,6 +160,50 @@ def test_small_records_are_read_at_once_as_one_by_one(
     assert labels.tolist() == [np.float32(datum.label) for datum in (*one_by_one, one_by_one[0])]
 
 
+def longer(record: bytes, count: int) -> bytes:
+    """The same Datum with ``count`` more numbers than its shape has."""
+    datum = Datum.FromString(record)
+    if datum.data:
+        datum.data += bytes(range(count))
+    else:
+        datum.float_data.extend(range(count))
+    return datum.SerializeToString()
+
+
+LONG = [longer(record, k) for k, record in zip((72, 72, 5), datums(1, 2, 3), strict=True)]
+LONG_FLOATS = [longer(record, 3) for record in datums(1, 2, floats=True)]
+
+
+@pytest.mark.parametrize(
+    ("records", "at_once"),
+    [
+        pytest.param(LONG[:2], True, id="bytes"),
+        pytest.param([*datums(7), *LONG], True, id="other lengths"),
+        pytest.param(LONG_FLOATS, True, id="floats"),
+        pytest.param([packed(record) for record in LONG_FLOATS], True, id="packed floats"),
+        pytest.param([LONG[0], LONG[1] + b"\x28\x09"], False, id="one by one"),
+        pytest.param(datums(1, 2), True, id="none of them"),
+    ],
+)
+def test_of_records_longer_than_their_shape_the_first_numbers_are_read(
+    tmp_path: Path, records: list[bytes], at_once: bool, caplog: pytest.LogCaptureFixture
+) -> None:  # as data_transformer.cpp does; nets are trained from such databases
+    with Writer(str(tmp_path / "db")) as writer:
+        for i, record in enumerate(records):
+            writer.put(b"%08d" % i, record)
+    transformer = Transformer(TransformationParameter(), 0, lambda *path: PLACE)
+    found = DatabaseSource(open_reader(str(tmp_path / "db")), Cursor(len(records), len(records)), transformer, PLACE)
+    assert (found.together(0, 1) is not None) == at_once
+    data, _ = found.batch(0)
+    stored = [
+        np.frombuffer(each.data, np.uint8) if each.data else each.float_data for each in map(parse_datum, records)
+    ]
+    assert (data == np.stack([np.array(each[:24], np.float32).reshape(2, 3, 4) for each in stored])).all()
+    told = [each.getMessage() for each in caplog.records if "only the first values" in each.getMessage()]
+    assert len(told) == (max(map(len, stored)) > 24)
+    assert all(message.startswith("net.prototxt:9:5: a record contains ") for message in told)
+
+
 @pytest.mark.parametrize("ranks", [1, 3])
 @pytest.mark.parametrize("shapes", [[(2, 3, 4)] * 7, [(2, 3, 4), (3, 6, 5), (3, 6, 5)]])
 def test_several_iterations_at_once_are_those_one_by_one(
