@@ -108,13 +108,11 @@ def load_sequence(
                   ``selection`` applies to the queries only, and no pair is excluded
     view_overlap  which other views are not a mistake in the soft zone
     """
-    hard_m = MAX_DISTANCE_M if max_distance_m is None else max_distance_m
-    hard_deg = MAX_ANGLE_DEG if max_angle_deg is None else max_angle_deg
+    hard_m, hard_deg = _given(max_distance_m, MAX_DISTANCE_M), _given(max_angle_deg, MAX_ANGLE_DEG)
     rule = f"same place: nearer than {hard_m:g} m and turned less than {hard_deg:g} degrees"
     wide = None
     if soft_distance_m is not None or soft_angle_deg is not None:
-        wide_m = hard_m if soft_distance_m is None else soft_distance_m
-        wide_deg = hard_deg if soft_angle_deg is None else soft_angle_deg
+        wide_m, wide_deg = _given(soft_distance_m, hard_m), _given(soft_angle_deg, hard_deg)
         if wide_m < hard_m or wide_deg < hard_deg:
             raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({rule})")
         wide = (wide_m, wide_deg)
@@ -149,6 +147,10 @@ def load_sequence(
         notes=[*queries.notes, *(() if references is None else (f"{others.name}: {note}" for note in others.notes))],
     )
     return _checked(data, hard)
+
+
+def _given(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
 
 
 @dataclass(frozen=True)

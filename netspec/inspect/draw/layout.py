@@ -8,7 +8,7 @@ optima of two linear programs (Gansner, Koutsofios, North, Vo: A Technique for D
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -268,6 +268,14 @@ def _entries(
     return entries
 
 
+def _gaps(rows: list[Row], index: dict[Cell, int], sizes: Sequence[Size]) -> Iterator[tuple[int, int, float]]:
+    """Yield neighbors of a row by number, the right one first, and minus the least distance of their axes."""
+    for row in rows:
+        for left, right in zip(row.cells, row.cells[1:], strict=False):
+            gap = GAP if left.item >= 0 and right.item >= 0 else WIRE_GAP
+            yield index[right], index[left], -(_reach(left, sizes)[1] + gap + _reach(right, sizes)[0])
+
+
 def _columns(
     rows: list[Row],
     links: Sequence[Sequence[_Link]],
@@ -281,11 +289,7 @@ def _columns(
     if not sizes:
         return Layout(rows, ports, 0)
     index = {cell: k for k, cell in enumerate(cell for row in rows for cell in row.cells)}
-    apart: list[tuple[int, int, float]] = []
-    for row in rows:
-        for left, right in zip(row.cells, row.cells[1:], strict=False):
-            gap = GAP if left.item >= 0 and right.item >= 0 else WIRE_GAP
-            apart.append((index[right], index[left], -(_reach(left, sizes)[1] + gap + _reach(right, sizes)[0])))
+    apart = list(_gaps(rows, index, sizes))
 
     def start(link: _Link) -> int:
         return ports[link.upper.item][wires[link.wire].port] if link.upper.item >= 0 else 0
