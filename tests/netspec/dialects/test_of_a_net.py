@@ -1,6 +1,7 @@
 """A dialect belongs to the nets that use it: others in the same process have Caffe's own layers."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,6 +10,8 @@ from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
+from netspec.net.weights import load_weights
+from netspec.proto.schema import NetParameter
 
 PLAIN = """
 layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1 dim: 9 dim: 9 } } }
@@ -119,3 +122,53 @@ def test_crops_of_a_hed_lie_where_coord_map_says(net_of: Callable[..., Net]) -> 
         text += f'layer {{ name: "o{step}" type: "Crop" bottom: "u{step}" bottom: "data" top: "o{step}" }}'
     crops = [layer for layer in net_of("# dialect: hed\n" + text).layers if layer.type == "Crop"]
     assert [crop.window[2].start for crop in crops] == [34, 35, 36, 38, 42]  # by BVLC's coord_map
+
+
+@pytest.mark.parametrize(("fields", "weight"), [("smooth_l1_loss_param { sigma: 3 }", 0), ("loss_weight: 2", 2)])
+def test_a_loss_of_fast_rcnn_counts_with_a_loss_weight_only(
+    net_of: Callable[..., Net], fields: str, weight: float
+) -> None:
+    assert net_of(PLAIN + SMOOTH % fields).loss_weights[-1] == [weight]
+    assert net_of("# dialect: ssd\n" + PLAIN + SMOOTH % "").loss_weights[-1] == [1]
+
+
+def test_files_have_blobs_of_bn_with_two_axes_or_four(net_of: Callable[..., Net], tmp_path: Path) -> None:
+    message = NetParameter()
+    blobs = message.layer.add(name="n", type="BN").blobs
+    for _ in range(4):
+        blobs.add(shape={"dim": [1, 1]}, data=[0.5])
+    (tmp_path / "w.caffemodel").write_bytes(message.SerializeToString())
+    net = net_of("# dialect: happynear\n" + PLAIN + BN)
+    load_weights(net, [tmp_path / "w.caffemodel"])
+    assert [blob.item() for blob in net.params["n"]] == [0.5] * 4
+    x = torch.randn(1, 1, 9, 9)
+    torch.testing.assert_close(net(data=x)["n"], (x - 0.5) * 0.5 * 0.5 + 0.5)
+
+
+OHEM = """
+layer { name: "in" type: "Input" top: "scores" top: "labels" top: "boxes" top: "targets" top: "weights" top: "rois"
+        input_param { shape { dim: [6, 3] } shape { dim: [6, 1, 1, 1] } shape { dim: [6, 8] } shape { dim: [6, 8] }
+                      shape { dim: [6, 8] } shape { dim: [6, 5] } } }
+layer { name: "cls" type: "SoftmaxWithLoss" bottom: "scores" bottom: "labels" top: "a" top: "p" top: "each_cls"
+        loss_weight: 0 loss_weight: 0 loss_weight: 0 }
+layer { name: "box" type: "SmoothL1Loss" bottom: "boxes" bottom: "targets" bottom: "weights" top: "b" top: "each_box"
+        loss_weight: 0 loss_weight: 0 }
+layer { name: "each" type: "Eltwise" bottom: "each_cls" bottom: "each_box" top: "each" }
+layer { name: "hard" type: "BoxAnnotatorOHEM" bottom: "rois" bottom: "each" bottom: "labels" bottom: "weights"
+        top: "hard" top: "hard_weights" box_annotator_ohem_param { roi_per_img: 2 } }
+layer { name: "loss" type: "SmoothL1Loss" bottom: "boxes" bottom: "targets" bottom: "hard_weights" top: "loss"
+        loss_weight: 1 loss_param { normalization: PRE_FIXED pre_fixed_normalizer: 2 } }
+"""
+
+
+def test_losses_of_rfcn_have_tops_for_each_region(net_of: Callable[..., Net]) -> None:
+    net = net_of(OHEM)
+    shapes = [(6, 3), (6, 1, 1, 1), (6, 8), (6, 8), (6, 8), (6, 5)]
+    given = dict(zip(net.inputs, (torch.randn(shape) for shape in shapes), strict=True))
+    given.update(labels=torch.zeros(6, 1, 1, 1), weights=torch.ones(6, 8), rois=torch.zeros(6, 5))
+    tops = net(**given)
+    d = (given["boxes"] - given["targets"]).abs()
+    of_boxes = torch.where(d < 1, d * d / 2, d - 0.5).sum(1)
+    of_classes = -given["scores"].log_softmax(1)[:, 0]
+    hardest = (of_boxes + of_classes).topk(2).indices
+    torch.testing.assert_close(tops["loss"], of_boxes[hardest].sum() / 2)
