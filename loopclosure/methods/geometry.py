@@ -31,12 +31,14 @@ class Geometry:
     check, agree  of a query and a reference, by number
     unlike  the evidence of pairs that the scores call unlike; None where nothing can be verified
     said    what was tried, in a sentence
+    seldom  it finds few of the matches of sequences, but no unlike pairs: each stretch needs one
     """
 
     check: GeometricCheck
     agree: Agree
     unlike: np.ndarray | None
     said: str
+    seldom: bool = False
 
     def common(self, evidence: float) -> bool:
         """Whether more than half of the unlike pairs have this evidence."""
@@ -64,6 +66,9 @@ def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agr
     against = np.array([check.evidence(of_part(query, reference)) for query, reference in pairs])
     unlike = np.count_nonzero(against >= 1)
     tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(against)} unlike pairs{hidden}"
+    if accepted.any() and LEAST_FOUND <= same < LEAST_SHARE * len(likely) and unlike <= RARELY * len(against):
+        said = f"{tried}: few are verified, and a stretch without any is none"
+        return Geometry(check, of_part, against, said, seldom=True)
     if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
         said = f"{tried}: these images cannot be verified, so that nothing is rejected for it"
         return Geometry(check, of_part, None, said)
@@ -116,6 +121,11 @@ def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: f
     """Return the queries (Q,) whose matches, which were verified, are loops."""
     unlike, evidence, accepted = geometry.unlike, matches.evidence, matches.accepted
     assert unlike is not None
+    if geometry.seldom:
+        loops = accepted & (matches.inliers > 0)
+        while np.any(more := accepted & np.any(_beside(matches.match, loops, lines), axis=0) & ~loops):
+            loops |= more
+        return loops
     # What verification alone finds must be better than what it finds in pairs that are no loop.
     least = max(SURE, threshold(evidence, unlike, precision))
     if not geometry.common(DOUBTLESS):

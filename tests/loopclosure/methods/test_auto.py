@@ -126,6 +126,23 @@ def test_a_loop_ends_with_its_last_verified_match():
     assert not found.accepted[90:].any()
 
 
+def test_where_few_matches_are_verified_each_stretch_needs_one():
+    road = drive(210, 6)
+    rows = np.concatenate([again(road[:70], 0.8, 7), drive(70, 16), again(road[140:], 0.8, 8)])
+    scores, points = alike(rows, road), (Agreement(40, 9, 20), Agreement(60, 50, 20))
+    found = answer(
+        scores,
+        everything(scores),
+        True,
+        0.99,
+        GeometricCheck(),
+        lambda q, r: points[q < 70 and q % 5 == 0 and abs(q - r) <= 3],
+    )
+    assert "few are verified" in found.reasons[1]
+    assert np.count_nonzero(found.accepted[:70]) > 55
+    assert not found.accepted[100:].any()
+
+
 def test_a_sequence_is_not_overruled_by_one_image_that_repeats():
     """The lamps of a tunnel: each third image is verified with the next lamp, which it looks like most."""
     road = drive(150, 6)
