@@ -18,11 +18,10 @@ from netspec.exact import ALL, libm, switch
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
 from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.kernels import RELU, Finish, Kernels, Preparation, Room, finished
 from netspec.layers.contract.learned import values_of
-from netspec.layers.contract.preparing import RELU, Finish, Kernel, Preparation, finished
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.contract.training import Kernels, Learning, Room
 
 
 class Activation(Layer):
@@ -56,14 +55,16 @@ class Rounded(Activation):
         return None if self.context.options.exact == ALL else type(self).in_place
 
     # Torch's function into ``out``, and its gradient, from the top's and the top, into ``grad_input``.
-    kernels: ClassVar[tuple[Callable[..., torch.Tensor], Callable[..., torch.Tensor]] | None] = None
+    by_torch: ClassVar[tuple[Callable[..., torch.Tensor], Callable[..., torch.Tensor]] | None] = None
 
-    def prepare_training(self, learning: Learning) -> Kernels | None:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if not how.learns:
+            return None
         if switch.applies(self.context.options.exact, torch.empty(1)):
             return self._prepared_as_caffe()
-        if self.kernels is None:
+        if self.by_torch is None:
             return None
-        rooms, (compute, gradient) = (Room(), Room()), self.kernels
+        rooms, (compute, gradient) = (Room(), Room()), self.by_torch
 
         def forward(x: torch.Tensor) -> torch.Tensor:
             return compute(x, out=rooms[0].like(x))
@@ -71,7 +72,7 @@ class Rounded(Activation):
         def backward(diff: torch.Tensor) -> torch.Tensor:
             return gradient(diff, rooms[0].like(diff), grad_input=rooms[1].like(diff))
 
-        return forward, backward
+        return Kernels(forward, backward)
 
     def _prepared_as_caffe(self) -> Kernels:
         bottom = top = torch.empty(0)
@@ -81,7 +82,7 @@ class Rounded(Activation):
             bottom, top = x, self.as_caffe(x)
             return top
 
-        return forward, lambda diff: self.caffes_gradient(bottom, top, diff)
+        return Kernels(forward, lambda diff: self.caffes_gradient(bottom, top, diff))
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom by torch's functions, whose gradients autograd knows."""
@@ -135,8 +136,8 @@ class ReLU(Activation):
             return RELU
         return Finish(f"leaky_relu {self.slope}", partial(F.leaky_relu_, negative_slope=self.slope))
 
-    def prepare_training(self, learning: Learning) -> Kernels | None:
-        if self.slope:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if self.slope or not how.learns:
             return None
         rooms, gradient = (Room(), Room()), torch.ops.aten.threshold_backward.grad_input
 
@@ -146,7 +147,7 @@ class ReLU(Activation):
         def backward(diff: torch.Tensor) -> torch.Tensor:
             return gradient(diff, rooms[0].like(diff), 0, grad_input=rooms[1].like(diff))
 
-        return forward, backward
+        return Kernels(forward, backward)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope)
@@ -185,8 +186,8 @@ class PReLU(Activation):
             )
         return F.prelu(x, slopes.reshape(-1))
 
-    def prepare(self, how: Preparation) -> Kernel | None:
-        if self.context.options.exact == ALL:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if how.learns or self.context.options.exact == ALL:
             return None
         slopes = values_of(self.blob(0)).clone().reshape(-1)
         return finished(lambda x: torch.prelu(x, slopes), how.finish)
@@ -243,7 +244,7 @@ class Sigmoid(Rounded):
 
     gradient_reads = frozenset({"top"})
     in_place = Finish("sigmoid", torch.sigmoid_)
-    kernels = torch.sigmoid, torch.ops.aten.sigmoid_backward.grad_input
+    by_torch = torch.sigmoid, torch.ops.aten.sigmoid_backward.grad_input
     onnx_op, torch_call = "Sigmoid", "torch.sigmoid({x})"
 
     @override
@@ -265,7 +266,7 @@ class TanH(Rounded):
 
     gradient_reads = frozenset({"top"})
     in_place = Finish("tanh", torch.tanh_)
-    kernels = torch.tanh, torch.ops.aten.tanh_backward.grad_input
+    by_torch = torch.tanh, torch.ops.aten.tanh_backward.grad_input
     onnx_op, torch_call = "Tanh", "torch.tanh({x})"
 
     @override

@@ -15,10 +15,9 @@ from netspec.layers.contract import fused
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.folding import Absorbed, blob_like, copy_of
-from netspec.layers.contract.preparing import Kernel, Preparation, copies, finished, lent
+from netspec.layers.contract.kernels import Kernels, Preparation, Room, copies, finished, lent, weight_and_bias
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.contract.training import Kernels, Learning, Room, weight_and_bias
 from netspec.proto.schema import TRAIN
 
 
@@ -72,7 +71,9 @@ class InnerProduct(Layer):
     def small(self) -> bool:
         return math.prod(self.blob_shapes[0]) <= SMALL_PRODUCT
 
-    def prepare(self, how: Preparation) -> Kernel:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if how.learns:
+            return self._learning_kernels(how)
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         transposed, top_shape = self.param.inner_product_param.transpose, self.top_shapes[0]
         rows = math.prod(top_shape[:-1])
@@ -83,22 +84,22 @@ class InnerProduct(Layer):
         weight = weight.t() if transposed else weight
         # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
         if rows > 1 and how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:
-            multiply = fused.product(weight, bias, how)
+            multiply = fused.product(weight, bias, how).forward
         else:
-            multiply = finished(lambda vectors: F.linear(vectors, weight, bias), how.finish)
+            multiply = finished(lambda vectors: F.linear(vectors, weight, bias), how.finish).forward
         if self.axis == 1:
-            return lambda data: multiply(data.reshape(one_by_one))
-        return lambda data: multiply(data.reshape(one_by_one)).view(top_shape)
+            return Kernels(lambda data: multiply(data.reshape(one_by_one)))
+        return Kernels(lambda data: multiply(data.reshape(one_by_one)).view(top_shape))
 
-    def prepare_training(self, learning: Learning) -> Kernels | None:
-        (weight, bias), sums = weight_and_bias(self, learning)
+    def _learning_kernels(self, how: Preparation) -> Kernels | None:
+        (weight, bias), sums = weight_and_bias(self, how)
         transposed = self.param.inner_product_param.transpose
-        top_shape, inputs, wanted = self.top_shapes[0], self.inputs, learning.wanted[0]
+        top_shape, inputs, wanted = self.top_shapes[0], self.inputs, how.wants(0)
         if math.prod(top_shape) == 0 or inputs == 0:
             return None
         if self.is_exact(weight, self.small):
             bound = BoundVectors(self.bottom_shapes[0], top_shape, transposed, Weights(weight, bias, *sums), wanted)
-            return bound.forward, bound.backward
+            return Kernels(bound.forward, bound.backward)
         tops = weight.new_empty(math.prod(top_shape[:-1]), top_shape[-1])
         top, matrix = tops.view(top_shape), weight if transposed else weight.t()
         diff = torch.empty(self.bottom_shapes[0]) if wanted else None
@@ -124,7 +125,7 @@ class InnerProduct(Layer):
                 torch.mm(tops_diff, matrix.t(), out=vectors_diff)
             return diff
 
-        return forward, backward
+        return Kernels(forward, backward)
 
     def multiply_adds(self) -> int:
         return math.prod(self.top_shapes[0]) * self.inputs
@@ -187,10 +188,12 @@ class Dropout(Layer):
         kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
         return data * kept.mul_(1 / (1 - self.ratio))
 
-    def prepare_training(self, learning: Learning) -> Kernels:
-        """Return the kernels; the numbers drawn are kept, and scale the gradients too."""
+    def kernels(self, how: Preparation) -> Kernels | None:
+        """Return the kernels of a net that learns; the numbers drawn are kept, and scale the gradients too."""
+        if not how.learns:
+            return None
         if self.phase != TRAIN:
-            return lambda data: data, lambda diff: diff
+            return Kernels(lambda data: data, lambda diff: diff)
         draws, rooms, share = self.context.random, (Room(), Room(), Room()), 1 - self.ratio
 
         def forward(data: torch.Tensor) -> torch.Tensor:
@@ -201,7 +204,7 @@ class Dropout(Layer):
         def backward(diff: torch.Tensor) -> torch.Tensor:
             return torch.mul(diff, rooms[0].like(diff), out=rooms[2].like(diff))
 
-        return forward, backward
+        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.phase == TRAIN:

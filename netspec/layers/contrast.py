@@ -13,7 +13,7 @@ from netspec.exact import ALL
 from netspec.exact.channels import RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
 from netspec.layers.contract.base import MOST, Layer, Shape
-from netspec.layers.contract.preparing import Kernel, Preparation, finished
+from netspec.layers.contract.kernels import Kernels, Preparation, finished
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 
@@ -66,9 +66,9 @@ class LRN(Layer):
             base = 1 + param.alpha * F.avg_pool2d(squares, size, stride=1, padding=reach)
         return data * base.pow(-param.beta)
 
-    def prepare(self, how: Preparation) -> Kernel | None:
+    def kernels(self, how: Preparation) -> Kernels | None:
         param, shape = self.param.lrn_param, self.bottom_shapes[0]
-        if param.norm_region != ACROSS_CHANNELS or self.context.options.exact == ALL:
+        if how.learns or param.norm_region != ACROSS_CHANNELS or self.context.options.exact == ALL:
             return None
         size, channels, reach = param.local_size, shape[1], param.local_size // 2
         frames: dict[bool, torch.Tensor] = {}

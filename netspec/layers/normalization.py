@@ -11,7 +11,7 @@ from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.folding import Affine, blob_in_double
-from netspec.layers.contract.preparing import RELU, Kernel, Preparation, channel_factors, finished, finishing
+from netspec.layers.contract.kernels import RELU, Kernel, Kernels, Preparation, channel_factors, finished, finishing
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST
@@ -119,8 +119,8 @@ class BatchNorm(Layer):
     def small(self) -> bool:
         return math.prod(self.bottom_shapes[0][1:]) <= SMALL_ITEM
 
-    def prepare(self, how: Preparation) -> Kernel | None:
-        if not self.use_global_stats:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if how.learns or not self.use_global_stats:
             return None
         return finished(self._by_past(self.is_exact(self.blob(0), self.small)), how.finish)
 

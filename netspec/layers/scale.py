@@ -13,7 +13,7 @@ from netspec.exact import SMALL_ITEM
 from netspec.exact.channels import ChannelProducts
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.folding import Absorbed, Affine, blob_in_double, copy_of
-from netspec.layers.contract.preparing import Kernel, Preparation, finished
+from netspec.layers.contract.kernels import Kernel, Kernels, Preparation, finished
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
@@ -127,8 +127,8 @@ class Scale(_Affine):
         shape, axes = self.bottom_shapes[0], len((*self.bottom_shapes[1:], *self.blob_shapes)[0])
         return self.axis == 1 and axes == 1 and math.prod(shape[1:]) <= SMALL_ITEM
 
-    def prepare(self, how: Preparation) -> Kernel | None:
-        if not self.by_channel:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if how.learns or not self.by_channel:
             return None
         scale, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         if not self.is_exact(scale, self.small):

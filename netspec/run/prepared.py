@@ -26,9 +26,9 @@ from netspec.graph.plan import Plan
 from netspec.graph.steps import PACK, Schedule, schedule
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.folding import Absorbed, absorbing
+from netspec.layers.contract.kernels import Kernel, Preparation, finished, finishing, own_kernels
 from netspec.layers.contract.learned import Stamp, is_lent, stamp
 from netspec.layers.contract.offers import offered
-from netspec.layers.contract.preparing import Kernel, Preparation, finished, finishing, own_kernel
 from netspec.layers.contract.reading import changes_itself
 from netspec.process.heap import give_back_freed_memory
 from netspec.run.fold import absorbed_by, roles_of
@@ -215,9 +215,11 @@ class Prepared:
             chain = step.chain
             layer = absorbing(layer, memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
         finish = None if step.finish is None else finishing(layers[step.finish])
-        how = Preparation(finish, step.reuse, step.lasts, memo, PACK in self.passes, keeps)
-        own = None if as_is else own_kernel(layer, how)
-        kernel = finished(layer.forward, finish) if own is None else own
+        how = Preparation(
+            finish=finish, reuse=step.reuse, lasts=step.lasts, memo=memo, pack=PACK in self.passes, keeps=keeps
+        )
+        own = None if as_is else own_kernels(layer, how)
+        kernel = (own or finished(layer.forward, finish)).forward
         if not offered(layer, "any_layout") or self._exact == ALL:
             inner = kernel
             kernel = lambda *bottoms: inner(*(bottom.contiguous() for bottom in bottoms))  # noqa: E731

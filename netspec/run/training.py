@@ -2,7 +2,7 @@
 
 A pass through autograd costs about a millisecond for ten layers, whatever their size; that is what a net of small
 layers or batches spends most of its time on. Here a layer is a pair of kernels
-(netspec/layers/contract/training.py), made for the shapes at hand, and a pass calls one after
+(netspec/layers/contract/kernels.py), made for the shapes at hand, and a pass calls one after
 the other. The numbers are the same.
 """
 
@@ -23,7 +23,16 @@ from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
-from netspec.layers.contract.training import Backward, Diff, Forward, Kernels, Learning, has_kernels, kernels, recorded
+from netspec.layers.contract.kernels import (
+    Backward,
+    Diff,
+    Kernel,
+    Kernels,
+    Preparation,
+    learns_alone,
+    own_kernels,
+    recorded,
+)
 from netspec.run.walk import losses_of
 
 LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
@@ -55,7 +64,7 @@ def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int
         return "a blob has several readers without a Split"
     owned = Counter(id(blob) for layer in layers for blob in layer.blobs)
     for node, layer in zip(plan.nodes, layers, strict=True):
-        if not has_kernels(layer) and any(owned[id(blob)] > 1 for blob in layer.blobs):
+        if any(owned[id(blob)] > 1 for blob in layer.blobs) and not learns_alone(layer):
             return f'"{node.name}" shares parameters, and only autograd adds up their gradients'
     return ""
 
@@ -64,7 +73,7 @@ def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int
 class _Prepared:
     """The kernels of all layers for one set of shapes, and what they hold."""
 
-    forward: list[tuple[Forward, tuple[int, ...], tuple[int, ...], tuple[tuple[int, float], ...]]]
+    forward: list[tuple[Kernel, tuple[int, ...], tuple[int, ...], tuple[tuple[int, float], ...]]]
     backward: list[tuple[Backward, tuple[int, ...], tuple[int, ...]]]
     start: Values  # the gradients that are there before the backward pass: those of the losses
     blobs: list[torch.Tensor]
@@ -230,8 +239,8 @@ class TrainingStep:
         if self._overwritten[i]:
             return self._overwritten_kernels(i)
         whole = all(layer.blob(j) is blob and blob.is_contiguous() for j, blob in enumerate(layer.blobs))
-        learning = Learning(wanted, tuple(blob.grad if blob.requires_grad else None for blob in layer.blobs))
-        return kernels(layer, learning) if whole else recorded(layer.run, learning)
+        how = Preparation(wanted, tuple(blob.grad if blob.requires_grad else None for blob in layer.blobs))
+        return (whole and own_kernels(layer, how)) or recorded(layer.run, wanted)
 
     def _overwritten_kernels(self, i: int) -> Kernels:
         """Return the kernels of a layer whose gradient reads what later layers have left in its memory."""
@@ -246,4 +255,4 @@ class TrainingStep:
             top = self._values[final]
             return gradient_from_memory(layer, top if held else self._values[node.bottoms[0]], top, diff)
 
-        return forward, backward
+        return Kernels(forward, backward)

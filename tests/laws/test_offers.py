@@ -5,12 +5,12 @@ import inspect
 from collections.abc import Iterator
 
 from netspec.layers import Layer
-from netspec.layers.contract import exporting, folding, gradients, preparing, reading, training
+from netspec.layers.contract import exporting, folding, gradients, kernels, reading
 from netspec.layers.data.files import ReadingLayer
 from paths import ROOT
 
 MOST_METHODS, MOST_ATTRIBUTES = 24, 14
-ROOMS = [exporting, folding, gradients, preparing, reading, training]
+ROOMS = [exporting, folding, gradients, kernels, reading]
 
 
 def members(cls: type) -> set[str]:

@@ -33,9 +33,9 @@ from netspec.compat.pycaffe.tapes import (
 from netspec.exact.blas import one_thread
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.contract.kernels import Preparation, learns_alone, own_kernels, recorded
 from netspec.layers.contract.offers import offered
 from netspec.layers.contract.reading import Constant
-from netspec.layers.contract.training import Learning, has_kernels, kernels
 from netspec.layers.utility.live_blobs import Blob, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
@@ -157,11 +157,11 @@ class Passes:
         """Return whether layer ``i`` has kernels of its own for what autograd would watch."""
         layer = self._layers[i]
         return (
-            has_kernels(layer)
-            and self.net.device.type == "cpu"
+            self.net.device.type == "cpu"
             and not any(self._is_in_place(i, blob) for blob in self.bottoms[i])
             and all(blob.dtype == torch.float32 and blob.is_contiguous() for blob in layer.blobs)
             and all(layer.blob(j) is blob for j, blob in enumerate(layer.blobs))
+            and learns_alone(layer)
         )
 
     # Running
@@ -370,8 +370,9 @@ class Passes:
         if bound is None or bound.shapes != shapes or bound.places != places_of(layer):
             layer.fit(shapes)
             sums = tuple(gradient_of(blob) if blob.requires_grad else None for blob in layer.blobs)
-            learning = Learning(tuple(self.net.backward_plan.bottoms[i]), sums, steady=False)
-            bound = self._bound[i] = Bound(shapes, places_of(layer), kernels(layer, learning))
+            wanted = tuple(self.net.backward_plan.bottoms[i])
+            made = own_kernels(layer, Preparation(wanted, sums, steady=False)) or recorded(layer.run, wanted)
+            bound = self._bound[i] = Bound(shapes, places_of(layer), made)
         return bound
 
     def _tape(self, i: int) -> Tape:

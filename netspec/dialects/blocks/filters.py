@@ -18,7 +18,7 @@ from netspec.dialects.blocks.relu6 import Capped
 from netspec.layers import activation, common, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.preparing import Kernel, Preparation
+from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.vision import convolution, pooling, windows
 from netspec.proto.schema import TRAIN, LayerParameter, added_value, has, value
@@ -115,8 +115,8 @@ class Convolution(convolution.Convolution):
     absorbs = convolution.Convolution.absorbs
     absorb = convolution.Convolution.absorb
 
-    def prepare(self, how: Preparation) -> Kernel | None:
-        return None if any(self.sides) else super().prepare(how)
+    def kernels(self, how: Preparation) -> Kernels | None:
+        return None if any(self.sides) else super().kernels(how)
 
     @override
     def onnx_geometry(self) -> dict[str, Any]:

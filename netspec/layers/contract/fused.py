@@ -15,8 +15,8 @@ import torch
 
 from netspec.exact.products import Filter
 from netspec.layers.contract.base import Shape
+from netspec.layers.contract.kernels import RELU, Kernels, Preparation, finished
 from netspec.layers.contract.learned import values_of
-from netspec.layers.contract.preparing import RELU, Kernel, Preparation, finished
 
 _NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
 
@@ -44,7 +44,7 @@ def convolution(
     sliding: Filter,
     group: int,
     how: Preparation,
-) -> Kernel:
+) -> Kernels:
     """Return a convolution of maps (N, C, H, W) by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
     geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]
     weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
@@ -60,7 +60,7 @@ def convolution(
 
 def deconvolution(
     shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Preparation
-) -> Kernel:
+) -> Kernels:
     """Return a transposed convolution of maps (N, C, H, W) by fixed weights (C, num_output, kernel_h, kernel_w).
 
     An activation is another pass here: in the same one oneDNN falls back to a slow kernel.
@@ -78,7 +78,7 @@ def deconvolution(
 
 def spread_by_channel(
     shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Preparation
-) -> Kernel:
+) -> Kernels:
     """Return a transposed convolution by weights (C, 1, kernel_h, kernel_w), each channel of (N, C, H, W) by itself.
 
     oneDNN's own is slow. A convolution does the same on maps with ``stride`` - 1 zeros between the pixels, with the
@@ -92,13 +92,13 @@ def spread_by_channel(
     axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
     turned = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
     apart = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
-    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, apart)
+    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, apart).forward
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         pixels.copy_(maps)
         return convolve(frame)
 
-    return kernel
+    return Kernels(kernel)
 
 
 def _kept(bias: torch.Tensor | None, how: Preparation) -> torch.Tensor | None:
@@ -121,7 +121,7 @@ def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape
     return how.memo(f"{name} {shape}", make)
 
 
-def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernel:
+def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernels:
     """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
     name = f"rows {tuple(weight.shape)} {weight.stride()}"  # of a shared matrix one layer may take the transpose
     weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))

@@ -15,9 +15,9 @@ from netspec.exact.losses import SigmoidCrossEntropy
 from netspec.exact.sums import row_magnitudes, row_squares
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
-from netspec.layers.contract.training import Kernels, Learning
 from netspec.layers.loss.base import (
     BATCH_SIZE,
     FULL,
@@ -159,9 +159,11 @@ class EuclideanLoss(Loss):
         squares = row_squares(difference.reshape(1, -1))[0] if exact else difference.square().sum()
         return squares / (2 * a.shape[0])
 
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if how.wanted is None:
+            return None
         shape, other = self.bottom_shapes
-        difference, found = torch.empty(shape), [torch.empty(shape) if wanted else None for wanted in learning.wanted]
+        difference, found = torch.empty(shape), [torch.empty(shape) if wanted else None for wanted in how.wanted]
         row, squares, exact = difference.view(1, -1), torch.empty(shape), self.is_exact(difference)
         count = torch.tensor(float(shape[0]))  # a number would be made a tensor at each pass
         divisor = 2 * count
@@ -178,7 +180,7 @@ class EuclideanLoss(Loss):
                 torch.mul(difference, -factor, out=found[1])
             return found[0], None if found[1] is None else found[1].view(other)
 
-        return forward, backward
+        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms)

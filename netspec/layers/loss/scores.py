@@ -17,9 +17,9 @@ from netspec.exact.losses import Infogain, bound_cross_entropy, bound_softmax, l
 from netspec.files.limits import read_bytes
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.kernels import Kernels, Preparation, Room
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.contract.training import Kernels, Learning, Room
 from netspec.layers.loss.base import (
     BATCH_SIZE,
     FULL,
@@ -110,9 +110,9 @@ class SoftmaxWithLoss(SoftmaxLoss):
         losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, exact)
         return (self.sum_up(losses, valid, exact), p.reshape(scores.shape))[: self.num_tops]
 
-    def prepare_training(self, learning: Learning) -> Kernels | None:
-        """Return the kernels, where every label counts."""
-        if self.ignore_label is not None or math.prod(self.bottom_shapes[0]) == 0:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        """Return the kernels of a net that learns, where every label counts."""
+        if not how.learns or self.ignore_label is not None or math.prod(self.bottom_shapes[0]) == 0:
             return None
         shape, tops, room = self.bottom_shapes[0], self.num_tops, Room()
         split, flat = (self.outer, self.classes, self.inner), (self.outer, 1, self.inner)
@@ -137,7 +137,7 @@ class SoftmaxWithLoss(SoftmaxLoss):
             found = room.like(p).copy_(p).scatter_add_(1, label, minus_one)
             return found.mul_(diff / divisor).view(shape), None
 
-        return forward, backward
+        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         scores, labels = self.onnx_scores_and_labels(graph, *bottoms)

@@ -12,7 +12,7 @@ from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
 from netspec.exact.sums import Product, RowSums, row_magnitudes, row_squares
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.preparing import Kernel, Preparation, finished
+from netspec.layers.contract.kernels import Kernels, Preparation, finished
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
@@ -75,8 +75,8 @@ class Eltwise(Layer):
             top = top + x if self.operation == self.SUM else top * x
         return top
 
-    def prepare(self, how: Preparation) -> Kernel | None:
-        if self.operation != self.SUM or self.coeff != [1.0, 1.0]:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if how.learns or self.operation != self.SUM or self.coeff != [1.0, 1.0]:
             return None
         return finished(torch.Tensor.add_ if how.reuse else torch.add, how.finish)
 

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 
 from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.contract.training import Kernels, Learning
 
 
 def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
@@ -53,9 +53,11 @@ class Concat(Layer):
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
 
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        if not how.learns:
+            return None
         axis, sizes = self.axis, [shape[self.axis] for shape in self.bottom_shapes]
-        return lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis)
+        return Kernels(lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis))
 
     @property
     def fresh(self) -> bool:

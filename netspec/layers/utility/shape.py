@@ -10,9 +10,9 @@ import torch
 from netspec.exact import switch
 from netspec.exact.sums import Copies, tiles
 from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.contract.training import Kernels, Learning
 
 
 class _OtherShape(Layer):
@@ -23,9 +23,9 @@ class _OtherShape(Layer):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])
 
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def kernels(self, how: Preparation) -> Kernels:
         (shape,), (top_shape,) = self.bottom_shapes, self.top_shapes
-        return lambda x: x.reshape(top_shape), lambda diff: diff.reshape(shape)
+        return Kernels(lambda x: x.reshape(top_shape), lambda diff: diff.reshape(shape))
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.reshape_to_top(bottoms[0])
@@ -117,7 +117,7 @@ class Split(Layer):
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
 
-    def prepare_training(self, learning: Learning) -> Kernels:
+    def kernels(self, how: Preparation) -> Kernels:
         """Return the kernels; gradients are added in Caffe's order, or in the order of autograd: the last one first."""
         order = 1 if self.num_tops > 2 and switch.applies(self.context.options.exact, torch.empty(1)) else -1
         tops = self.num_tops
@@ -126,7 +126,7 @@ class Split(Layer):
             first, *others = [diff for diff in diffs[::order] if diff is not None]
             return sum(others, first)
 
-        return lambda x: (x,) * tops, backward
+        return Kernels(lambda x: (x,) * tops, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return bottoms * self.num_tops

@@ -26,10 +26,9 @@ from netspec.layers.contract import fused
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.folding import Absorbed, blob_like, copy_of
-from netspec.layers.contract.preparing import Kernel, Preparation, copies, finished, lent
+from netspec.layers.contract.kernels import Kernels, Preparation, copies, finished, lent, weight_and_bias
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.contract.training import Kernels, Learning, weight_and_bias
 from netspec.layers.vision.layout import channels_side_by_side, map_by_map, of_one_channel
 from netspec.layers.vision.sliding import TORCH_USUAL, SlidingFilter
 
@@ -154,12 +153,15 @@ class Convolution(SlidingFilter):
         """The multiply-adds for one image, bias aside."""
         return math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * math.prod(self.blob_shapes[0])
 
-    def prepare(self, how: Preparation) -> Kernel | None:
+    def kernels(self, how: Preparation) -> Kernels | None:
+        """Return the kernels for a single bottom (N, C, H, W)."""
         usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(self.bottom_shapes[0]))
-        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         if not usual or len(self.bottom_shapes) > 1 or math.prod(self.top_shapes[0]) == 0:
             return None
         shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
+        if how.learns:
+            return self._learning_kernels(shape, sliding, how)
+        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         if self.is_exact(weight, self.small):
             return lent(BoundColumns(shape, sliding, self.group, at_rest(*copies(self.values(), how))), how)
         if self.reads_padding_alone:
@@ -169,22 +171,16 @@ class Convolution(SlidingFilter):
         geometry = (self.stride, self.pad, self.dilation, self.group)
         return finished(lambda maps: torch.conv2d(of_one_channel(maps), weight, bias, *geometry), how.finish)
 
-    def prepare_training(self, learning: Learning) -> Kernels | None:
-        """Return the kernels for a single bottom (N, C, H, W)."""
-        shape = self.bottom_shapes[0]
-        usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(shape))
-        if not usual or len(self.bottom_shapes) > 1 or math.prod(self.top_shapes[0]) == 0:
-            return None
-        sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
-        (weight, bias), sums = weight_and_bias(self, learning)
+    def _learning_kernels(self, shape: Shape, sliding: Filter, how: Preparation) -> Kernels | None:
+        (weight, bias), sums = weight_and_bias(self, how)
         if self.is_exact(weight, self.small):
-            asked = (learning.wanted[0], learning.steady)
-            bound = BoundColumns(shape, sliding, self.group, Weights(weight, bias, *sums), *asked)
-            return bound.forward, bound.backward
+            weights = Weights(weight, bias, *sums)
+            bound = BoundColumns(shape, sliding, self.group, weights, how.wants(0), how.steady)
+            return Kernels(bound.forward, bound.backward)
         if self.reads_padding_alone:
             return None
         lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else map_by_map
-        return self.convolutions(sliding, weight, bias, sums, learning.wanted[0], lay_out)
+        return self.convolutions(sliding, weight, bias, sums, how.wants(0), lay_out)
 
     def convolutions(
         self,
@@ -216,7 +212,7 @@ class Convolution(SlidingFilter):
                     total.add_(gradient)
             return laid_out_like(maps, maps_diff) if wanted else None
 
-        return forward, backward
+        return Kernels(forward, backward)
 
     def multiply_adds(self) -> int:
         pixels = math.prod(self.top_shapes[0]) // self.num_output
@@ -332,14 +328,11 @@ class Deconvolution(Convolution):
     def small(self) -> bool:
         return False
 
-    def prepare_training(self, learning: Learning) -> Kernels | None:
-        return None
-
-    def prepare(self, how: Preparation) -> Kernel | None:
+    def kernels(self, how: Preparation) -> Kernels | None:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         usual = self.channel_axis == 1 and self.spatial_axes == 2 and len(self.bottom_shapes) == 1
         exact, large = self.is_exact(weight, self.small), self.multiply_adds() > SMALL_PRODUCT
-        if usual and not exact and large and how.pack and fused.suits(weight):
+        if not how.learns and usual and not exact and large and how.pack and fused.suits(weight):
             shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
             if self.group == 1:
                 return fused.deconvolution(shape, weight, bias, sliding, how)

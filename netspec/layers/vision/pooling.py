@@ -12,10 +12,9 @@ from torch.nn import functional as F
 from netspec.exact.sums import Copies
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.preparing import Kernel, Preparation, finished
+from netspec.layers.contract.kernels import Kernels, Preparation, finished, recorded
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.contract.training import Kernels, Learning, recorded
 from netspec.layers.vision.layout import channels_side_by_side
 from netspec.layers.vision.windows import (
     CEIL,
@@ -192,10 +191,12 @@ class Pooling(_PoolingBase):
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
 
-    def prepare(self, how: Preparation) -> Kernel | None:
+    def kernels(self, how: Preparation) -> Kernels | None:
         windows, empty = self.windows, math.prod(self.top_shapes[0]) == 0
         if self.num_tops > 1 or self.method == STOCHASTIC or empty or not windows.known_to_torch:
             return None
+        if how.wanted is not None:
+            return self._learning_kernels(how.wanted)
         geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
         if self.method == AVE:
             return finished(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.finish)
@@ -212,12 +213,10 @@ class Pooling(_PoolingBase):
 
         return finished(kernel, how.finish)
 
-    def prepare_training(self, learning: Learning) -> Kernels | None:
-        """Return the kernels; where a window has no pixel to win, autograd records the pass."""
-        windows, empty = self.windows, math.prod(self.top_shapes[0]) == 0
-        if self.num_tops > 1 or self.method == STOCHASTIC or empty or not windows.known_to_torch:
-            return None
-        record, trace = recorded(self.run, learning)
+    def _learning_kernels(self, wanted: Sequence[bool]) -> Kernels:
+        """Return the kernels; where a window has no pixel to win, autograd records the run."""
+        windows = self.windows
+        record, trace = recorded(self.run, wanted)
         geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
         given = bottom = indices = torch.empty(0)
         if self.method == AVE:
@@ -228,7 +227,7 @@ class Pooling(_PoolingBase):
                 bottom = maps
                 return F.avg_pool2d(maps, *geometry, ceil, True)
 
-            return average, lambda diff: spread_evenly(diff, bottom, *geometry, ceil, True, None)
+            return Kernels(average, lambda diff: spread_evenly(diff, bottom, *geometry, ceil, True, None))
         spread, is_usual = torch.ops.aten.max_pool2d_with_indices_backward.default, True
 
         def forward(maps: torch.Tensor) -> Any:
@@ -244,7 +243,7 @@ class Pooling(_PoolingBase):
             found = spread(diff, bottom, *geometry, [1, 1], ceil, indices)
             return found if bottom is given else found.contiguous()
 
-        return forward, backward
+        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         if self.param.pooling_param.global_pooling and self.method != STOCHASTIC and self.num_tops == 1:

@@ -12,7 +12,7 @@ from netspec.exact import CHOICES
 from netspec.exact.blas import one_thread
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, layer_class
-from netspec.layers.contract.training import Learning, kernels, recorded
+from netspec.layers.contract.kernels import Preparation, own_kernels, recorded
 from netspec.proto.schema import TRAIN, LayerParameter
 
 MAPS = (3, 4, 9, 8)
@@ -75,7 +75,7 @@ def build(name: str, text: str, shapes: list[tuple[int, ...]], exact: str) -> La
 
 @pytest.mark.slow
 @each("name, text, shapes, exact, sideways", [(*case, *how) for case in ALL for how in product(CHOICES, (False, True))])
-@one_thread()  # as Learning says: the two would share a product among threads in different ways, and so round otherwise
+@one_thread()  # as Preparation says; the two would share a product among threads in other ways, and round otherwise
 def test_kernels_are_what_autograd_computes(
     name: str, text: str, shapes: list[tuple[int, ...]], exact: str, sideways: bool
 ) -> None:
@@ -85,8 +85,9 @@ def test_kernels_are_what_autograd_computes(
     mine = copy.deepcopy(watched)
     for blob in (*watched.blobs, *mine.blobs):
         blob.grad = torch.zeros_like(blob)
-    forward, backward = kernels(mine, Learning(wanted, tuple(blob.grad for blob in mine.blobs)))
-    expected_forward, expected_backward = recorded(watched.run, Learning(wanted))
+    how = Preparation(wanted, tuple(blob.grad for blob in mine.blobs))
+    forward, backward = own_kernels(mine, how) or recorded(mine.run, wanted)
+    expected_forward, expected_backward = recorded(watched.run, wanted)
     generator = torch.Generator().manual_seed(1)
 
     def bottom(i: int, shape: tuple[int, ...]) -> torch.Tensor:

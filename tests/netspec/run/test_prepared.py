@@ -428,7 +428,7 @@ def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> No
         param.convolution_param.kernel_size.append(3)
         return cls(param, [(1, 2, 4, 4)])
 
-    names = ("prepare", "absorbs", "absorb", "fresh", "to_onnx")
+    names = ("kernels", "absorbs", "absorb", "fresh", "to_onnx")
     assert [offered(made(Halved), name) for name in names] == [None] * len(names)
     assert None not in [offered(made(Named), name) for name in names]
     assert offered(made(ReLU), "fresh")
